@@ -1,0 +1,500 @@
+"""The calibration of one DVL: feed it samples, read estimates.
+
+    feed_dvl ──► valid? ──► in order? ──► angular velocity ──► speed, turn ──┬─► models without GNSS
+                                          (from IMU track)                   └─► reference (from its track) ──► models
+    feed_reference ─► valid? ─► in order? ─► track                               with GNSS, automatic selection
+    feed_imu ───────► valid? ─► in order? ─► track
+
+The node, the replay and the evaluation all use this class; only `block_size` differs (how many samples are gathered
+before the models are updated: 1 live, many offline), and that changes nothing but the speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from .bank import GaussianState, ModelBank, nis_bounds
+from .frames import ENU_FROM_NED, Array, Quaternion, Vector, rotation_from_quaternion, slerp
+from .models import MODELS, Observations
+from .observability import convergence, observability
+from .parameters import ParameterError, Parameters
+from .results import Estimate, Result
+from .samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from .screening import is_valid_velocity, unit_quaternion, usable_covariance
+from .selection import Selection
+from .streams import Bracket, Order, Sequencer, Track
+
+SECOND_NS = 1_000_000_000
+# How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.
+RETENTION_NS = 10 * SECOND_NS
+
+
+class _Moving(NamedTuple):
+    """A DVL sample on its way to the models, stamps compensated for dvl_time_offset."""
+
+    stamp_ns: int
+    velocity: Vector
+    covariance: Array | None
+    interval_ns: int  # since the DVL sample before
+    usable: bool = True
+    angular_velocity: Vector | None = None
+
+
+class _Paired(NamedTuple):
+    """A DVL sample with its reference velocity in the body frame."""
+
+    sample: _Moving
+    velocity: Vector
+    covariance: Array | None
+    weight: float
+
+
+class Calibrator:
+    """Calibrates with all models at once, see the module's picture.
+
+    prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
+    by model name. block_size: samples per update of the models. on_event: told in words of restarts and the like.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        prior_sway_heave: tuple[float, float] | None = None,
+        initial: Mapping[str, GaussianState] | None = None,
+        block_size: int = 1,
+        on_event: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        if parameters.prior_source == "reference" and prior_sway_heave is None:
+            raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
+        self.parameters = parameters
+        self._prior_sway_heave = prior_sway_heave
+        self._initial = initial
+        self._block_size = block_size
+        self._on_event = on_event
+        self.restarts = 0
+        self._offset_ns = round(parameters.dvl_time_offset * 1e9)
+        self._lever_arm: Vector | None = (
+            tuple(parameters.lever_arm) if any(parameters.lever_arm) else None  # type: ignore[assignment]
+        )
+        self._needs_turn_rate = self._lever_arm is not None or parameters.max_turn_rate > 0.0
+        self._aided_noise = np.eye(3)[None] * parameters.gnss_aided_std**2
+        self._unaided_noise = np.eye(3)[None] * parameters.gnss_free_std**2
+        self.reset()
+
+    # ------------------------------------------------------------------ state
+
+    def reset(self) -> None:
+        """Forget all samples and what was learnt from them."""
+        p = self.parameters
+        jump_ns = round(p.max_time_jump * 1e9)
+        latency_ns = round(p.max_latency * 1e9)
+        gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
+        retention_ns = RETENTION_NS + gnss_ns + imu_ns + latency_ns
+        self._dvl_order: Sequencer[DvlSample] = Sequencer(jump_ns)
+        self._reference_order: Sequencer[ReferenceSample] = Sequencer(jump_ns)
+        self._imu_order: Sequencer[ImuSample] = Sequencer(jump_ns)
+        self._reference: Track[ReferenceSample] = Track(gnss_ns, latency_ns, retention_ns)
+        self._imu: Track[ImuSample] = Track(imu_ns, latency_ns, retention_ns)
+        self._tally: dict[str, Counter[str]] = {name: Counter() for name in ("dvl", "reference", "imu", "pairing")}
+        self._forget_dvl()
+
+    def _forget_dvl(self) -> None:
+        self.selection = Selection()
+        self._aided = ModelBank([m for m in MODELS.values() if m.aided], self.parameters, self._initial)
+        self._unaided = ModelBank([m for m in MODELS.values() if not m.aided], self.parameters, self._initial)
+        self._awaiting_imu: deque[_Moving] = deque()
+        self._awaiting_reference: deque[_Moving] = deque()
+        self._unaided_block: list[tuple[_Moving, bool]] = []
+        self._aided_block: list[_Paired] = []
+        self._first_ns: int | None = None
+        self.last_ns: int | None = None
+        self._decided_ns: int | None = None
+        self._prior = _PriorWindow(self.parameters, self._prior_sway_heave)
+        self.n_updates = 0
+
+    # ------------------------------------------------------------------ input
+
+    def feed_dvl(self, sample: DvlSample) -> bool:
+        """Take a DVL sample; whether it is valid and in order."""
+        tally = self._tally["dvl"]
+        tally["received"] += 1
+        valid, covariance = usable_covariance(sample.covariance)
+        if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
+            tally["invalid"] += 1
+            return False
+        sample = DvlSample(sample.stamp_ns - self._offset_ns, sample.velocity, covariance)
+        order, admitted = self._dvl_order.admit(sample)
+        self._count_order(tally, order)
+        if order is Order.CONFIRMED_RESTART:
+            self._restart(admitted[0].stamp_ns)
+        for one in admitted:
+            interval_ns = 0 if self.last_ns is None else one.stamp_ns - self.last_ns
+            self.last_ns = one.stamp_ns
+            if self._first_ns is None:
+                self._first_ns = one.stamp_ns
+            self._awaiting_imu.append(_Moving(one.stamp_ns, one.velocity, one.covariance, interval_ns))
+        if admitted:
+            self._advance()
+        return bool(admitted)
+
+    def feed_reference(self, sample: ReferenceSample) -> None:
+        """Take a reference (GNSS) velocity."""
+        tally = self._tally["reference"]
+        tally["received"] += 1
+        valid, covariance = usable_covariance(sample.covariance)
+        if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
+            tally["invalid"] += 1
+            return
+        if self._decided_ns is not None and sample.stamp_ns < self._decided_ns:
+            tally["late"] += 1  # a DVL sample has gone on without it: max_latency is too short
+        sample = sample._replace(covariance=covariance)
+        order, admitted = self._reference_order.admit(sample)
+        self._count_order(tally, order)
+        if order is Order.CONFIRMED_RESTART:
+            self._reference.clear()
+        for one in admitted:
+            self._reference.append(one)
+        if admitted:
+            self._advance()
+
+    def feed_imu(self, sample: ImuSample) -> None:
+        """Take attitude and angular velocity."""
+        tally = self._tally["imu"]
+        tally["received"] += 1
+        orientation, angular_velocity = unit_quaternion(sample.orientation), sample.angular_velocity
+        if angular_velocity is not None and not math.isfinite(sum(angular_velocity)):
+            angular_velocity = None
+        if orientation is None and angular_velocity is None:
+            tally["invalid"] += 1
+            return
+        order, admitted = self._imu_order.admit(ImuSample(sample.stamp_ns, orientation, angular_velocity))
+        self._count_order(tally, order)
+        if order is Order.CONFIRMED_RESTART:
+            self._imu.clear()
+        for one in admitted:
+            self._imu.append(one)
+        if admitted and (self._awaiting_imu or self._awaiting_reference):
+            self._advance()
+
+    def refuse(self, stream: str, reason: str) -> None:
+        """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
+        self._tally[stream]["received"] += 1
+        self._tally[stream][reason] += 1
+
+    @staticmethod
+    def _count_order(tally: Counter[str], order: Order) -> None:
+        if order in (Order.DUPLICATE, Order.OUT_OF_ORDER):
+            tally[order.value] += 1
+
+    def _restart(self, stamp_ns: int) -> None:
+        """DVL stamps went back: a bag loops, or the clock was set. Start anew with this sample."""
+        self.restarts += 1
+        dvl_order = self._dvl_order
+        back = (self.last_ns or stamp_ns) - stamp_ns
+        self._on_event(f"DVL stamps went back by {back * 1e-9:.1f} s: the calibration starts anew")
+        self._tally["dvl"] = Counter(received=2)  # the two samples that showed it
+        for name in ("reference", "imu", "pairing"):
+            self._tally[name].clear()
+        dvl_order.stray = 0
+        self._forget_dvl()
+        # what the other streams brought from before the restart must not be paired with what comes after it
+        limit_ns = stamp_ns + round(self.parameters.max_time_jump * 1e9)
+        self._reference.drop_after(limit_ns)
+        self._imu.drop_after(limit_ns)
+
+    # ------------------------------------------------------------------ pairing
+
+    def _advance(self) -> None:
+        """Let DVL samples go on as far as their partners are decided."""
+        newest = (self._dvl_order.last_ns, self._reference.newest_ns, self._imu.newest_ns)
+        horizon_ns = max(stamp for stamp in newest if stamp is not None)
+        while self._awaiting_imu:
+            sample = self._awaiting_imu[0]
+            if self._needs_turn_rate and not self._imu.decided(sample.stamp_ns, horizon_ns):
+                break
+            self._awaiting_imu.popleft()
+            self._to_unaided(sample)
+        while self._awaiting_reference:
+            sample = self._awaiting_reference[0]
+            if not self._reference.decided(sample.stamp_ns, horizon_ns):
+                break
+            bracket = self._reference.bracket(sample.stamp_ns)
+            in_earth_frame = bracket is not None and bracket.after.frame is not VelocityFrame.BODY
+            if in_earth_frame and not self._imu.decided(sample.stamp_ns, horizon_ns):
+                break
+            self._awaiting_reference.popleft()
+            self._decided_ns = sample.stamp_ns
+            self._to_aided(sample, bracket)
+
+    def _to_unaided(self, sample: _Moving) -> None:
+        if self._needs_turn_rate:
+            sample = sample._replace(angular_velocity=self._angular_velocity(sample.stamp_ns))
+        unusable = self._unusable(sample)
+        if unusable is None:
+            if self._lever_arm is not None and sample.angular_velocity is None:
+                self._tally["dvl"]["lever_arm_uncompensated"] += 1
+            prior_known = self._prior.known_at(sample.stamp_ns, sample.velocity)
+            self._unaided_block.append((sample, prior_known))
+            if len(self._unaided_block) >= self._block_size:
+                self._update_unaided()
+        else:
+            self._tally["dvl"][unusable] += 1
+            sample = sample._replace(usable=False)
+        self._awaiting_reference.append(sample)
+
+    def _unusable(self, sample: _Moving) -> str | None:
+        """Why a valid sample is not used, as its counter's name, or None."""
+        p = self.parameters
+        x, y, z = sample.velocity
+        if x * x + y * y + z * z < p.min_speed * p.min_speed:
+            return "slow"
+        if p.max_turn_rate > 0.0:
+            if sample.angular_velocity is None:
+                return "no_turn_rate"
+            x, y, z = sample.angular_velocity
+            if x * x + y * y + z * z > p.max_turn_rate * p.max_turn_rate:
+                return "turning"
+        return None
+
+    def _to_aided(self, sample: _Moving, bracket: Bracket[ReferenceSample] | None) -> None:
+        paired = None if bracket is None else self._pair(sample, bracket)
+        self._tally["pairing"]["paired" if paired else "unpaired"] += 1
+        self.selection.update(sample.stamp_ns, paired is not None, self.parameters)
+        if paired is None or not sample.usable:
+            return
+        self._aided_block.append(paired)
+        if len(self._aided_block) >= self._block_size:
+            self._update_aided()
+
+    def _pair(self, sample: _Moving, bracket: Bracket[ReferenceSample]) -> _Paired | None:
+        before, after, fraction = bracket
+        velocity, covariance = after.velocity, after.covariance
+        if fraction != 1.0:
+            assert before is not None
+            if before.frame is not after.frame:
+                return None
+            velocity = _mix(before.velocity, after.velocity, fraction)
+            # The mean of two samples is less noisy than each, but its neighbours share them: over a run a reference
+            # sample carries its own information once, which is what the plain mean of the covariances gives.
+            covariance = None
+            if before.covariance is not None and after.covariance is not None:
+                covariance = (1.0 - fraction) * before.covariance + fraction * after.covariance
+        weight = 1.0
+        if before is not None and sample.interval_ns > 0:
+            weight = 1.0 / max(1, round((after.stamp_ns - before.stamp_ns) / sample.interval_ns))
+        if after.frame is not VelocityFrame.BODY:
+            orientation = self._orientation(sample.stamp_ns)
+            if orientation is None:
+                self._tally["pairing"]["without_attitude"] += 1
+                return None
+            rotation = rotation_from_quaternion(orientation).T
+            if after.frame is VelocityFrame.NED:
+                rotation = rotation @ ENU_FROM_NED
+            x, y, z = (rotation @ velocity).tolist()
+            velocity = (x, y, z)
+            covariance = None if covariance is None else rotation @ covariance @ rotation.T
+        return _Paired(sample, velocity, covariance, weight)
+
+    def _angular_velocity(self, stamp_ns: int) -> Vector | None:
+        bracket = self._imu.bracket(stamp_ns)
+        if bracket is None:
+            return None
+        before, after, fraction = bracket
+        if fraction == 1.0:
+            return after.angular_velocity
+        if before is None or before.angular_velocity is None or after.angular_velocity is None:
+            return None
+        return _mix(before.angular_velocity, after.angular_velocity, fraction)
+
+    def _orientation(self, stamp_ns: int) -> Quaternion | None:
+        bracket = self._imu.bracket(stamp_ns)
+        if bracket is None:
+            return None
+        before, after, fraction = bracket
+        if fraction == 1.0:
+            return after.orientation
+        if before is None or before.orientation is None or after.orientation is None:
+            return None
+        return slerp(before.orientation, after.orientation, fraction)
+
+    # ------------------------------------------------------------------ models
+
+    def _update_unaided(self) -> None:
+        block, self._unaided_block = self._unaided_block, []
+        if not block:
+            return
+        samples = [sample for sample, _ in block]
+        seen = self._observations(samples, None)
+        known = np.array([known for _, known in block])
+        stamps = [sample.stamp_ns for sample in samples]
+        self._unaided.update(stamps, seen, self._unaided_noise, np.ones(len(samples)), known)
+        self.n_updates += len(samples)
+
+    def _update_aided(self) -> None:
+        block, self._aided_block = self._aided_block, []
+        if not block:
+            return
+        samples = [paired.sample for paired in block]
+        seen = self._observations(samples, np.array([paired.velocity for paired in block]))
+        weight = np.array([paired.weight for paired in block])
+        stamps = [sample.stamp_ns for sample in samples]
+        self._aided.update(stamps, seen, self._aided_covariance(block), weight, np.ones(len(block), dtype=bool))
+        self.n_updates += len(samples)
+
+    def _observations(self, samples: list[_Moving], reference_body: Array | None) -> Observations:
+        lever = np.zeros((len(samples), 3))
+        if self._lever_arm is not None:
+            rates = np.array([sample.angular_velocity or (0.0, 0.0, 0.0) for sample in samples])
+            lever = np.cross(rates, self._lever_arm)
+        return Observations(
+            velocity_dvl=np.array([sample.velocity for sample in samples]),
+            reference_body=reference_body,
+            lever_velocity=lever,
+            rotation_dvl_from_body=self.parameters.rotation_dvl_from_body,
+            sway_heave=self._prior.sway_heave,
+        )
+
+    def _aided_covariance(self, block: list[_Paired]) -> Array:
+        """R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
+        if not self.parameters.use_message_covariance or all(paired.covariance is None for paired in block):
+            return self._aided_noise
+        rotation = self.parameters.rotation_dvl_from_body
+        noise = np.empty((len(block), 3, 3))
+        for i, paired in enumerate(block):
+            if paired.covariance is None:
+                noise[i] = self._aided_noise[0]
+            else:
+                own = self._unaided_noise[0] if paired.sample.covariance is None else paired.sample.covariance
+                noise[i] = rotation @ paired.covariance @ rotation.T + own
+        return noise
+
+    # ------------------------------------------------------------------ output
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Where the messages went, since the start or the last restart.
+
+        dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (wrong_frame) + accepted;
+        accepted = slow + turning + no_turn_rate + usable + awaiting_imu. pairing: accepted and decided = paired +
+        unpaired; awaiting_reference is the rest. A model's used + gated (+ samples in its prior window) is what it
+        was given: usable samples, for the models with GNSS those that were paired.
+        """
+        counts = {name: dict(tally) for name, tally in self._tally.items()}
+        for name, order in (("dvl", self._dvl_order), ("reference", self._reference_order), ("imu", self._imu_order)):
+            counts[name]["stray"] = order.stray
+            counts[name]["held"] = int(order.held is not None)
+            for key in ("received", "invalid", "duplicate", "out_of_order"):
+                counts[name].setdefault(key, 0)
+        dvl, pairing = counts["dvl"], counts["pairing"]
+        for key in ("slow", "turning", "no_turn_rate", "wrong_frame"):
+            dvl.setdefault(key, 0)
+        for key in ("wrong_frame", "late"):
+            counts["reference"].setdefault(key, 0)
+        for key in ("paired", "unpaired", "without_attitude"):
+            pairing.setdefault(key, 0)
+        not_accepted = ("invalid", "duplicate", "out_of_order", "stray", "held", "wrong_frame")
+        dvl["accepted"] = dvl["received"] - sum(dvl[key] for key in not_accepted)
+        dvl["awaiting_imu"] = len(self._awaiting_imu)
+        dvl["usable"] = dvl["accepted"] - sum(dvl[k] for k in ("slow", "turning", "no_turn_rate", "awaiting_imu"))
+        pairing["awaiting_reference"] = len(self._awaiting_reference)
+        counts["calibration"] = {"restarts": self.restarts}
+        return counts
+
+    @property
+    def selected(self) -> str:
+        """Name of the selected model."""
+        return self.selection.model(self.parameters)
+
+    def set_parameters(self, parameters: Parameters) -> None:
+        """Change parameters that can change at run time (`ParameterSpec.read_only` False)."""
+        self.parameters = parameters
+        if self._decided_ns is not None:
+            self.selection.record(self._decided_ns, parameters)
+
+    def state(self, name: str) -> GaussianState:
+        """State and covariance of one model."""
+        self._update_unaided()
+        self._update_aided()
+        return self._bank(name).state(name)
+
+    def _bank(self, name: str) -> ModelBank:
+        return self._aided if MODELS[name].aided else self._unaided
+
+    def estimate(self, name: str | None = None) -> Estimate:
+        """Estimate of one model, by default the selected one, with all that is known about it."""
+        model = MODELS[name or self.selected]
+        state, covariance = self.state(model.name)
+        used, gated, mean_nis = self._bank(model.name).counts(model.name)
+        entries = observability(model, covariance, self.parameters)
+        return Estimate(
+            model=model.name,
+            state=state,
+            covariance=covariance,
+            used=used,
+            gated=gated,
+            mean_nis=mean_nis,
+            nis_bounds=nis_bounds(model, self.parameters, used),
+            convergence=convergence(entries, self.parameters),
+            observability=entries,
+        )
+
+    def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:
+        """Newest angular velocity (rad/s, body), if not older than imu_timeout: for output without delay."""
+        newest = self._imu.newest
+        if newest is None or abs(stamp_ns - newest.stamp_ns) > self.parameters.imu_timeout * 1e9:
+            return None
+        return newest.angular_velocity
+
+    def result(self) -> Result:
+        """Everything, as of now."""
+        return Result(
+            selected=self.selected,
+            selected_because=self.selection.reason(self.parameters),
+            estimates={name: self.estimate(name) for name in MODELS},
+            segments=tuple(self.selection.segments),
+            counts=self.counts,
+            first_ns=self._first_ns,
+            last_ns=self.last_ns,
+            parameters=self.parameters.as_dict(),
+        )
+
+
+class _PriorWindow:
+    """Prior sway and heave of the models that need them."""
+
+    def __init__(self, parameters: Parameters, given: tuple[float, float] | None) -> None:
+        self._rotation_body_from_dvl = parameters.rotation_dvl_from_body.T
+        self._window_ns = round(parameters.prior_window * 1e9)
+        self._start_ns: int | None = None
+        self._sum = np.zeros(2)
+        self._count = 0
+        self.sway_heave: Array = np.array(parameters.prior_sway_heave if given is None else given)
+        self._collecting = parameters.prior_source == "initial_window"
+
+    def known_at(self, stamp_ns: int, velocity_dvl: Vector) -> bool:
+        """Whether the prior is known; until then, take the sample into its mean."""
+        if not self._collecting:
+            return True
+        if self._start_ns is None:
+            self._start_ns = stamp_ns
+        if stamp_ns - self._start_ns >= self._window_ns:
+            self._collecting = False
+            self.sway_heave = self._sum / self._count
+            return True
+        self._sum += (self._rotation_body_from_dvl @ velocity_dvl)[1:]
+        self._count += 1
+        return False
+
+
+def _mix(a: Vector, b: Vector, fraction: float) -> Vector:
+    return (
+        a[0] + (b[0] - a[0]) * fraction,
+        a[1] + (b[1] - a[1]) * fraction,
+        a[2] + (b[2] - a[2]) * fraction,
+    )

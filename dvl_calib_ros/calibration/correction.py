@@ -1,0 +1,41 @@
+"""Using an estimate: the errors as ~/estimate carries them, and corrected velocities with their uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .bank import GaussianState
+from .error_model import correction_jacobian, correction_matrix
+from .frames import Array
+from .models import Model
+
+NOT_ESTIMATED = -1.0  # variance of a component that the model does not estimate
+
+
+def twist_terms(model: Model, state: GaussianState) -> tuple[Array, Array]:
+    """δk per axis, then φ (6,) with their joint covariance (6, 6).
+
+    A component that the model does not estimate is 0 with variance NOT_ESTIMATED.
+    """
+    terms = np.roll(model.to_error_terms(), 3, axis=0)
+    covariance = terms @ state.p @ terms.T
+    missing = ~terms.any(axis=1)
+    covariance[missing, missing] = NOT_ESTIMATED
+    return terms @ state.x, covariance
+
+
+class Correction:
+    """Corrects DVL velocities with one model's state."""
+
+    def __init__(self, model: Model, state: GaussianState, rotation_dvl_from_body: Array) -> None:
+        terms = model.to_error_terms()
+        errors = terms @ state.x
+        self._rotation_dvl_from_body = rotation_dvl_from_body
+        self._matrix = correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body)
+        self._error_covariance = terms @ state.p @ terms.T
+
+    def apply(self, velocity_dvl: Array, noise_dvl: Array) -> tuple[Array, Array]:
+        """Body velocity (3,) m/s and its covariance (3, 3): sensor noise (3, 3), DVL frame, and the calibration's."""
+        jacobian = correction_jacobian(velocity_dvl, self._rotation_dvl_from_body)
+        noise = self._matrix @ noise_dvl @ self._matrix.T
+        return self._matrix @ velocity_dvl, noise + jacobian @ self._error_covariance @ jacobian.T

@@ -1,0 +1,52 @@
+"""The nonlinear DVL error model, its exact inverse, and what follows from it (models.md, "Error model").
+
+``v_d = (I + diag(δk)) (I + [φ×]) T v_b`` with ``T = rotation_dvl_from_body``: the nominal mounting, φ (3,) rad the
+residual misalignment and δk (3,) the scale-factor errors, both in the DVL frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .frames import Array, skew
+
+
+def distort(velocity_body: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
+    """What a DVL with these errors measures of a body velocity: (..., 3) m/s -> (..., 3) m/s in the DVL frame."""
+    matrix = np.diag(1.0 + np.asarray(scale)) @ (np.eye(3) + skew(misalignment)) @ rotation_dvl_from_body
+    return velocity_body @ matrix.T
+
+
+def correction_matrix(misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
+    """(3, 3) matrix that takes the measured DVL velocity to the corrected body velocity: the inverse of `distort`."""
+    return rotation_dvl_from_body.T @ np.linalg.inv(np.eye(3) + skew(misalignment)) @ np.diag(1.0 / (1.0 + scale))
+
+
+def correct(velocity_dvl: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
+    """Corrected body velocity of measured DVL velocities: (..., 3) m/s -> (..., 3) m/s."""
+    return velocity_dvl @ correction_matrix(misalignment, scale, rotation_dvl_from_body).T
+
+
+def correction_jacobian(velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
+    """d(corrected body velocity)/d(φ, δk) at small errors: (3,) m/s -> (3, 6).
+
+    From the first-order inverse ``v_b = Tᵀ (v - φ×v - δk∘v)``: columns ``Tᵀ[v×]`` and ``-Tᵀ diag(v)``.
+    """
+    return rotation_dvl_from_body.T @ np.hstack([skew(velocity_dvl), -np.diag(velocity_dvl)])
+
+
+def corrected_mounting(misalignment: Array, rotation_dvl_from_body: Array) -> Array:
+    """Corrected mounting as ``rotation_body_from_dvl`` (3, 3).
+
+    ``I + [φ×]`` is not a rotation. The nearest one (its polar factor) turns about φ by atan‖φ‖, because in the plane
+    across φ the matrix is ``[[1, -‖φ‖], [‖φ‖, 1]]``, a rotation by that angle times a length.
+    """
+    norm = float(np.linalg.norm(misalignment))
+    if norm == 0.0:
+        return np.array(rotation_dvl_from_body.T)
+    axis = skew(np.asarray(misalignment) / norm)
+    angle = math.atan(norm)
+    rotation = np.eye(3) + math.sin(angle) * axis + (1.0 - math.cos(angle)) * axis @ axis
+    return rotation_dvl_from_body.T @ rotation.T

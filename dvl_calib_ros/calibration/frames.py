@@ -1,0 +1,119 @@
+"""Rotations and frames (REP-103, REP-105).
+
+Names of rotations say both frames: ``v_a = rotation_a_from_b @ v_b``. Quaternions are ``(x, y, z, w)`` as in
+geometry_msgs. Angles are radians.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.floating[Any]]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+# forward-right-down <-> forward-left-up, and its own inverse
+FLU_FROM_FRD: Array = np.diag([1.0, -1.0, -1.0])
+# north-east-down -> east-north-up, and its own inverse
+ENU_FROM_NED: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+# skew(a) is linear in a: its nine elements, row by row, are a @ _SKEW. One product instead of seven assignments.
+_SKEW: Array = np.zeros((3, 9))
+for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
+    _SKEW[_axis, 3 * _row + _column] = 1.0
+    _SKEW[_axis, 3 * _column + _row] = -1.0
+
+
+def skew(a: ArrayLike) -> Array:
+    """Cross-product matrix: ``skew(a) @ b == cross(a, b)``. Shape (..., 3) -> (..., 3, 3), finite values."""
+    a = np.asarray(a, dtype=float)
+    return (a @ _SKEW).reshape(*a.shape, 3)
+
+
+def rotation_from_rpy(rpy: ArrayLike) -> Array:
+    """Rotation of a URDF ``origin rpy``: turns about the fixed axes X, then Y, then Z.
+
+    ``(..., 3)`` -> ``(..., 3, 3)``; with the pose of a child in its parent it is ``rotation_parent_from_child``, and
+    with roll, pitch, yaw of a body in a navigation frame ``rotation_navigation_from_body``.
+    """
+    roll, pitch, yaw = np.moveaxis(np.asarray(rpy, dtype=float), -1, 0)
+    cr, sr, cp, sp, cy, sy = (
+        np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw),
+    )  # fmt: skip
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def rpy_from_rotation(rotation: ArrayLike) -> Array:
+    """Inverse of `rotation_from_rpy` for one rotation: (3, 3) -> roll, pitch, yaw (3,), pitch within ±pi/2."""
+    r = np.asarray(rotation, dtype=float)
+    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    if math.hypot(r[0, 0], r[1, 0]) < 1e-12:  # gimbal lock: only yaw -/+ roll is defined, put it all in yaw
+        return np.array([0.0, pitch, math.atan2(-r[0, 1], r[1, 1])])
+    return np.array([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
+    """Unit quaternion (x, y, z, w), w >= 0, of one rotation (3, 3). Shepperd's method: the largest term first."""
+    r = np.asarray(rotation, dtype=float)
+    trace = float(np.trace(r))
+    terms = np.array([r[0, 0], r[1, 1], r[2, 2], trace])
+    largest = int(np.argmax(terms))
+    q = np.empty(4)
+    if largest == 3:
+        q[:] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1.0 + trace
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q[i] = 1.0 + 2.0 * r[i, i] - trace
+        q[j] = r[j, i] + r[i, j]
+        q[k] = r[k, i] + r[i, k]
+        q[3] = r[k, j] - r[j, k]
+    q /= np.linalg.norm(q)
+    x, y, z, w = (q if q[3] >= 0.0 else -q).tolist()
+    return x, y, z, w
+
+
+def rotation_from_quaternion(q: Quaternion) -> Array:
+    """Rotation matrix (3, 3) of one unit quaternion (x, y, z, w)."""
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def slerp(q0: Quaternion, q1: Quaternion, fraction: float) -> Quaternion:
+    """Spherical linear interpolation between unit quaternions along the shorter arc, fraction in 0..1."""
+    dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
+    sign = 1.0 if dot >= 0.0 else -1.0
+    dot = min(abs(dot), 1.0)
+    if dot > 0.9999995:  # arcs below 2 mrad: the chord is exact to 1e-10 and keeps clear of 0/0
+        w0, w1 = 1.0 - fraction, fraction * sign
+    else:
+        angle = math.acos(dot)
+        w0 = math.sin((1.0 - fraction) * angle) / math.sin(angle)
+        w1 = sign * math.sin(fraction * angle) / math.sin(angle)
+    x, y, z, w = (w0 * a + w1 * b for a, b in zip(q0, q1, strict=True))
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return x / norm, y / norm, z / norm, w / norm
+
+
+def attitude_enu_flu_from_ned_frd(rpy: ArrayLike) -> Array:
+    """Attitude as marine instruments give it, as ROS wants it.
+
+    Roll, pitch, yaw (..., 3) of a forward-right-down body in north-east-down (Z-Y-X order) ->
+    ``rotation_enu_from_body`` (..., 3, 3) of the forward-left-up body.
+    """
+    return ENU_FROM_NED @ rotation_from_rpy(rpy) @ FLU_FROM_FRD

@@ -1,0 +1,339 @@
+"""Every parameter, once: name, default, type, unit, range and description.
+
+From this schema come the node's declarations and descriptors, the validation of YAML files offline, the table in the
+README and `config/calibration.yaml`. All in SI units and radians.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from .frames import Array, rotation_from_rpy
+from .models import MODELS
+from .samples import VelocityFrame
+
+AUTO = "auto"
+FROM_FRAME_ID = "from_frame_id"
+
+
+class ParameterError(ValueError):
+    """A parameter that does not exist or whose value cannot be used; the message names it and says what would do."""
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What is known about a parameter beside its name."""
+
+    default: Any
+    description: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = True
+
+    @property
+    def kind(self) -> str:
+        """ROS 2 type: string, bool, double or double_array."""
+        names = {str: "string", bool: "bool", float: "double", tuple: "double_array"}
+        return names[type(self.default)]
+
+    @property
+    def length(self) -> int:
+        """Number of elements of an array."""
+        return len(self.default)
+
+    def check(self, name: str, value: Any) -> Any:
+        """The value in its own type (whole numbers become doubles, arrays tuples), or ParameterError."""
+        if self.kind == "double_array":
+            if isinstance(value, str | bytes) or not hasattr(value, "__len__") or len(value) != self.length:
+                raise ParameterError(f"{name}: expected an array of {self.length} numbers, got {value!r}")
+            return tuple(self._number(f"{name}[{i}]", element) for i, element in enumerate(value))
+        if self.kind == "double":
+            return self._number(name, value)
+        if self.kind == "bool":
+            if not isinstance(value, bool):
+                raise ParameterError(f"{name}: expected true or false, got {value!r}")
+            return value
+        if not isinstance(value, str):
+            raise ParameterError(f"{name}: expected text, got {value!r}")
+        if self.choices and value not in self.choices:
+            raise ParameterError(f"{name}: {value!r} is not one of {', '.join(self.choices)}")
+        return value
+
+    def _number(self, name: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+            raise ParameterError(f"{name}: expected a number, got {value!r}")
+        number = float(value)
+        if not math.isfinite(number):
+            raise ParameterError(f"{name}: {number} is not finite")
+        if (self.low is not None and number < self.low) or (self.high is not None and number > self.high):
+            raise ParameterError(f"{name}: {number:g} is outside {self.low:g} .. {self.high:g} {self.unit}".rstrip())
+        return number
+
+
+def _parameter(default: Any, description: str, **known: Any) -> Any:
+    return dataclasses.field(default=default, metadata={"spec": ParameterSpec(default, description, **known)})
+
+
+_AIDED = tuple(name for name, model in MODELS.items() if model.aided)
+_UNAIDED = tuple(name for name, model in MODELS.items() if not model.aided)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The parameters of a calibration, checked when made. Raises ParameterError."""
+
+    model: str = _parameter(
+        AUTO,
+        "Model whose estimate is published: auto, or a model's name.",
+        choices=(AUTO, *MODELS),
+        read_only=False,
+    )
+    gnss_model: str = _parameter(
+        "M3",
+        "What auto runs while GNSS is available.",
+        choices=_AIDED,
+        read_only=False,
+    )
+    gnss_free_model: str = _parameter(
+        "M7",
+        "What auto runs while GNSS is not available.",
+        choices=_UNAIDED,
+        read_only=False,
+    )
+    gnss_timeout: float = _parameter(
+        2.0,
+        "Age of the last paired reference sample at which GNSS counts as lost; also the longest gap between two "
+        "reference samples that is interpolated across.",
+        unit="s",
+        low=0.05,
+        high=60.0,
+    )
+    gnss_hysteresis: float = _parameter(
+        3.0,
+        "How long GNSS must have come or gone before auto switches.",
+        unit="s",
+        low=0.0,
+        high=600.0,
+        read_only=False,
+    )
+    gnss_frame: str = _parameter(
+        FROM_FRAME_ID,
+        "Frame of the reference velocity. from_frame_id: base_frame is body; enu, map, odom, world are "
+        "ENU; ned is NED; anything else is refused.",
+        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame)),
+    )
+    base_frame: str = _parameter(
+        "base_link",
+        "Name of the body frame (forward-left-up): of calibrated_twist, and of a body-frame reference.",
+    )
+    dvl_frame: str = _parameter(
+        "",
+        "frame_id that DVL messages must carry. Empty: any but a body or earth frame, and the first one seen.",
+    )
+    mounting_rpy: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "Nominal orientation of the DVL in the body, as in a URDF origin (fixed axes X, Y, Z).",
+        unit="rad",
+        low=-2 * math.pi,
+        high=2 * math.pi,
+    )
+    lever_arm: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "Position of the DVL relative to the reference point, body frame; compensated while the "
+        "angular velocity is known.",
+        unit="m",
+        low=-100.0,
+        high=100.0,
+    )
+    dvl_time_offset: float = _parameter(
+        0.0,
+        "Positive: DVL stamps are late. Taken off before pairing.",
+        unit="s",
+        low=-10.0,
+        high=10.0,
+    )
+    initial_std_misalignment: float = _parameter(
+        0.05,
+        "Prior standard deviation of each misalignment angle.",
+        unit="rad",
+        low=1e-6,
+        high=1.0,
+    )
+    initial_std_scale: float = _parameter(
+        0.006,
+        "Prior standard deviation of the scale-factor error.",
+        low=1e-7,
+        high=0.5,
+    )
+    process_std_misalignment: float = _parameter(
+        0.0,
+        "Random walk of each misalignment angle.",
+        unit="rad/√s",
+        low=0.0,
+        high=0.1,
+    )
+    process_std_scale: float = _parameter(
+        0.0,
+        "Random walk of the scale-factor error.",
+        unit="1/√s",
+        low=0.0,
+        high=0.1,
+    )
+    use_message_covariance: bool = _parameter(
+        True,
+        "R of the GNSS models from the messages' covariances (rotated, added) where given.",
+    )
+    gnss_aided_std: float = _parameter(
+        0.2,
+        "Standard deviation per axis of R of the GNSS models where the reference gives no covariance.",
+        unit="m/s",
+        low=1e-4,
+        high=10.0,
+    )
+    gnss_free_std: float = _parameter(
+        0.025,
+        "Standard deviation per axis of R of the GNSS-free models; stands in for a DVL covariance that is not given.",
+        unit="m/s",
+        low=1e-4,
+        high=10.0,
+    )
+    prior_source: str = _parameter(
+        "fixed",
+        "Prior sway and heave of M5 and M6: fixed (prior_sway_heave), initial_window (mean of the DVL's own "
+        "first prior_window; then M5 and M6 gain nothing, the mean already holds the misalignment), reference (mean "
+        "of the reference velocity's first prior_window; replay only).",
+        choices=("fixed", "initial_window", "reference"),
+    )
+    prior_window: float = _parameter(
+        2.0,
+        "Length of the window that prior_source averages.",
+        unit="s",
+        low=0.1,
+        high=600.0,
+    )
+    prior_sway_heave: tuple[float, ...] = _parameter(
+        (0.0, 0.0),
+        "Sway and heave of prior_source fixed, body frame.",
+        unit="m/s",
+        low=-10.0,
+        high=10.0,
+    )
+    gate_probability: float = _parameter(
+        0.999,
+        "Innovation gate: share of good samples that pass (chi-square). 0 or 1: off.",
+        low=0.0,
+        high=1.0,
+    )
+    min_speed: float = _parameter(
+        0.3,
+        "Slower samples are not used. 0: off.",
+        unit="m/s",
+        low=0.0,
+        high=10.0,
+    )
+    max_turn_rate: float = _parameter(
+        0.0,
+        "Samples at a higher angular velocity are not used, nor are samples without one. 0: off.",
+        unit="rad/s",
+        low=0.0,
+        high=10.0,
+    )
+    max_speed: float = _parameter(
+        10.0,
+        "A DVL or reference velocity above this is invalid.",
+        unit="m/s",
+        low=0.1,
+        high=100.0,
+    )
+    imu_timeout: float = _parameter(
+        1.5,
+        "Longest gap between two IMU samples that is interpolated across.",
+        unit="s",
+        low=0.01,
+        high=60.0,
+    )
+    max_latency: float = _parameter(
+        1.0,
+        "By how much (in stamps) one topic may lag another before a DVL sample goes on without its partner. When "
+        "a bag is played faster than recorded, raise it in proportion.",
+        unit="s",
+        low=0.0,
+        high=600.0,
+    )
+    max_time_jump: float = _parameter(
+        10.0,
+        "A step between stamps above this needs a second sample to be believed; back in time it is a restart "
+        "(bag loop) and the calibration starts anew.",
+        unit="s",
+        low=0.1,
+        high=86400.0,
+    )
+    fine_std_misalignment: float = _parameter(
+        0.0017453292519943296,
+        "Convergence is fine once every observable angle's standard deviation is below this (0.1°) ...",
+        unit="rad",
+        low=1e-6,
+        high=1.0,
+        read_only=False,
+    )
+    fine_std_scale: float = _parameter(
+        0.001,
+        "... and the scale's below this.",
+        low=1e-7,
+        high=0.5,
+        read_only=False,
+    )
+    result_file: str = _parameter(
+        "",
+        "Result file (YAML) written by ~/save and at shutdown. Empty: none.",
+        read_only=False,
+    )
+    initial_calibration: str = _parameter(
+        "", "Result file whose states and covariances are the prior. Empty: none.",
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        for name, spec in SCHEMA.items():
+            object.__setattr__(self, name, spec.check(name, getattr(self, name)))
+
+    @staticmethod
+    def from_mapping(values: Mapping[str, Any]) -> Parameters:
+        """Parameters with these values, the rest at their defaults. ParameterError names what is unknown or wrong."""
+        check_names(values)
+        return Parameters(**values)
+
+    def replace(self, **values: Any) -> Parameters:
+        """A copy with these values, checked."""
+        check_names(values)
+        return dataclasses.replace(self, **values)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Name -> value with arrays as lists, for YAML and JSON."""
+        return {name: list(value) if isinstance(value := getattr(self, name), tuple) else value for name in SCHEMA}
+
+    @cached_property
+    def rotation_dvl_from_body(self) -> Array:
+        """T (3, 3), from mounting_rpy."""
+        return rotation_from_rpy(self.mounting_rpy).T
+
+
+SCHEMA: Mapping[str, ParameterSpec] = {field.name: field.metadata["spec"] for field in dataclasses.fields(Parameters)}
+
+
+def check_names(names: Mapping[str, Any]) -> None:
+    """Raise ParameterError for a name that is not a parameter, with the nearest one that is."""
+    for name in names:
+        if name not in SCHEMA:
+            near = difflib.get_close_matches(str(name), SCHEMA, n=1)
+            hint = f", did you mean {near[0]!r}?" if near else f"; there are {', '.join(SCHEMA)}"
+            raise ParameterError(f"{name}: no such parameter{hint}")

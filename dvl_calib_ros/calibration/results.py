@@ -1,0 +1,85 @@
+"""What a calibration says: immutable data that outlives the code that made it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .error_model import correct, corrected_mounting
+from .frames import Array
+from .models import MODELS
+from .observability import Convergence, Observability
+from .selection import Segment
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """State of one model.
+
+    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n). used, gated:
+    samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
+    """
+
+    model: str
+    state: Array
+    covariance: Array
+    used: int
+    gated: int
+    mean_nis: float
+    nis_bounds: tuple[float, float]
+    convergence: Convergence
+    observability: tuple[Observability, ...]
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
+        return MODELS[self.model].state_names
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def misalignment(self) -> Array:
+        """φ (3,) rad, DVL frame."""
+        return self.state[:3]
+
+    @property
+    def scale(self) -> Array:
+        """δk (3,) per DVL axis, zero where not estimated."""
+        return (MODELS[self.model].to_error_terms() @ self.state)[3:]
+
+    def corrected_velocity(self, velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
+        """Measured DVL velocities (..., 3) m/s -> corrected body velocities (..., 3) m/s."""
+        return correct(velocity_dvl, self.misalignment, self.scale, rotation_dvl_from_body)
+
+    def rotation_body_from_dvl(self, rotation_dvl_from_body: Array) -> Array:
+        """Corrected mounting (3, 3)."""
+        return corrected_mounting(self.misalignment, rotation_dvl_from_body)
+
+
+@dataclass(frozen=True)
+class Result:
+    """All models' estimates, which one is selected, and what the data went through.
+
+    first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
+    `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values.
+    """
+
+    selected: str
+    selected_because: str
+    estimates: Mapping[str, Estimate]
+    segments: tuple[Segment, ...]
+    counts: Mapping[str, Mapping[str, int]]
+    first_ns: int | None
+    last_ns: int | None
+    parameters: Mapping[str, Any]
+
+    @property
+    def estimate(self) -> Estimate:
+        """The selected model's estimate."""
+        return self.estimates[self.selected]

@@ -1,0 +1,79 @@
+"""Which model's estimate is the one: automatic selection with timeout and hysteresis, in stamps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from .parameters import AUTO, Parameters
+
+
+class Segment(NamedTuple):
+    """From this stamp on (until the next segment's) this model was selected."""
+
+    from_ns: int
+    model: str
+
+
+class GnssAvailability:
+    """Whether GNSS is available: paired samples keep arriving, and a change has held for the hysteresis.
+
+    Before the first sample GNSS is not available.
+    """
+
+    def __init__(self) -> None:
+        self.available = False
+        self._last_paired_ns: int | None = None
+        self._changing_since_ns: int | None = None
+
+    def update(self, stamp_ns: int, paired: bool, timeout_ns: int, hysteresis_ns: int) -> None:
+        """Take note of one DVL sample and whether it was paired with a reference."""
+        if paired:
+            self._last_paired_ns = stamp_ns
+        fresh = self._last_paired_ns is not None and stamp_ns - self._last_paired_ns <= timeout_ns
+        if fresh == self.available:
+            self._changing_since_ns = None
+            return
+        if self._changing_since_ns is None:
+            self._changing_since_ns = stamp_ns
+        if stamp_ns - self._changing_since_ns >= hysteresis_ns:
+            self.available = fresh
+            self._changing_since_ns = None
+
+    @property
+    def reason(self) -> str:
+        """In words, for the operator."""
+        state = "available" if self.available else "not available"
+        if self._changing_since_ns is None:
+            return f"GNSS is {state}"
+        change = "going" if self.available else "coming"
+        return f"GNSS is {state}, {change}; waiting for gnss_hysteresis"
+
+
+class Selection:
+    """The selected model over time."""
+
+    def __init__(self) -> None:
+        self.gnss = GnssAvailability()
+        self.segments: list[Segment] = []
+
+    def update(self, stamp_ns: int, paired: bool, parameters: Parameters) -> None:
+        """Take note of one DVL sample, in order of stamps."""
+        timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
+        self.gnss.update(stamp_ns, paired, timeout_ns, hysteresis_ns)
+        self.record(stamp_ns, parameters)
+
+    def record(self, stamp_ns: int, parameters: Parameters) -> None:
+        """Start a new segment if another model is selected now."""
+        model = self.model(parameters)
+        if not self.segments or self.segments[-1].model != model:
+            self.segments.append(Segment(stamp_ns, model))
+
+    def model(self, parameters: Parameters) -> str:
+        """Name of the selected model."""
+        if parameters.model != AUTO:
+            return parameters.model
+        return parameters.gnss_model if self.gnss.available else parameters.gnss_free_model
+
+    def reason(self, parameters: Parameters) -> str:
+        """Why it is that model."""
+        return "set by parameter model" if parameters.model != AUTO else f"auto: {self.gnss.reason}"

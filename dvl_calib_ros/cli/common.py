@@ -1,0 +1,155 @@
+"""What several commands share: parameter and topic options, progress, tables of estimates."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..calibration.parameters import Parameters
+    from ..calibration.results import Estimate, Result
+
+
+def add_parameter_options(parser: argparse.ArgumentParser) -> None:
+    """--params and -p, as ROS 2 users know them."""
+    parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
+    parser.add_argument(
+        "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"
+    )
+
+
+def add_topic_options(parser: argparse.ArgumentParser) -> None:
+    """--dvl-topic, --gnss-topic, --imu-topic."""
+    for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
+        parser.add_argument(f"--{role}-topic", default=default, metavar="TOPIC", help=f"default: {default}")
+
+
+def add_storage_options(parser: argparse.ArgumentParser) -> None:
+    """--storage and --compression of a bag to write."""
+    from ..io.bags import Compression, Storage
+
+    storages, compressions = [each.value for each in Storage], [each.value for each in Compression]
+    parser.add_argument("--storage", choices=storages, default="mcap", help="default: %(default)s")
+    parser.add_argument(
+        "--compression", choices=compressions, default="none", help="chunk is MCAP's own; default: %(default)s"
+    )
+
+
+def load(arguments: argparse.Namespace) -> Parameters:
+    """Parameters from --params and -p."""
+    from ..io.parameter_files import load_parameters
+
+    return load_parameters(arguments.params, arguments.overrides)
+
+
+def console(stderr: bool = False) -> Console:
+    """A rich console; plain text where the output is no terminal, never narrower than a table needs there."""
+    from rich.console import Console
+
+    wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 160
+    return Console(stderr=stderr, width=wide, highlight=False)
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar for a share of 0..1, on standard error and only if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.progress import Progress
+
+    with Progress(console=console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write JSON, whole or not at all; numbers that are not finite become null."""
+    from ..io.result_file import save_text
+
+    save_text(path, json.dumps(_finite(document), indent=1, ensure_ascii=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def estimate_cells(estimate: Estimate) -> list[str]:
+    """φ in degrees and δk in per cent with their ±1σ, '-' where the model has none; '?' marks what is unobserved."""
+    cells = []
+    names = list(estimate.state_names)
+    for name in ("phi_x", "phi_y", "phi_z", "delta_k"):
+        index = next((i for i, own in enumerate(names) if own.startswith(name)), None)
+        if index is None:
+            cells.append("-")
+            continue
+        factor, digits = (math.degrees(1.0), 2) if name.startswith("phi") else (100.0, 2)
+        mark = "" if estimate.observability[index].observed else " ?"
+        axis = " (x)" if names[index] == "delta_k_x" else ""
+        cells.append(
+            f"{factor * estimate.state[index]:+.{digits}f} ± {factor * estimate.std[index]:.{digits}f}{axis}{mark}"
+        )
+    return cells
+
+
+ESTIMATE_COLUMNS = ("φx roll °", "φy pitch °", "φz yaw °", "scale %")
+
+
+def result_table(result: Result, models: Sequence[str], title: str) -> Table:
+    """One line per model, the selected one marked."""
+    from rich.table import Table
+
+    from ..calibration.models import MODELS
+
+    table = Table(title=title, title_justify="left", caption="± 1σ;  ? not shown by this data", caption_justify="left")
+    table.add_column("model")
+    for column in ESTIMATE_COLUMNS:
+        table.add_column(column, justify="right", no_wrap=True)
+    for column in ("used", "gated", "NIS/m"):
+        table.add_column(column, justify="right")
+    table.add_column("convergence")
+    for name in models:
+        estimate = result.estimates[name]
+        dof = MODELS[name].n_measurement
+        table.add_row(
+            f"[bold]{name} ◄[/]" if name == result.selected else name,
+            *estimate_cells(estimate),
+            str(estimate.used),
+            str(estimate.gated),
+            f"{estimate.mean_nis / dof:.2f}" if estimate.used else "-",
+            estimate.convergence.value,
+        )
+    return table
+
+
+def share_folder() -> Path:
+    """Where bags/ and config/ are: in the source tree, or installed under share/dvl_calib_ros. Raises InputError."""
+    from ..io.errors import InputError
+
+    candidates = [
+        Path(__file__).resolve().parents[2],
+        Path(sys.prefix) / "share" / "dvl_calib_ros",
+    ]
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        candidates.append(Path(get_package_share_directory("dvl_calib_ros")))
+    except Exception:  # not installed through ament, or no ROS at all
+        pass
+    for folder in candidates:
+        if (folder / "bags").is_dir():
+            return folder
+    raise InputError(f"the shipped bags are not installed; looked in {', '.join(map(str, candidates))}")

@@ -1,0 +1,132 @@
+"""The whole thing at once on a shipped bag.
+
+Starts the real node in a process of its own, plays a bag with a GNSS outage to it over DDS (on this machine only, on
+a ROS domain of its own), shows the estimates converge, switches a model by the parameter service, then replays the
+same bag offline and prints both results beside the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from . import common
+
+NAME = "demo"
+HELP = "live node, replay and truth side by side on a shipped bag"
+EXAMPLE = "dvl-calib demo --speed 40"
+BAG = "harbour_box"
+# What the bag was simulated with, see bags/README.md
+MISALIGNMENT_DEG = (1.0, -1.5, 3.0)
+SCALE_PERCENT = 0.5
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Play, watch, compare."""
+    from ..io.errors import InputError
+
+    if not 0.1 <= arguments.speed <= 1000.0:
+        raise InputError("--speed: give a number in 0.1 .. 1000")
+    bag = common.share_folder() / "bags" / BAG
+    # its own domain: the demo must neither hear nor disturb a vehicle that is running
+    os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    try:
+        import rclpy
+    except ImportError as error:
+        raise InputError(f"the demo runs the ROS 2 node ({error}); pip install 'dvl_calib_ros[ros]'") from error
+    out = common.console()
+    with tempfile.TemporaryDirectory() as folder:
+        saved = Path(folder) / "live.yaml"
+        log = (Path(folder) / "node.log").open("w+")
+        latency = _latency(arguments.speed)
+        command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args"]
+        command += ["-p", f"result_file:={saved}", "-p", latency]
+        with subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True) as process:
+            rclpy.init()
+            try:
+                _show_live(out, bag, arguments.speed)
+            finally:
+                rclpy.try_shutdown()
+                process.send_signal(signal.SIGINT)
+                process.wait(30)
+        if not saved.exists():
+            log.seek(0)
+            raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")
+        _compare(out, bag, saved, latency)
+    return 0
+
+
+def _latency(speed: float) -> str:
+    """max_latency for a bag that is played so many times faster than recorded: a second on the clock, in stamps."""
+    return f"max_latency:={max(1.0, min(speed, 600.0)):.1f}"
+
+
+def _show_live(out: Any, bag: Path, speed: float) -> None:
+    from rich.live import Live
+
+    from ..node.watch import Watcher
+
+    watcher = Watcher([bag], _truth())
+    out.print(f"[bold]1. Live[/]: node and player are two processes, ROS domain {os.environ['ROS_DOMAIN_ID']}")
+    out.print(f"   playing {bag} at {speed:g} times real time, GNSS drops out on the way\n")
+    with Live(console=out, refresh_per_second=5, get_renderable=watcher.render, transient=False) as live:
+        watcher.run(speed, switch_at_s=470.0, switch_to="M4", back_at_s=500.0)
+        live.refresh()
+    out.print()
+
+
+def _truth() -> dict[str, float]:
+    """What the calibration should find in the bag: φ in degrees, δk in per cent (see bags/README.md)."""
+    import math
+
+    from ..simulation.sensors import DvlErrors, equivalent_error_terms
+
+    roll, pitch, yaw = map(math.radians, MISALIGNMENT_DEG)
+    errors = DvlErrors((roll, pitch, yaw), (0.01 * SCALE_PERCENT,) * 3)
+    misalignment, scale = equivalent_error_terms(errors)
+    angles = dict(zip(("phi_x", "phi_y", "phi_z"), map(math.degrees, misalignment), strict=True))
+    return angles | {"delta_k": 100.0 * scale[0]}
+
+
+def _compare(out: Any, bag: Path, saved: Path, latency: str) -> None:
+    import numpy as np
+    from rich.table import Table
+
+    from ..io.parameter_files import load_parameters
+    from ..io.replay import replay
+    from ..io.result_file import load_initial_calibration
+    from ..io.yaml_files import load_yaml
+
+    out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
+    offline = replay([bag], load_parameters(None, [latency])).result
+    live = load_initial_calibration(saved)
+    table = Table(title="Live node against replay and truth", title_justify="left")
+    for column in ("model", *common.ESTIMATE_COLUMNS, "max |live - replay|"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_row("[bold]truth[/]", *(f"{value:+.2f}" for value in _truth().values()), "")
+    worst = 0.0
+    for name, estimate in offline.estimates.items():
+        difference = max(
+            float(np.abs(live[name].x - estimate.state).max()), float(np.abs(live[name].p - estimate.covariance).max())
+        )
+        worst = max(worst, difference)
+        selected = f"[bold]{name} ◄[/]" if name == offline.selected else name
+        table.add_row(selected, *common.estimate_cells(estimate), f"{difference:.1e}")
+    out.print(table)
+    model = load_yaml(saved, "result file")["model"]
+    out.print(f"The node ended on {model}, the replay on {offline.selected}.")
+    verdict = "agree" if worst < 1e-12 else "[red]DIFFER[/]"
+    out.print(f"Live and offline {verdict}: the largest difference in any state or covariance is {worst:.1e}.")

@@ -1,0 +1,61 @@
+"""Turn trajectories in CSV or NPY into bags.
+
+A file holds rows of time and three values; a folder holds recordings NAME_dvl.csv, each with NAME_gnss.csv and
+NAME_attitude.csv where there are such, and becomes one bag per recording. Units are SI and radians; velocities are
+forward-right-down (frd) unless said otherwise and become ROS's forward-left-up; attitude is roll, pitch, yaw of the
+forward-right-down body in north-east-down.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from . import common
+
+NAME = "import"
+HELP = "turn CSV or NPY trajectories into bags"
+EXAMPLE = "dvl-calib import T12_dvl.csv --gnss T12_gnss.csv --attitude T12_attitude.csv -o T12"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("dvl", type=Path, metavar="DVL", help="CSV or NPY of DVL velocities, or a folder of recordings")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write (for a folder: folder of bags)")
+    parser.add_argument("--gnss", type=Path, metavar="FILE", help="reference velocities")
+    parser.add_argument("--attitude", type=Path, metavar="FILE", help="roll, pitch, yaw in north-east-down")
+    parser.add_argument("--frame", choices=("frd", "flu"), default="frd", help="of the DVL; default: %(default)s")
+    frames = ("frd", "flu", "enu", "ned")
+    parser.add_argument("--gnss-frame", choices=frames, default="frd", help="default: %(default)s")
+    parser.add_argument("--dvl-std", type=float, default=0.0, metavar="M/S", help="covariance to write; 0: not given")
+    parser.add_argument("--gnss-std", type=float, default=0.0, metavar="M/S", help="covariance to write; 0: not given")
+    parser.add_argument(
+        "--start", type=float, default=1_600_000_000.0, metavar="S", help="stamp of time 0, s since 1970; default 1.6e9"
+    )
+    common.add_storage_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Import one recording, or a folder of them."""
+    from ..io.bags import Compression, Storage
+    from ..io.errors import InputError
+    from ..io.trajectories import ImportOptions, import_folder, import_recording
+
+    options = ImportOptions(
+        frame=arguments.frame,
+        gnss_frame=arguments.gnss_frame,
+        dvl_std=arguments.dvl_std,
+        gnss_std=arguments.gnss_std,
+        start_ns=round(arguments.start * 1e9),
+        storage=Storage(arguments.storage),
+        compression=Compression(arguments.compression),
+    )
+    if arguments.dvl.is_dir():
+        if arguments.gnss or arguments.attitude:
+            raise InputError("--gnss and --attitude go with a file; in a folder they are found by their names")
+        written = import_folder(arguments.dvl, arguments.output, options)
+    else:
+        counts = import_recording(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
+        written = {arguments.output: counts}
+    for path, counts in written.items():
+        print(f"{path}: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count))

@@ -1,0 +1,60 @@
+"""Entry point of ``dvl-calib``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from .. import __version__
+from . import benchmark, demo, import_, replay, run, simulate
+
+COMMANDS = (run, replay, simulate, import_, demo, benchmark)
+
+
+def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser with all commands; only the one that is called gets its arguments, which may import much."""
+    parser = argparse.ArgumentParser(
+        prog="dvl-calib",
+        description="Calibrate a Doppler velocity log (DVL): live on ROS 2, or over recorded bags.",
+        epilog="example: dvl-calib replay my_bag --models all",
+    )
+    parser.add_argument("--version", action="version", version=f"dvl-calib {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
+    for module in COMMANDS:
+        command = commands.add_parser(
+            module.NAME,
+            help=module.HELP,
+            description=(module.__doc__ or "").strip(),
+            epilog=f"example: {module.EXAMPLE}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if module.NAME in argv:
+            module.add_arguments(command)
+        command.set_defaults(run=module.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; 0 on success, 2 on bad usage or bad input, said in one line on standard error."""
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = build_parser(argv).parse_args(argv)
+    from ..calibration.parameters import ParameterError
+    from ..io.errors import InputError
+
+    try:
+        return int(arguments.run(arguments) or 0)
+    except (InputError, ParameterError) as error:
+        print(f"dvl-calib {arguments.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"dvl-calib {arguments.command}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

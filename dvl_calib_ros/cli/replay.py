@@ -1,0 +1,77 @@
+"""Calibrate with recorded bags: the same estimator as the node's, over rosbag2 folders or files, several as one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from . import common
+
+NAME = "replay"
+HELP = "calibrate with recorded bags"
+EXAMPLE = "dvl-calib replay my_bag --models all --params calibration.yaml --save calibration_result.yaml"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("--models", default="all", help="models to show, such as M3,M7; default: all")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
+    common.add_parameter_options(parser)
+    common.add_topic_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Replay, print, save."""
+    from ..io.replay import Topics, replay, replay_document
+    from ..io.result_file import check_writable, result_document, result_text, save_text
+
+    models = _models(arguments.models)
+    parameters = common.load(arguments)
+    for target in (arguments.json, arguments.save):
+        if target is not None:
+            check_writable(target)
+    topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
+    with common.progress("replaying") as on_progress:
+        replayed = replay(arguments.bags, parameters, topics, on_progress)
+    result = replayed.result
+    if arguments.json is not None:
+        common.write_json(arguments.json, replay_document(result, models))
+    if arguments.save is not None:
+        save_text(arguments.save, result_text(result_document(result, replayed.dvl_frame)))
+    _print(replayed.notes, result, models)
+
+
+def _models(text: str) -> list[str]:
+    from ..calibration.models import MODELS
+    from ..io.errors import InputError
+
+    if text == "all":
+        return list(MODELS)
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in MODELS:
+            raise InputError(f"--models: {name!r} is no model; there are {', '.join(MODELS)}, or all")
+    if not names:
+        raise InputError(f"--models: name at least one of {', '.join(MODELS)}, or all")
+    return names
+
+
+def _print(notes, result, models) -> None:  # type: ignore[no-untyped-def]
+    errors = common.console(stderr=True)
+    for note in notes:
+        errors.print(f"[yellow]warning:[/] {note}", markup=True, soft_wrap=True)
+    out = common.console()
+    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+    seconds = 1e-9 * (result.last_ns - result.first_ns)
+    title = f"{dvl['accepted']} DVL samples over {seconds:.1f} s, {pairing['paired']} paired with GNSS"
+    out.print(common.result_table(result, models, title))
+    for name in ("dvl", "reference", "imu"):
+        counts = result.counts[name]
+        lost = ", ".join(f"{value} {key}" for key, value in counts.items() if value and key != "received")
+        out.print(f"{name}: {counts['received']} received" + (f": {lost}" if lost else ""))
+    out.print(f"selected: {result.selected} ({result.selected_because})")
+    for entry in result.estimate.observability:
+        if entry.missing:
+            out.print(f"{result.selected} has not seen {entry.name} ({entry.axis}) yet; it needs {entry.missing}")

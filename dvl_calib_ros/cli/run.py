@@ -1,0 +1,47 @@
+"""Run the calibration node, live. Needs ROS 2 Jazzy (or pip install 'dvl_calib_ros[ros]').
+
+Everything after --ros-args goes to ROS 2 unchanged (remappings, namespace, log level).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from . import common
+
+NAME = "run"
+HELP = "run the calibration node, live"
+EXAMPLE = "dvl-calib run --params calibration.yaml --dvl-topic /dvl/velocity -p result_file:=/data/calibration.yaml"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    common.add_parameter_options(parser)
+    common.add_topic_options(parser)
+    parser.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], dest="ros_args", help=argparse.SUPPRESS)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Translate the options for ROS 2 and run the node."""
+    common.load(arguments)  # a bad file or value is said here, in one line, before ROS starts
+    from ..node.main import main
+
+    return main(ros_arguments(arguments))
+
+
+def ros_arguments(arguments: argparse.Namespace) -> list[str]:
+    """The options as ROS 2 arguments."""
+    ros = ["--ros-args"]
+    if arguments.params is not None:
+        ros += ["--params-file", str(Path(arguments.params).resolve())]
+    for override in arguments.overrides:
+        ros += ["-p", override]
+    for default, topic in (
+        ("dvl/twist", arguments.dvl_topic),
+        ("gnss/twist", arguments.gnss_topic),
+        ("imu/data", arguments.imu_topic),
+    ):
+        if topic != default:
+            ros += ["-r", f"{default}:={topic}"]
+    return ros + list(arguments.ros_args)

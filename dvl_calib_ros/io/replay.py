@@ -1,0 +1,217 @@
+"""The calibration over recorded bags: the same estimator as the node's, fed from files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..calibration.calibrator import Calibrator
+from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
+from ..calibration.parameters import Parameters
+from ..calibration.results import Result
+from ..calibration.samples import VelocityFrame
+from .bags import BagReader
+from .errors import InputError
+from .messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from .result_file import estimate_document, load_initial_calibration
+
+BLOCK_SIZE = 512
+# Samples read between two reports of progress
+PROGRESS_EVERY = 2000
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topic names; the node's by default."""
+
+    dvl: str = "dvl/twist"
+    gnss: str = "gnss/twist"
+    imu: str = "imu/data"
+
+    def found_in(self, present: dict[str, str]) -> Topics:
+        """These topics as the bag spells them: with or without a leading slash."""
+        return Topics(*(_spelled(name, present) for name in (self.dvl, self.gnss, self.imu)))
+
+
+def _spelled(name: str, present: dict[str, str]) -> str:
+    return next((spelling for spelling in (name, f"/{name}", name.lstrip("/")) if spelling in present), name)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id."""
+
+    result: Result
+    notes: tuple[str, ...]
+    dvl_frame: str
+
+
+def replay(
+    paths: Sequence[Path],
+    parameters: Parameters,
+    topics: Topics | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Replayed:
+    """Calibrate with the bags at `paths`, read as one in order of log time.
+
+    on_progress: told the share (0..1) that is read. Raises InputError if there is no bag or no usable DVL topic.
+    """
+    initial = load_initial_calibration(Path(parameters.initial_calibration)) if parameters.initial_calibration else None
+    topics = topics or Topics()
+    prior = reference_prior(paths, parameters, topics) if parameters.prior_source == "reference" else None
+    notes: list[str] = []
+    if parameters.prior_source == "initial_window":
+        notes.append(INITIAL_WINDOW_WARNING)
+    calibrator = Calibrator(
+        parameters, prior_sway_heave=prior, initial=initial, block_size=BLOCK_SIZE, on_event=notes.append
+    )
+    feed = MessageFeed(calibrator, notes.append)
+    with BagReader(paths) as bag:
+        present = bag.topics
+        chosen = topics.found_in(present)
+        _check_topics(bag, paths, chosen, notes)
+        _feed_all(bag, chosen, feed, on_progress)
+        notes = bag.notes + notes
+    result = calibrator.result()
+    notes += _warnings(result, topics, feed)
+    return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link")
+
+
+INITIAL_WINDOW_WARNING = (
+    "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 and "
+    "M6 gain nothing over no calibration; prefer fixed"
+)
+
+
+def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
+    present = bag.topics
+    where = ", ".join(map(str, paths))
+    if not present:
+        raise InputError(f"{where}: the bag is empty, it has no topics")
+    if topics.dvl not in present:
+        listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
+        raise InputError(f"{where}: no topic {topics.dvl!r}; set --dvl-topic. The bag has: {listing}")
+    wanted = {"dvl": TWIST_TYPE, "gnss": TWIST_TYPE, "imu": IMU_TYPE}
+    for role, msgtype in wanted.items():
+        name = getattr(topics, role)
+        if name in present and present[name] != msgtype:
+            raise InputError(f"{where}: topic {name} holds {present[name]}, expected {msgtype}; set --{role}-topic")
+    if not bag.message_counts[topics.dvl]:
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages")
+    if topics.gnss not in present:
+        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
+
+
+def _feed_all(bag: BagReader, topics: Topics, feed: MessageFeed, on_progress: Callable[[float], None]) -> None:
+    take: dict[str, Callable[[Any, int], Any]] = {
+        topics.imu: feed.imu, topics.gnss: feed.reference, topics.dvl: feed.dvl,
+    }  # fmt: skip
+    streams = {topics.imu: "imu", topics.gnss: "reference", topics.dvl: "dvl"}
+    start_ns, end_ns = bag.span_ns
+    span_ns = max(end_ns - start_ns, 1)
+    for count, (topic, log_ns, message, undecodable) in enumerate(bag.messages(take)):
+        if undecodable:
+            feed.undecodable(streams[topic], undecodable)
+        else:
+            take[topic](message, log_ns)
+        if count % PROGRESS_EVERY == 0:
+            on_progress((log_ns - start_ns) / span_ns)
+    on_progress(1.0)
+
+
+def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
+    """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError."""
+    calibrator = Calibrator(parameters.replace(prior_source="fixed"))
+    feed = MessageFeed(calibrator, lambda _: None)
+    rotation = None
+    velocities: list[Any] = []
+    first_ns: int | None = None
+    with BagReader(paths) as bag:
+        chosen = topics.found_in(bag.topics)
+        for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
+            if undecodable:
+                continue
+            if topic == chosen.imu:
+                orientation = feed.imu(message, log_ns).orientation
+                rotation = None if orientation is None else rotation_from_quaternion(orientation).T
+                continue
+            sample = feed.reference(message, log_ns)
+            if sample is None:
+                continue
+            first_ns = sample.stamp_ns if first_ns is None else first_ns
+            if sample.stamp_ns - first_ns >= parameters.prior_window * 1e9:
+                break
+            velocity = np.array(sample.velocity)
+            if sample.frame is not VelocityFrame.BODY:
+                if rotation is None:
+                    continue
+                velocity = rotation @ (ENU_FROM_NED @ velocity if sample.frame is VelocityFrame.NED else velocity)
+            velocities.append(velocity)
+    if not velocities:
+        raise InputError(
+            f"prior_source reference: topic {topics.gnss} has no velocity that can be turned into the body frame in "
+            f"its first {parameters.prior_window:g} s; set --gnss-topic, or use prior_source fixed"
+        )
+    _, sway, heave = np.mean(velocities, axis=0).tolist()
+    return sway, heave
+
+
+def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
+    """What the counts say that a user should not overlook."""
+    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+    notes = []
+    if not dvl["accepted"]:
+        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}")
+    if pairing["without_attitude"]:
+        notes.append(
+            f"{pairing['without_attitude']} DVL samples have an earth-frame reference but no attitude from "
+            f"{topics.imu}: the models with GNSS could not use them (set --imu-topic?)"
+        )
+    if dvl["no_turn_rate"]:
+        notes.append(f"{dvl['no_turn_rate']} samples have no angular velocity for max_turn_rate and are not used")
+    if dvl.get("lever_arm_uncompensated"):
+        notes.append(f"lever_arm is not compensated in {dvl['lever_arm_uncompensated']} samples: no angular velocity")
+    if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
+        notes.append("every sample is slower than min_speed: nothing was learnt")
+    if feed.zero_stamps:
+        notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
+    for estimate in result.estimates.values():
+        given = estimate.used + estimate.gated
+        if given and estimate.gated > 0.2 * given:
+            notes.append(
+                f"{estimate.model}: {estimate.gated} of {given} samples are gated; check mounting_rpy and the frames "
+                "before believing it"
+            )
+    return notes
+
+
+def _counted(counts: Any) -> str:
+    return ", ".join(f"{value} {name}" for name, value in counts.items() if value) or "none received"
+
+
+def replay_document(result: Result, models: Sequence[str]) -> dict[str, Any]:
+    """`replay --json`: plain data of the models asked for. Segments are in s since the first DVL sample."""
+    segments = []
+    with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
+        ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
+        segments = [
+            {
+                "from_s": (segment.from_ns - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "to_s": (end - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "model": segment.model,
+            }
+            for segment, end in zip(result.segments, ends, strict=True)
+        ]
+    return {
+        "models": {name: estimate_document(result.estimates[name]) for name in models},
+        "selected": segments,
+        "counts": {name: dict(counts) for name, counts in result.counts.items()},
+        "parameters": dict(result.parameters),
+        "version": __version__,
+    }

@@ -1,0 +1,167 @@
+"""The result of a calibration as a YAML file: never torn when written, never believed blindly when read."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from .. import __version__
+from ..calibration.bank import GaussianState
+from ..calibration.frames import quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.models import MODELS
+from ..calibration.results import Estimate, Result
+from .errors import InputError
+from .yaml_files import load_yaml
+
+FORMAT = "dvl_calib_ros result 1"
+
+
+def estimate_document(estimate: Estimate) -> dict[str, Any]:
+    """One model's estimate as plain data; full precision, in the order of the state."""
+    return {
+        "state_names": list(estimate.state_names),
+        "state": estimate.state.tolist(),
+        "covariance": estimate.covariance.tolist(),
+        "used": estimate.used,
+        "gated": estimate.gated,
+        "convergence": estimate.convergence.value,
+    }
+
+
+def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, Any]:
+    """A result as plain data for the result file."""
+    estimate = result.estimate
+    parameters = result.parameters
+    nominal = rotation_from_rpy(parameters["mounting_rpy"])
+    corrected = estimate.rotation_body_from_dvl(nominal.T)
+    rpy, quaternion = rpy_from_rotation(corrected), quaternion_from_rotation(corrected)
+    names = dict(zip(estimate.state_names, estimate.std.tolist(), strict=True))
+    return {
+        "format": FORMAT,
+        "software": f"dvl_calib_ros {__version__}",
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "model": result.selected,
+        **estimate_document(estimate),
+        "std": {
+            name: f"{math.degrees(std):.4f} deg" if name.startswith("phi") else f"{100 * std:.4f} %"
+            for name, std in names.items()
+        },
+        "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
+        "mounting": {
+            "nominal_rpy": list(parameters["mounting_rpy"]),
+            "corrected_rpy": rpy.tolist(),
+            "corrected_quaternion_xyzw": list(quaternion),
+            "scale_error_xyz": estimate.scale.tolist(),
+            "static_transform_publisher": _static_transform_publisher(
+                parameters["lever_arm"], quaternion, parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
+            ),
+        },
+        "models": {name: estimate_document(each) for name, each in result.estimates.items()},
+        "counts": {name: dict(counts) for name, counts in result.counts.items()},
+        "parameters": dict(parameters),
+    }
+
+
+def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str:
+    numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
+    arguments = " ".join(f"--{name} {value:.9g}" for name, value in numbers)
+    return f"ros2 run tf2_ros static_transform_publisher {arguments} --frame-id {parent} --child-frame-id {child}"
+
+
+def result_text(document: Mapping[str, Any]) -> str:
+    """A result document as YAML."""
+    return yaml.safe_dump(dict(document), sort_keys=False, default_flow_style=None, width=120)
+
+
+def check_writable(path: Path) -> None:
+    """Raise InputError if a result file could not be written there, before anything is collected for it."""
+    folder = path.parent
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file in it, such as {path / 'calibration.yaml'}")
+    if not folder.is_dir():
+        raise InputError(f"{path}: the folder {folder} does not exist; create it or name another")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: the folder {folder} is not writable ({error.strerror}); name another") from error
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a file so that it is always the old or the new one, whole; the old one is kept as ``.bak``.
+
+    Raises InputError; then the old file is untouched.
+    """
+    temporary = ""
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            os.fchmod(file.fileno(), 0o644)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        if path.exists():
+            _keep_backup(path)
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with suppress(OSError):
+            os.unlink(temporary)
+        remedy = "free some space, or name a file on another disk" if error.errno == 28 else "name another place"
+        raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
+
+
+def _keep_backup(path: Path) -> None:
+    backup = path.with_name(path.name + ".bak")
+    with suppress(FileNotFoundError):
+        backup.unlink()
+    try:
+        os.link(path, backup)
+    except OSError:  # a file system without hard links
+        shutil.copy2(path, backup)
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def load_initial_calibration(path: Path) -> dict[str, GaussianState]:
+    """States and covariances of a result file, by model name. Raises InputError naming what is wrong in it."""
+    content = load_yaml(path, "result file")
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
+    models = content.get("models")
+    if not isinstance(models, dict) or not models:
+        raise InputError(f"{path}: damaged, it holds no models")
+    return {name: _gaussian(f"{path}: models: {name}", name, saved) for name, saved in models.items() if name in MODELS}
+
+
+def _gaussian(where: str, name: str, saved: Any) -> GaussianState:
+    model = MODELS[name]
+    try:
+        x = np.array(saved["state"], dtype=float)
+        p = np.array(saved["covariance"], dtype=float)
+        names = tuple(saved["state_names"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: damaged ({type(error).__name__}: {error})") from error
+    if names != model.state_names or x.shape != (model.n_state,) or p.shape != (model.n_state, model.n_state):
+        raise InputError(f"{where}: states {names} are not those of the model, {model.state_names}")
+    if not np.isfinite(x).all() or not np.isfinite(p).all() or not np.allclose(p, p.T, rtol=1e-9, atol=0.0):
+        raise InputError(f"{where}: state or covariance is not finite, or the covariance not symmetric")
+    if np.linalg.eigvalsh(p)[0] <= 0.0:
+        raise InputError(f"{where}: covariance is not positive definite")
+    return GaussianState(x, p)

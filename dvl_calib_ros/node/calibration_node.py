@@ -1,0 +1,280 @@
+"""The node ``dvl_calibration``: topics, parameters, services and diagnostics around a `Calibrator`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+
+from ..calibration.calibrator import Calibrator
+from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
+from ..calibration.models import MODELS
+from ..calibration.parameters import ParameterError, Parameters
+from ..calibration.samples import DvlSample
+from ..io.errors import InputError
+from ..io.messages import MessageFeed
+from ..io.parameter_files import NODE_NAME
+from ..io.replay import INITIAL_WINDOW_WARNING
+from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
+from .diagnostics import diagnose
+from .parameters import declare_parameters
+
+# Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
+QUEUE = 5000
+
+
+class CalibrationNode(Node):
+    """See interfaces.md, "The node". Raises ParameterError or InputError for a configuration that cannot run."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
+        parameters = declare_parameters(self)
+        if parameters.result_file:
+            check_writable(Path(parameters.result_file))
+        initial = None
+        if parameters.initial_calibration:
+            initial = load_initial_calibration(Path(parameters.initial_calibration))
+        if parameters.prior_source == "initial_window":
+            self.get_logger().warning(INITIAL_WINDOW_WARNING)
+        self._calibrator = Calibrator(parameters, initial=initial, on_event=self._warn)
+        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._correction: Correction | None = None
+        self._corrected_by = ""
+        self._published_updates = 0
+        self._started = time.monotonic()
+        self._last_dvl: float | None = None
+
+        self._estimate = self._output_message()
+        self._corrected = self._output_message()
+        self._corrected.header.frame_id = parameters.base_frame
+        latched = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=1,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        self._estimate_publisher = self.create_publisher(TwistWithCovarianceStamped, "~/estimate", latched)
+        self._corrected_publisher = self.create_publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 10)
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._inputs: dict[str, Any] = {}
+        self._subscribe(TwistWithCovarianceStamped, "dvl/twist", self._on_dvl)
+        self._subscribe(TwistWithCovarianceStamped, "gnss/twist", self._on_reference)
+        self._subscribe(Imu, "imu/data", self._on_imu)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/save", self._on_save)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        # steady: diagnostics go on while simulated time stands still or jumps
+        self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._log_configuration()
+
+    def _warn(self, sentence: str) -> None:
+        self.get_logger().warning(sentence)
+
+    def _log_configuration(self) -> None:
+        p = self._calibrator.parameters
+        changed = {name: value for name, value in p.as_dict().items() if value != Parameters().as_dict()[name]}
+        self.get_logger().info(f"model {p.model}; parameters that are not at their default: {changed or 'none'}")
+
+    # ------------------------------------------------------------------ input
+
+    def _subscribe(
+        self,
+        message_type: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+    ) -> None:
+        """Subscribe so that both kinds of publisher are heard.
+
+        A reliable subscription loses nothing but does not hear a best-effort publisher. When such a one turns up, the
+        subscription is made anew as best effort, which hears both.
+        """
+
+        def on_incompatible(event: Any) -> None:
+            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
+                self.get_logger().info(f"{topic}: a publisher is best effort; subscribing as best effort")
+                assert self.executor is not None  # it runs this callback
+                self.executor.create_task(resubscribe)
+            else:
+                self._feed.problems[f"{topic} qos"] = (
+                    f"{topic}: a publisher offers an incompatible QoS ({event.last_policy_kind.name}) and is not heard"
+                )
+                self._warn(self._feed.problems[f"{topic} qos"])
+
+        def resubscribe() -> None:
+            old = self._inputs[topic]
+            self._subscribe(message_type, topic, callback, ReliabilityPolicy.BEST_EFFORT)
+            self.destroy_subscription(old)
+
+        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
+        self._inputs[topic] = self.create_subscription(
+            message_type,
+            topic,
+            callback,
+            profile,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
+        )
+
+    def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
+        self._last_dvl = time.monotonic()
+        sample = self._feed.dvl(message, self.get_clock().now().nanoseconds)
+        if sample is not None:
+            self._publish_corrected(sample)
+        self._publish_if_updated()
+
+    def _on_reference(self, message: TwistWithCovarianceStamped) -> None:
+        self._feed.reference(message, self.get_clock().now().nanoseconds)
+        self._publish_if_updated()
+
+    def _on_imu(self, message: Imu) -> None:
+        self._feed.imu(message, self.get_clock().now().nanoseconds)
+        self._publish_if_updated()
+
+    # ------------------------------------------------------------------ output
+
+    @staticmethod
+    def _output_message() -> TwistWithCovarianceStamped:
+        """A message to be filled again and again; what never changes in it is set here."""
+        message = TwistWithCovarianceStamped()
+        message.twist.covariance[[21, 28, 35]] = NOT_ESTIMATED  # calibrated_twist has no angular velocity
+        return message
+
+    def _publish_if_updated(self) -> None:
+        if self._calibrator.n_updates != self._published_updates:
+            self._publish_estimate()
+
+    def _publish_estimate(self) -> None:
+        calibrator = self._calibrator
+        self._published_updates = calibrator.n_updates
+        model = MODELS[calibrator.selected]
+        state = calibrator.state(model.name)
+        self._correction = Correction(model, state, calibrator.parameters.rotation_dvl_from_body)
+        self._corrected_by = model.name
+        terms, covariance = twist_terms(model, state)
+        message = self._estimate
+        if calibrator.last_ns is not None:
+            _set_stamp(message.header.stamp, calibrator.last_ns)
+        message.header.frame_id = self._feed.dvl_frame or "dvl_link"
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = terms.tolist()
+        message.twist.covariance = covariance.ravel()
+        self._estimate_publisher.publish(message)
+
+    def _publish_corrected(self, sample: DvlSample) -> None:
+        calibrator = self._calibrator
+        parameters = calibrator.parameters
+        if self._correction is None or self._corrected_by != calibrator.selected:
+            name = calibrator.selected
+            self._correction = Correction(MODELS[name], calibrator.state(name), parameters.rotation_dvl_from_body)
+            self._corrected_by = name
+        noise = sample.covariance
+        if noise is None or not noise.any():
+            noise = np.eye(3) * parameters.gnss_free_std**2
+        velocity, covariance = self._correction.apply(np.array(sample.velocity), noise)
+        stamp_ns = sample.stamp_ns - round(parameters.dvl_time_offset * 1e9)
+        if any(parameters.lever_arm):
+            rate = calibrator.latest_angular_velocity(stamp_ns)
+            if rate is not None:
+                velocity = velocity - np.cross(rate, parameters.lever_arm)
+        message = self._corrected
+        _set_stamp(message.header.stamp, stamp_ns)
+        linear = message.twist.twist.linear
+        linear.x, linear.y, linear.z = velocity.tolist()
+        message.twist.covariance.reshape(6, 6)[:3, :3] = covariance
+        self._corrected_publisher.publish(message)
+
+    def _publish_diagnostics(self) -> None:
+        silent = None if self._last_dvl is None else time.monotonic() - self._last_dvl
+        status = diagnose(
+            self._calibrator.result(),
+            self._calibrator.selection,
+            list(self._feed.problems.values()),
+            silent,
+            time.monotonic() - self._started,
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics_publisher.publish(message)
+
+    # ------------------------------------------------------------------ services, parameters
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._calibrator.reset()
+        self._correction = None
+        self._publish_estimate()
+        response.success, response.message = True, "all samples forgotten"
+        return response
+
+    def _on_save(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        path = self._calibrator.parameters.result_file
+        if not path:
+            response.message = "parameter result_file is not set: ros2 param set /dvl_calibration result_file FILE"
+            return response
+        try:
+            self._save(Path(path))
+        except InputError as error:
+            response.message = str(error)
+            self.get_logger().error(response.message)
+        else:
+            response.success, response.message = True, f"saved to {path}"
+        return response
+
+    def _save(self, path: Path) -> None:
+        save_text(path, self._result_text())
+
+    def _result_text(self) -> str:
+        return result_text(result_document(self._calibrator.result(), self._feed.dvl_frame or "dvl_link"))
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            changed = self._changed(parameters)
+            if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
+                check_writable(Path(changed.result_file))
+        except (ParameterError, InputError) as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply_parameters(self, parameters: list[Parameter]) -> None:
+        before = self._calibrator.selected
+        self._calibrator.set_parameters(self._changed(parameters))
+        if self._calibrator.selected != before:
+            self.get_logger().info(f"running {self._calibrator.selected} instead of {before}")
+            self._publish_estimate()
+
+    def _changed(self, parameters: list[Parameter]) -> Parameters:
+        own = Parameters().as_dict()
+        return self._calibrator.parameters.replace(
+            **{parameter.name: parameter.value for parameter in parameters if parameter.name in own}
+        )
+
+    # ------------------------------------------------------------------ end
+
+    def finish(self) -> None:
+        """Save the result if a file is named for it; print it if it cannot be saved, so that it is not lost."""
+        path = self._calibrator.parameters.result_file
+        if not path:
+            return
+        try:
+            self._save(Path(path))
+            print(f"calibration_node: saved to {path}", file=sys.stderr)
+        except InputError as error:
+            print(f"calibration_node: {error}. The result follows.\n{self._result_text()}", file=sys.stderr)
+
+
+def _set_stamp(stamp: Any, nanoseconds: int) -> None:
+    stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)

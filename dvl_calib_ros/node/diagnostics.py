@@ -1,0 +1,76 @@
+"""What /diagnostics says: one status, made of a calibration's result."""
+
+from __future__ import annotations
+
+import math
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from ..calibration.models import MODELS
+from ..calibration.results import Estimate, Result
+from ..calibration.selection import Selection
+
+# A DVL that has sent nothing for so long is a fault, s.
+SILENCE_S = 5.0
+# Share of gated samples above which the configuration is more likely wrong than the data.
+SUSPICIOUS_GATED = 0.2
+
+
+def diagnose(
+    result: Result, selection: Selection, problems: list[str], dvl_silent_s: float | None, running_s: float
+) -> DiagnosticStatus:
+    """Status of the running calibration. dvl_silent_s: wall time since the last DVL message, None before the first."""
+    estimate = result.estimate
+    faults, warnings = _faults(dvl_silent_s, running_s), _warnings(estimate, problems)
+    level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
+    status = DiagnosticStatus(level=level, name="dvl_calibration: calibration", hardware_id="dvl")
+    status.message = "; ".join(faults + warnings) or f"{result.selected} {estimate.convergence.value}"
+    values = {
+        "model": result.selected,
+        "why": result.selected_because,
+        "gnss": selection.gnss.reason,
+        "convergence": estimate.convergence.value,
+        **_estimate_values(estimate),
+        **_count_values(result),
+    }
+    for number, problem in enumerate(problems, start=1):
+        values[f"problem {number}"] = problem
+    status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return status
+
+
+def _faults(dvl_silent_s: float | None, running_s: float) -> list[str]:
+    if dvl_silent_s is None:
+        return ["no DVL message yet: check the topic dvl/twist and its type"] if running_s > SILENCE_S else []
+    return [f"no DVL message for {dvl_silent_s:.0f} s"] if dvl_silent_s > SILENCE_S else []
+
+
+def _warnings(estimate: Estimate, problems: list[str]) -> list[str]:
+    warnings = list(problems)
+    given = estimate.used + estimate.gated
+    if given >= 20 and estimate.gated > SUSPICIOUS_GATED * given:
+        warnings.append(f"{estimate.gated} of {given} samples gated: check mounting_rpy and the frames")
+    if estimate.used >= 20 and estimate.mean_nis > estimate.nis_bounds[1]:
+        warnings.append("innovations larger than R and P allow: σ is too small, raise gnss_aided_std or gnss_free_std")
+    return warnings
+
+
+def _estimate_values(estimate: Estimate) -> dict[str, str]:
+    values = {}
+    for name, value, entry in zip(estimate.state_names, estimate.state, estimate.observability, strict=True):
+        factor, unit = (math.degrees(1.0), "deg") if name.startswith("phi") else (100.0, "%")
+        values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
+        values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
+        values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"
+    low, high = estimate.nis_bounds
+    rows = MODELS[estimate.model].n_measurement
+    values["mean NIS"] = f"{estimate.mean_nis:.3f} of {rows} (99 %: {low:.3f} .. {high:.3f})"
+    return values
+
+
+def _count_values(result: Result) -> dict[str, str]:
+    values = {"samples used": str(result.estimate.used), "samples gated": str(result.estimate.gated)}
+    for stream, counts in result.counts.items():
+        for name, count in counts.items():
+            values[f"{stream} {name}"] = str(count)
+    return values

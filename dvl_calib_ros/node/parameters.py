@@ -1,0 +1,53 @@
+"""The schema's parameters as ROS 2 parameters with descriptors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType
+from rclpy.node import Node
+
+from ..calibration.parameters import SCHEMA, Parameters, ParameterSpec
+from ..io.parameter_files import is_ros_parameter
+
+_TYPES = {
+    "string": ParameterType.PARAMETER_STRING,
+    "bool": ParameterType.PARAMETER_BOOL,
+    "double": ParameterType.PARAMETER_DOUBLE,
+    "double_array": ParameterType.PARAMETER_DOUBLE_ARRAY,
+}
+
+
+def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
+    """What `ros2 param describe` shows."""
+    constraints = []
+    if spec.choices:
+        constraints.append("one of " + ", ".join(spec.choices))
+    if spec.kind == "double_array":
+        constraints.append(f"{spec.length} numbers, each {spec.low:g} .. {spec.high:g}")
+    described = ParameterDescriptor(
+        type=_TYPES[spec.kind],
+        description=spec.description + (f" [{spec.unit}]" if spec.unit else ""),
+        additional_constraints="; ".join(constraints),
+        read_only=spec.read_only,
+    )
+    if spec.kind == "double" and spec.low is not None and spec.high is not None:
+        described.floating_point_range = [FloatingPointRange(from_value=spec.low, to_value=spec.high, step=0.0)]
+    return described
+
+
+def declare_parameters(node: Node) -> Parameters:
+    """Declare every parameter, with the values given at the start. Raises ParameterError.
+
+    The node must have declared its overrides by itself; so names that do not exist are seen (ROS 2 would ignore
+    them), and whole numbers are taken where a double is meant.
+    """
+    given: dict[str, Any] = {
+        name: node.get_parameter(name).value for name in node.get_parameters_by_prefix("") if not is_ros_parameter(name)
+    }
+    parameters = Parameters.from_mapping(given)
+    for name in given:
+        node.undeclare_parameter(name)
+    for name, spec in SCHEMA.items():
+        node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)
+    return parameters

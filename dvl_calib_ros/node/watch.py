@@ -1,0 +1,118 @@
+"""Watches the node from outside while a bag is played to it, as the demo shows it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rich.console import Group
+from rich.table import Table
+
+from ..calibration.correction import NOT_ESTIMATED
+from ..io.parameter_files import NODE_NAME
+from .player import BagPlayer
+
+# place in ~/estimate's covariance diagonal, factor to what people read
+SHOWN = {
+    "phi_x": ("φx roll °", 3, math.degrees(1.0)),
+    "phi_y": ("φy pitch °", 4, math.degrees(1.0)),
+    "phi_z": ("φz yaw °", 5, math.degrees(1.0)),
+    "delta_k": ("scale %", 0, 100.0),
+}
+
+
+class Watcher:
+    """Plays bags to the node and keeps what it says, for `render` to show. truth: in degrees and per cent."""
+
+    def __init__(self, paths: Sequence[Path], truth: Mapping[str, float]) -> None:
+        self._truth = truth
+        self._node = rclpy.create_node("dvl_calib_demo")
+        latched = QoSProfile(
+            depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+        )
+        self._node.create_subscription(TwistWithCovarianceStamped, f"{NODE_NAME}/estimate", self._on_estimate, latched)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self._parameters = self._node.create_client(SetParameters, f"{NODE_NAME}/set_parameters")
+        self._player = BagPlayer(self._node, paths)
+        self._time = 0.0
+        self._estimate: TwistWithCovarianceStamped | None = None
+        self._diagnostics: dict[str, str] = {}
+        self._events: list[str] = []
+        self._shown_why = ""
+
+    def run(self, speed: float, switch_at_s: float, switch_to: str, back_at_s: float) -> None:
+        """Play everything; set parameter model to switch_to at one time and back to auto at another (s)."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self._node)
+
+        def spin() -> None:
+            with suppress(ExternalShutdownException):  # Ctrl-C ends the demo, not with a traceback
+                executor.spin()
+
+        spinning = threading.Thread(target=spin, daemon=True)
+        spinning.start()
+        switches = [(switch_at_s, switch_to), (back_at_s, "auto")]
+
+        def on_time(at: float) -> None:
+            self._time = at
+            if switches and at >= switches[0][0]:
+                self._switch(switches.pop(0)[1])
+
+        try:
+            self._player.wait_for_subscribers()
+            self._player.play(speed, on_time)
+        finally:
+            executor.shutdown()
+            spinning.join(5.0)
+            self._node.destroy_node()
+
+    def _switch(self, model: str) -> None:
+        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=model)
+        request = SetParameters.Request(parameters=[ParameterMessage(name="model", value=value)])
+        self._events.append(f"{self._time:6.1f} s  ros2 param set /{NODE_NAME} model {model}")
+        self._parameters.call_async(request)
+
+    def _on_estimate(self, message: TwistWithCovarianceStamped) -> None:
+        self._estimate = message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self._diagnostics = {item.key: item.value for status in message.status for item in status.values}
+        why = f"running {self._diagnostics.get('model')} ({self._diagnostics.get('why')})"
+        if why != self._shown_why:
+            self._shown_why = why
+            self._events.append(f"{self._time:6.1f} s  {why}")
+
+    def render(self) -> Any:
+        """What is known now, for a rich display."""
+        table = Table(title=f"{self._time:6.1f} s", title_justify="left")
+        for column in ("", "truth", "estimate", "± 1σ"):
+            table.add_column(column, justify="right", no_wrap=True, min_width=9)
+        for name, (label, place, factor) in SHOWN.items():
+            table.add_row(label, f"{self._truth[name]:+.2f}", *self._cells(place, factor))
+        used, gated = self._diagnostics.get("samples used", "-"), self._diagnostics.get("samples gated", "-")
+        state = self._diagnostics.get("convergence", "waiting for data")
+        table.caption = f"model {self._diagnostics.get('model', '-')}, {state}, {used} used, {gated} gated"
+        return Group(table, self._diagnostics.get("gnss", ""), *self._events[-10:])
+
+    def _cells(self, place: int, factor: float) -> tuple[str, str]:
+        if self._estimate is None:
+            return "-", "-"
+        twist = self._estimate.twist
+        variance = float(twist.covariance[7 * place])
+        if variance == NOT_ESTIMATED:
+            return "-", "-"
+        linear, angular = twist.twist.linear, twist.twist.angular
+        value = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)[place]
+        return f"{factor * value:+.2f}", f"{factor * math.sqrt(variance):.2f}"

@@ -1,0 +1,83 @@
+"""What sensors make of a motion: a DVL down to its four beams, and GNSS velocity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..calibration.error_model import distort
+from ..calibration.frames import Array, rotation_from_rpy
+
+JANUS_FROM_VERTICAL = np.deg2rad(20.0)
+JANUS_AZIMUTHS = np.deg2rad([45.0, 135.0, 225.0, 315.0])
+
+# Unit vectors of the beams (4, 3): velocity along each beam = BEAMS @ velocity (protocol.md)
+BEAMS: Array = np.column_stack(
+    [
+        np.cos(JANUS_AZIMUTHS) * np.sin(JANUS_FROM_VERTICAL),
+        np.sin(JANUS_AZIMUTHS) * np.sin(JANUS_FROM_VERTICAL),
+        np.full(4, np.cos(JANUS_FROM_VERTICAL)),
+    ]
+)
+AXES_FROM_BEAMS: Array = np.linalg.pinv(BEAMS)  # least squares
+
+
+@dataclass(frozen=True)
+class DvlErrors:
+    """Errors of a DVL.
+
+    misalignment_rpy: (3,) rad, actual DVL in its nominal orientation, as a URDF origin. scale: (3,) per axis.
+    beam_bias: (4,) m/s. beam_std: m/s of white noise on each beam.
+    """
+
+    misalignment_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    beam_bias: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    beam_std: float = 0.0
+
+
+def equivalent_error_terms(errors: DvlErrors) -> tuple[Array, Array]:
+    """φ (3,) rad and δk (3,) of the calibration's error model that stand for these errors: the truth to compare with.
+
+    A rotation by θ about u is cosθ (I + tanθ [u×]) across u, so φ = tanθ u, and its cosine goes into the scale.
+    """
+    vector = Rotation.from_matrix(rotation_from_rpy(errors.misalignment_rpy).T).as_rotvec()
+    angle = float(np.linalg.norm(vector))
+    misalignment = vector * (np.tan(angle) / angle if angle else 1.0)
+    return misalignment, (1.0 + np.asarray(errors.scale)) * np.cos(angle) - 1.0
+
+
+def measure_dvl(
+    velocity_body: Array, errors: DvlErrors, rotation_dvl_from_body: Array, rng: np.random.Generator
+) -> Array:
+    """Velocities (N, 3) m/s that the DVL reports, in its own frame: turned, scaled, beam by beam, least squares."""
+    turned = velocity_body @ (rotation_from_rpy(errors.misalignment_rpy).T @ rotation_dvl_from_body).T
+    scaled = turned * (1.0 + np.asarray(errors.scale))
+    beams = scaled @ BEAMS.T + np.asarray(errors.beam_bias)
+    beams = beams + rng.normal(0.0, errors.beam_std, beams.shape)
+    return beams @ AXES_FROM_BEAMS.T
+
+
+def axis_covariance(beam_std: float) -> Array:
+    """Covariance (3, 3) (m/s)² of the axes for white noise on the beams."""
+    return beam_std**2 * AXES_FROM_BEAMS @ AXES_FROM_BEAMS.T
+
+
+def measure_dvl_matched(
+    velocity_body: Array,
+    misalignment: Array,
+    scale: Array,
+    std: float,
+    rotation_dvl_from_body: Array,
+    rng: np.random.Generator,
+) -> Array:
+    """As the models assume it: the error model itself (φ rad, δk, DVL frame) and white noise per axis; (N, 3) m/s."""
+    measured = distort(velocity_body, misalignment, scale, rotation_dvl_from_body)
+    return measured + rng.normal(0.0, std, measured.shape)
+
+
+def measure_gnss(velocity: Array, std: float, rng: np.random.Generator) -> Array:
+    """GNSS velocities (N, 3) m/s with white noise per axis."""
+    return velocity + rng.normal(0.0, std, velocity.shape)

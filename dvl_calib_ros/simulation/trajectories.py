@@ -1,0 +1,107 @@
+"""Vehicle motion to simulate: legs and turns on the surface or at constant depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import cycle
+
+import numpy as np
+
+from ..calibration.frames import Array, rotation_from_rpy
+
+SPEED_MPS = 1.5
+TURN_RATE = np.deg2rad(9.0)
+# Sway in a turn: a vehicle without keel skids outward in proportion to centripetal acceleration (0.25 s: 3.5 degrees
+# of sideslip at 9 degrees per second)
+SKID_S = 0.25
+WAVE_PERIOD_S = 6.0
+WAVE_ROLL, WAVE_PITCH = np.deg2rad(2.0), np.deg2rad(1.0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the vehicle does at N times.
+
+    time: (N,) s from 0. velocity_body: (N, 3) m/s of the reference point over ground, forward-left-up.
+    rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame.
+    """
+
+    time: Array
+    velocity_body: Array
+    rotation_enu_from_body: Array
+    angular_velocity: Array
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A stretch of constant speed (m/s) and yaw rate (rad/s)."""
+
+    seconds: float
+    speed: float
+    yaw_rate: float = 0.0
+
+
+def _quarter(sign: float = 1.0, speed: float = SPEED_MPS) -> Leg:
+    return Leg(np.pi / 2 / TURN_RATE, speed, sign * TURN_RATE)
+
+
+def _half(sign: float, speed: float = SPEED_MPS) -> Leg:
+    return Leg(np.pi / TURN_RATE, speed, sign * TURN_RATE)
+
+
+def _full(sign: float, speed: float) -> Leg:
+    return Leg(2 * np.pi / TURN_RATE, speed, sign * TURN_RATE)
+
+
+# One round each, repeated for as long as wanted.
+ROUNDS: Mapping[str, Callable[[], list[Leg]]] = {
+    "straight": lambda: [Leg(60.0, SPEED_MPS)],
+    "box": lambda: [
+        part for speed in (1.0, 1.5, 2.0) for _ in range(4) for part in (Leg(20.0, speed), _quarter(1.0, speed))
+    ],
+    "lawnmower": lambda: [Leg(60.0, SPEED_MPS), _half(1.0), Leg(60.0, SPEED_MPS), _half(-1.0)],
+    "figure8": lambda: [part for speed in (1.0, 2.0) for part in (_full(1.0, speed), _full(-1.0, speed))],
+}
+
+
+def make_motion(trajectory: str, seconds: float, rate_hz: float) -> Motion:
+    """Motion along a trajectory of `ROUNDS` for so long, sampled at a rate."""
+    time = np.arange(0.0, seconds, 1.0 / rate_hz)
+    speed, yaw_rate = _smoothed(ROUNDS[trajectory](), seconds, time)
+    yaw = _integral(time, yaw_rate)
+    phase = 2 * np.pi * time / WAVE_PERIOD_S
+    roll, pitch = WAVE_ROLL * np.sin(phase), WAVE_PITCH * np.cos(1.3 * phase)
+    sway = -SKID_S * yaw_rate * speed
+    rotation = rotation_from_rpy(np.column_stack([roll, pitch, yaw]))
+    roll_rate, pitch_rate = np.gradient(roll, time), np.gradient(pitch, time)
+    # Euler angle rates to body rates, Z-Y-X order
+    rates = np.column_stack(
+        [
+            roll_rate - yaw_rate * np.sin(pitch),
+            pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
+            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(roll) * np.cos(pitch),
+        ]
+    )
+    return Motion(time, np.column_stack([speed, sway, np.zeros_like(speed)]), rotation, rates)
+
+
+def _smoothed(one_round: list[Leg], seconds: float, time: Array) -> tuple[Array, Array]:
+    """Speed (N,) and yaw rate (N,), with changes spread over 3 s: a vehicle has inertia."""
+    ends, speeds, yaw_rates = [], [], []
+    end = 0.0
+    for leg in cycle(one_round):
+        end += leg.seconds
+        ends.append(end)
+        speeds.append(leg.speed)
+        yaw_rates.append(leg.yaw_rate)
+        if end > seconds:
+            break
+    spread = np.linspace(-1.5, 1.5, 31)
+    at = np.searchsorted(ends, np.clip(time[:, None] + spread, 0.0, seconds))
+    return np.array(speeds)[at].mean(axis=1), np.array(yaw_rates)[at].mean(axis=1)
+
+
+def _integral(time: Array, rate: Array) -> Array:
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
+    return np.concatenate([[0.0], np.cumsum(steps)])

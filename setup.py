@@ -1,0 +1,42 @@
+"""Python package and ament_python package in one."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "dvl_calib_ros"
+ROS_FREE = ["numpy>=1.26", "scipy>=1.11", "pyyaml>=6.0", "rich>=13.7", "rosbags>=0.10", "mcap>=1.2"]
+ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
+TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5"]
+
+
+def shared(folder: str) -> list:
+    """The files of a folder, to be installed under share/ with their sub-folders."""
+    files = [path for path in Path(folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    return [(f"share/{NAME}/{path.parent.as_posix()}", [path.as_posix()]) for path in sorted(files)]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Calibrate a Doppler velocity log (DVL), live on ROS 2 Jazzy and over recorded bags",
+    license="Apache-2.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    python_requires=">=3.10",
+    install_requires=ROS_FREE,
+    extras_require={"ros": ROS, "test": TEST},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        *shared("bags"),
+        *shared("config"),
+        *shared("launch"),
+    ],
+    entry_points={
+        "console_scripts": [
+            "dvl-calib = dvl_calib_ros.cli.main:main",
+            "calibration_node = dvl_calib_ros.node.main:main",
+        ]
+    },
+    zip_safe=True,
+)
