@@ -59,6 +59,7 @@ class ModelBank:
         self._process = self._process_rate(parameters)
         self._needs_prior = np.array([model.needs_prior for model in self.models])
         self._last_stamp_ns: int | None = None
+        self.n_given = 0
         self._used = np.zeros(k, dtype=np.int64)
         self._gated = np.zeros(k, dtype=np.int64)
         self._nis_sum = np.zeros(k)
@@ -75,9 +76,10 @@ class ModelBank:
     ) -> None:
         """Update every model with a block of N samples.
 
-        noise: R, broadcastable to (N, 3, 3) (m/s)². weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool,
+        noise: R, (N or 1, 3, 3) (m/s)². weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool,
         whether prior sway and heave were known at the sample; models that need them skip it where not.
         """
+        self.n_given += len(stamps_ns)
         data = self._measurements(seen, noise, weight, prior_known)
         process = self._process_noise(stamps_ns)
         if process is None and len(stamps_ns) >= BATCH_FROM:
@@ -97,7 +99,7 @@ class ModelBank:
             z_model, h_model = model.linearise(seen)
             z[index, :, : model.n_measurement] = z_model
             h[index, :, : model.n_measurement, : model.n_state] = h_model
-        r = np.where(self._own_rows, noise, np.eye(N_MEASUREMENT))
+        r = noise[None] if self._own_rows.all() else np.where(self._own_rows, noise, np.eye(N_MEASUREMENT))
         usable = ~self._needs_prior[:, None] | prior_known
         return kalman.Measurements(z, h, r, weight, usable, self._gate)
 

@@ -27,7 +27,7 @@ from .results import Estimate, Result
 from .samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from .screening import is_valid_velocity, unit_quaternion, usable_covariance
 from .selection import Selection
-from .streams import Bracket, Order, Sequencer, Track
+from .streams import Bracket, Order, S, Sequencer, Track
 
 SECOND_NS = 1_000_000_000
 # How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.
@@ -58,7 +58,7 @@ class Calibrator:
     """Calibrates with all models at once, see the module's picture.
 
     prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
-    by model name. block_size: samples per update of the models. on_event: told in words of restarts and the like.
+    by model name. block_size: samples gathered for an update of the models. on_event: told of restarts in words.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Calibrator:
     def reset(self) -> None:
         """Forget all samples and what was learnt from them."""
         p = self.parameters
-        jump_ns = round(p.max_time_jump * 1e9)
+        jump_ns = self._max_jump_ns = round(p.max_time_jump * 1e9)
         latency_ns = round(p.max_latency * 1e9)
         gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
         retention_ns = RETENTION_NS + gnss_ns + imu_ns + latency_ns
@@ -102,6 +102,8 @@ class Calibrator:
         self._reference: Track[ReferenceSample] = Track(gnss_ns, latency_ns, retention_ns)
         self._imu: Track[ImuSample] = Track(imu_ns, latency_ns, retention_ns)
         self._tally: dict[str, Counter[str]] = {name: Counter() for name in ("dvl", "reference", "imu", "pairing")}
+        # streams that still bring samples from before a restart of the DVL's stamps
+        self._before_restart: set[str] = set()
         self._forget_dvl()
 
     def _forget_dvl(self) -> None:
@@ -116,7 +118,6 @@ class Calibrator:
         self.last_ns: int | None = None
         self._decided_ns: int | None = None
         self._prior = _PriorWindow(self.parameters, self._prior_sway_heave)
-        self.n_updates = 0
 
     # ------------------------------------------------------------------ input
 
@@ -154,13 +155,7 @@ class Calibrator:
         if self._decided_ns is not None and sample.stamp_ns < self._decided_ns:
             tally["late"] += 1  # a DVL sample has gone on without it: max_latency is too short
         sample = sample._replace(covariance=covariance)
-        order, admitted = self._reference_order.admit(sample)
-        self._count_order(tally, order)
-        if order is Order.CONFIRMED_RESTART:
-            self._reference.clear()
-        for one in admitted:
-            self._reference.append(one)
-        if admitted:
+        if self._keep("reference", self._reference_order, self._reference, sample):
             self._advance()
 
     def feed_imu(self, sample: ImuSample) -> None:
@@ -173,19 +168,32 @@ class Calibrator:
         if orientation is None and angular_velocity is None:
             tally["invalid"] += 1
             return
-        order, admitted = self._imu_order.admit(ImuSample(sample.stamp_ns, orientation, angular_velocity))
-        self._count_order(tally, order)
-        if order is Order.CONFIRMED_RESTART:
-            self._imu.clear()
-        for one in admitted:
-            self._imu.append(one)
-        if admitted and (self._awaiting_imu or self._awaiting_reference):
+        sample = ImuSample(sample.stamp_ns, orientation, angular_velocity)
+        kept = self._keep("imu", self._imu_order, self._imu, sample)
+        if kept and (self._awaiting_imu or self._awaiting_reference):
             self._advance()
 
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
         self._tally[stream]["received"] += 1
         self._tally[stream][reason] += 1
+
+    def _keep(self, name: str, sequencer: Sequencer[S], track: Track[S], sample: S) -> bool:
+        """Put a sample on its track if its stamp allows; whether the track has grown."""
+        order, admitted = sequencer.admit(sample)
+        self._count_order(self._tally[name], order)
+        if order is Order.CONFIRMED_RESTART:
+            track.clear()
+            self._before_restart.discard(name)
+        elif name in self._before_restart and admitted:
+            dvl_ns = self._dvl_order.last_ns or 0
+            if admitted[-1].stamp_ns > dvl_ns + self._max_jump_ns:
+                self._tally[name]["before_restart"] += len(admitted)
+                return False
+            self._before_restart.discard(name)
+        for one in admitted:
+            track.append(one)
+        return bool(admitted)
 
     @staticmethod
     def _count_order(tally: Counter[str], order: Order) -> None:
@@ -203,10 +211,11 @@ class Calibrator:
             self._tally[name].clear()
         dvl_order.stray = 0
         self._forget_dvl()
-        # what the other streams brought from before the restart must not be paired with what comes after it
-        limit_ns = stamp_ns + round(self.parameters.max_time_jump * 1e9)
-        self._reference.drop_after(limit_ns)
-        self._imu.drop_after(limit_ns)
+        # a stream that has not gone back yet brings what must not be paired with what comes now
+        for name, track in (("reference", self._reference), ("imu", self._imu)):
+            if track.newest_ns is not None and track.newest_ns > stamp_ns + self._max_jump_ns:
+                track.clear()
+                self._before_restart.add(name)
 
     # ------------------------------------------------------------------ pairing
 
@@ -231,6 +240,10 @@ class Calibrator:
             self._awaiting_reference.popleft()
             self._decided_ns = sample.stamp_ns
             self._to_aided(sample, bracket)
+        if len(self._unaided_block) >= self._block_size:
+            self._update_unaided()
+        if len(self._aided_block) >= self._block_size:
+            self._update_aided()
 
     def _to_unaided(self, sample: _Moving) -> None:
         if self._needs_turn_rate:
@@ -241,8 +254,6 @@ class Calibrator:
                 self._tally["dvl"]["lever_arm_uncompensated"] += 1
             prior_known = self._prior.known_at(sample.stamp_ns, sample.velocity)
             self._unaided_block.append((sample, prior_known))
-            if len(self._unaided_block) >= self._block_size:
-                self._update_unaided()
         else:
             self._tally["dvl"][unusable] += 1
             sample = sample._replace(usable=False)
@@ -266,11 +277,8 @@ class Calibrator:
         paired = None if bracket is None else self._pair(sample, bracket)
         self._tally["pairing"]["paired" if paired else "unpaired"] += 1
         self.selection.update(sample.stamp_ns, paired is not None, self.parameters)
-        if paired is None or not sample.usable:
-            return
-        self._aided_block.append(paired)
-        if len(self._aided_block) >= self._block_size:
-            self._update_aided()
+        if paired is not None and sample.usable:
+            self._aided_block.append(paired)
 
     def _pair(self, sample: _Moving, bracket: Bracket[ReferenceSample]) -> _Paired | None:
         before, after, fraction = bracket
@@ -334,7 +342,6 @@ class Calibrator:
         known = np.array([known for _, known in block])
         stamps = [sample.stamp_ns for sample in samples]
         self._unaided.update(stamps, seen, self._unaided_noise, np.ones(len(samples)), known)
-        self.n_updates += len(samples)
 
     def _update_aided(self) -> None:
         block, self._aided_block = self._aided_block, []
@@ -345,10 +352,9 @@ class Calibrator:
         weight = np.array([paired.weight for paired in block])
         stamps = [sample.stamp_ns for sample in samples]
         self._aided.update(stamps, seen, self._aided_covariance(block), weight, np.ones(len(block), dtype=bool))
-        self.n_updates += len(samples)
 
     def _observations(self, samples: list[_Moving], reference_body: Array | None) -> Observations:
-        lever = np.zeros((len(samples), 3))
+        lever = None
         if self._lever_arm is not None:
             rates = np.array([sample.angular_velocity or (0.0, 0.0, 0.0) for sample in samples])
             lever = np.cross(rates, self._lever_arm)
@@ -416,6 +422,10 @@ class Calibrator:
         self.parameters = parameters
         if self._decided_ns is not None:
             self.selection.record(self._decided_ns, parameters)
+
+    def n_given(self, name: str) -> int:
+        """Number of samples that a model was given so far; it grows when there may be a new estimate."""
+        return self._bank(name).n_given
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from .bank import GaussianState
 from .error_model import correction_jacobian, correction_matrix
 from .frames import Array
 from .models import Model
 
+_SCALE_FIRST = [3, 4, 5, 0, 1, 2]
 NOT_ESTIMATED = -1.0  # variance of a component that the model does not estimate
 
 
@@ -17,7 +16,7 @@ def twist_terms(model: Model, state: GaussianState) -> tuple[Array, Array]:
 
     A component that the model does not estimate is 0 with variance NOT_ESTIMATED.
     """
-    terms = np.roll(model.to_error_terms(), 3, axis=0)
+    terms = model.error_terms_from_state[_SCALE_FIRST]
     covariance = terms @ state.p @ terms.T
     missing = ~terms.any(axis=1)
     covariance[missing, missing] = NOT_ESTIMATED
@@ -28,7 +27,7 @@ class Correction:
     """Corrects DVL velocities with one model's state."""
 
     def __init__(self, model: Model, state: GaussianState, rotation_dvl_from_body: Array) -> None:
-        terms = model.to_error_terms()
+        terms = model.error_terms_from_state
         errors = terms @ state.x
         self._rotation_dvl_from_body = rotation_dvl_from_body
         self._matrix = correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body)

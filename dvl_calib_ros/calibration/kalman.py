@@ -33,7 +33,7 @@ MAX_GATE_PASSES = 12
 class Measurements:
     """N measurements for each of K models, padded to m rows and n states.
 
-    z: (K, N, m). h: (K, N, m, n). r: broadcastable to (K, N, m, m), symmetric positive definite. weight: (N,), share
+    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (N,), share
     of its own information that a sample adds, in 0..1 (below 1 for samples that share one reference sample's noise).
     usable: (K, N), False where a model must not use a sample. gate: (K,), largest normalised innovation squared that
     is used, inf for no gate.
@@ -76,16 +76,16 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
 
     x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q that the state gains before each sample, or None.
     """
-    k, n_samples, m = data.z.shape
+    k, n_samples = data.z.shape[:2]
     x, p = x.copy(), p.copy()
     identity = np.eye(x.shape[1])
-    r = np.broadcast_to(data.r, (k, n_samples, m, m))
+    one_r = data.r.shape[1] == 1
     used = np.zeros((k, n_samples), dtype=bool)
     nis = np.zeros((k, n_samples))
     for i in range(n_samples):
         if process is not None:
             p += process[i]
-        h, r_i, weight = data.h[:, i], r[:, i], data.weight[i]
+        h, r_i, weight = data.h[:, i], data.r[:, 0 if one_r else i], data.weight[i]
         pht = p @ h.transpose(0, 2, 1)
         s = h @ pht + r_i
         s_inverse = np.linalg.inv(s)
@@ -168,10 +168,16 @@ def _running_sum(first: Array, gained: Array, used: Mask) -> Array:
 
 def _recursion_history(x: Array, p: Array, data: Measurements) -> History:
     xs, ps, used, nis = [], [], [], []
-    r = np.broadcast_to(data.r, (*data.z.shape, data.z.shape[-1]))
     for i in range(data.z.shape[1]):
         at = slice(i, i + 1)
-        one = Measurements(data.z[:, at], data.h[:, at], r[:, at], data.weight[at], data.usable[:, at], data.gate)
+        one = Measurements(
+            data.z[:, at],
+            data.h[:, at],
+            data.r if data.r.shape[1] == 1 else data.r[:, at],
+            data.weight[at],
+            data.usable[:, at],
+            data.gate,
+        )
         after = recursion(x, p, one)
         x, p = after.x, after.p
         xs.append(x)

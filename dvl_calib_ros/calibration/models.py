@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,15 +28,75 @@ class Observations:
 
     velocity_dvl: (N, 3) m/s measured, DVL frame. reference_body: (N, 3) m/s GNSS velocity of the reference point in
     the body frame, None where the block has none. lever_velocity: (N, 3) m/s, ω×l of the DVL in the body frame, zero
-    where unknown. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and heave, body frame.
+    where unknown, None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and
+    heave, body frame.
+
+    What several models derive from these is computed once.
     """
 
     velocity_dvl: Array
     reference_body: Array | None
-    lever_velocity: Array
+    lever_velocity: Array | None
     rotation_dvl_from_body: Array
     sway_heave: Array
 
+    @cached_property
+    def reference(self) -> Reference:
+        """The reference velocity as it is."""
+        assert self.reference_body is not None  # the bank gives aided models paired blocks only
+        return self._reference(self.reference_body)
+
+    @cached_property
+    def reference_without_heave(self) -> Reference:
+        """The reference velocity with its heave set to zero.
+
+        In the body frame, before T: it is the vehicle, not the instrument, that does not heave. For a mounting turned
+        about z only this is the paper's r_z := 0; for a tilted one r_z := 0 would undo the known tilt.
+        """
+        assert self.reference_body is not None
+        return self._reference(self.reference_body * _HORIZONTAL)
+
+    def _reference(self, velocity_body: Array) -> Reference:
+        if self.lever_velocity is not None:
+            velocity_body = velocity_body + self.lever_velocity
+        r = velocity_body @ self.rotation_dvl_from_body.T
+        return Reference(r, skew(r))
+
+    @cached_property
+    def velocity_at_reference(self) -> Array:
+        """Measured velocity moved to the reference point (N, 3) m/s, DVL frame."""
+        if self.lever_velocity is None:
+            return self.velocity_dvl
+        return self.velocity_dvl - self.lever_velocity @ self.rotation_dvl_from_body.T
+
+    @cached_property
+    def speed(self) -> Array:
+        """Measured speed at the reference point (N,) m/s."""
+        v = self.velocity_at_reference
+        return np.sqrt((v * v).sum(axis=1))
+
+    @cached_property
+    def speed_and_prior(self) -> Array:
+        """(‖v‖, s, h): measured speed ahead, prior sway and heave (N, 3) m/s, body frame."""
+        expected = np.empty((len(self.speed), 3))
+        expected[:, 0] = self.speed
+        expected[:, 1:] = self.sway_heave
+        return expected
+
+    @cached_property
+    def body_from_measured(self) -> Array:
+        """Tᵀ[v×] (N, 3, 3): how the measured velocity turns in the body frame."""
+        return np.matmul(self.rotation_dvl_from_body.T, skew(self.velocity_at_reference))
+
+
+class Reference(NamedTuple):
+    """r = T (g + ω×l) (N, 3) m/s in the DVL frame, and [r×] (N, 3, 3)."""
+
+    r: Array
+    skew: Array
+
+
+_HORIZONTAL = np.array([1.0, 1.0, 0.0])
 
 Linearised = tuple[Array, Array]
 """z (N, m) m/s and H (N, m, n): what one model makes of a block of observations."""
@@ -71,7 +132,8 @@ class Model:
         """Number of states n."""
         return 3 + len(self.scale_axes)
 
-    def to_error_terms(self) -> Array:
+    @cached_property
+    def error_terms_from_state(self) -> Array:
         """(6, n) matrix that takes the state to φ (3) and δk per axis (3)."""
         matrix = np.zeros((6, self.n_state))
         matrix[:3, :3] = np.eye(3)
@@ -83,56 +145,32 @@ class Model:
 def _gnss_aided(
     scale_axes: tuple[tuple[str, tuple[int, ...]], ...], heave_is_zero: bool, seen: Observations
 ) -> Linearised:
-    """M1-M4: z = r - v, H = [r×, -r on the scaled axes], r = T (g + ω×l).
-
-    Heave is zeroed in the body frame, before T: it is the vehicle, not the instrument, that does not heave. For a
-    mounting turned about z only this is the paper's r_z := 0; for a tilted one r_z := 0 would undo the known tilt.
-    """
-    assert seen.reference_body is not None  # the bank gives aided models paired blocks only
-    g = seen.reference_body * np.array([1.0, 1.0, 0.0]) if heave_is_zero else seen.reference_body
-    r = (g + seen.lever_velocity) @ seen.rotation_dvl_from_body.T
+    """M1-M4: z = r - v, H = [r×, -r on the scaled axes]."""
+    r, r_skew = seen.reference_without_heave if heave_is_zero else seen.reference
     h = np.zeros((len(r), 3, 3 + len(scale_axes)))
-    h[:, :, :3] = skew(r)
+    h[:, :, :3] = r_skew
     for column, (_, axes) in enumerate(scale_axes, start=3):
         for axis in axes:
             h[:, axis, column] = -r[:, axis]
     return r - seen.velocity_dvl, h
 
 
-def _at_reference_point(seen: Observations) -> tuple[Array, Array]:
-    """Measured velocity moved to the reference point (N, 3), DVL frame, and the speed there (N,)."""
-    v = seen.velocity_dvl - seen.lever_velocity @ seen.rotation_dvl_from_body.T
-    return v, np.sqrt(np.einsum("ni,ni->n", v, v))
-
-
-def _speed_and_prior(speed: Array, seen: Observations) -> Array:
-    """Reference (‖v‖, s, h) in the body frame, (N, 3) m/s."""
-    return np.column_stack([speed, np.broadcast_to(seen.sway_heave, (len(speed), 2))])
-
-
 def _m5(seen: Observations) -> Linearised:
     """z = r - v, H = [r×], r = T (‖v‖, s, h)."""
-    v, speed = _at_reference_point(seen)
-    r = _speed_and_prior(speed, seen) @ seen.rotation_dvl_from_body.T
-    return r - v, skew(r)
-
-
-def _body_from_measured(v: Array, seen: Observations) -> Array:
-    """H of the models that compare in the body frame: Tᵀ[v×], (N, 3, 3)."""
-    return np.matmul(seen.rotation_dvl_from_body.T, skew(v))
+    r = seen.speed_and_prior @ seen.rotation_dvl_from_body.T
+    return r - seen.velocity_at_reference, skew(r)
 
 
 def _m6(seen: Observations) -> Linearised:
     """z = (‖v‖, s, h) - Tᵀv, H = Tᵀ[v×], body frame."""
-    v, speed = _at_reference_point(seen)
-    return _speed_and_prior(speed, seen) - v @ seen.rotation_dvl_from_body, _body_from_measured(v, seen)
+    z = seen.speed_and_prior - seen.velocity_at_reference @ seen.rotation_dvl_from_body
+    return z, seen.body_from_measured
 
 
 def _m7(seen: Observations) -> Linearised:
     """z = ‖v‖ - (Tᵀv)_x, H = first row of Tᵀ[v×]."""
-    v, speed = _at_reference_point(seen)
-    z = speed - v @ seen.rotation_dvl_from_body[:, 0]
-    return z[:, None], _body_from_measured(v, seen)[:, :1]
+    z = seen.speed - seen.velocity_at_reference @ seen.rotation_dvl_from_body[:, 0]
+    return z[:, None], seen.body_from_measured[:, :1]
 
 
 _ONE_SCALE = (("delta_k", (0, 1, 2)),)

@@ -51,7 +51,7 @@ class Estimate:
     @property
     def scale(self) -> Array:
         """δk (3,) per DVL axis, zero where not estimated."""
-        return (MODELS[self.model].to_error_terms() @ self.state)[3:]
+        return (MODELS[self.model].error_terms_from_state @ self.state)[3:]
 
     def corrected_velocity(self, velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
         """Measured DVL velocities (..., 3) m/s -> corrected body velocities (..., 3) m/s."""

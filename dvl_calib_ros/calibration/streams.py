@@ -121,11 +121,6 @@ class Track(Generic[S]):
         self._stamps.clear()
         self._samples.clear()
 
-    def drop_after(self, stamp_ns: int) -> None:
-        """Forget what is later than this: the other side of a restart."""
-        keep = bisect_left(self._stamps, stamp_ns + 1)
-        del self._stamps[keep:], self._samples[keep:]
-
     def decided(self, stamp_ns: int, horizon_ns: int) -> bool:
         """Whether `bracket(stamp_ns)` can no longer change, with horizon_ns the newest stamp of any stream.
 

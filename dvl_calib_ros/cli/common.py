@@ -56,7 +56,7 @@ def console(stderr: bool = False) -> Console:
     from rich.console import Console
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 160
-    return Console(stderr=stderr, width=wide, highlight=False)
+    return Console(stderr=stderr, width=wide, highlight=False, emoji=False)
 
 
 @contextmanager
@@ -76,7 +76,7 @@ def write_json(path: Path, document: Any) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
     from ..io.result_file import save_text
 
-    save_text(path, json.dumps(_finite(document), indent=1, ensure_ascii=False) + "\n")
+    save_text(path, json.dumps(_finite(document), indent=1, allow_nan=False) + "\n")
 
 
 def _finite(value: Any) -> Any:

@@ -41,6 +41,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.errors import InputError
     from ..io.trajectories import ImportOptions, import_folder, import_recording
 
+    if not 0.0 <= arguments.start < 2.0**31:
+        raise InputError("--start: give seconds since 1970, 0 .. 2147483647")
     options = ImportOptions(
         frame=arguments.frame,
         gnss_frame=arguments.gnss_frame,

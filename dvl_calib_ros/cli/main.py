@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from .. import __version__
 from . import benchmark, demo, import_, replay, run, simulate
@@ -13,9 +15,15 @@ from . import benchmark, demo, import_, replay, run, simulate
 COMMANDS = (run, replay, simulate, import_, demo, benchmark)
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say in one line what is wrong with the usage."""
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
 def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     """The parser with all commands; only the one that is called gets its arguments, which may import much."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="dvl-calib",
         description="Calibrate a Doppler velocity log (DVL): live on ROS 2, or over recorded bags.",
         epilog="example: dvl-calib replay my_bag --models all",
@@ -39,21 +47,33 @@ def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad usage or bad input, said in one line on standard error."""
     argv = sys.argv[1:] if argv is None else argv
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show φ must not end the run
+            stream.reconfigure(errors="replace")
     arguments = build_parser(argv).parse_args(argv)
     from ..calibration.parameters import ParameterError
     from ..io.errors import InputError
 
     try:
-        return int(arguments.run(arguments) or 0)
+        code = int(arguments.run(arguments) or 0)
+        sys.stdout.flush()
+        return code
     except (InputError, ParameterError) as error:
-        print(f"dvl-calib {arguments.command}: {error}", file=sys.stderr)
-        return 2
+        return _fail(arguments.command, str(error))
     except KeyboardInterrupt:
         print(f"dvl-calib {arguments.command}: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        name = "" if error.filename is None else f"{error.filename}: "
+        return _fail(arguments.command, f"{name}{error.strerror or error}; check names, permissions and space")
+
+
+def _fail(command: str, message: str) -> int:
+    print(f"dvl-calib {command}: {' '.join(message.splitlines())}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Replay, print, save."""
+    from ..io.errors import InputError
     from ..io.replay import Topics, replay, replay_document
     from ..io.result_file import check_writable, result_document, result_text, save_text
 
@@ -32,6 +33,8 @@ def run(arguments: argparse.Namespace) -> None:
     for target in (arguments.json, arguments.save):
         if target is not None:
             check_writable(target)
+    if arguments.json is not None and arguments.json == arguments.save:
+        raise InputError(f"--json and --save: both name {arguments.json}; give them names of their own")
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
         replayed = replay(arguments.bags, parameters, topics, on_progress)
@@ -55,13 +58,15 @@ def _models(text: str) -> list[str]:
             raise InputError(f"--models: {name!r} is no model; there are {', '.join(MODELS)}, or all")
     if not names:
         raise InputError(f"--models: name at least one of {', '.join(MODELS)}, or all")
-    return names
+    return list(dict.fromkeys(names))
 
 
 def _print(notes, result, models) -> None:  # type: ignore[no-untyped-def]
+    from rich.markup import escape
+
     errors = common.console(stderr=True)
     for note in notes:
-        errors.print(f"[yellow]warning:[/] {note}", markup=True, soft_wrap=True)
+        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
     out = common.console()
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     seconds = 1e-9 * (result.last_ns - result.first_ns)

@@ -50,19 +50,10 @@ def run(arguments: argparse.Namespace) -> None:
 
     from ..calibration.samples import VelocityFrame
     from ..io.bags import Compression, Storage
-    from ..io.errors import InputError
     from ..simulation.scenario import Scenario, write_bag
     from ..simulation.sensors import DvlErrors
 
-    if len(arguments.scale) not in (1, 3):
-        raise InputError("--scale: give one number for all axes, or three")
-    numbers = [arguments.duration, arguments.dvl_rate, arguments.gnss_rate, arguments.imu_rate]
-    if not all(map(math.isfinite, numbers)) or min(numbers) < 0.0 or not arguments.dvl_rate:
-        raise InputError("--duration and the rates must be finite and not negative, --dvl-rate above 0")
-    if not 1.0 <= arguments.duration <= 100_000.0 or max(numbers[1:]) > 1000.0:
-        raise InputError("--duration must be 1 .. 100000 s, rates at most 1000 Hz")
-    if min(arguments.beam_std, arguments.gnss_std) < 0.0:
-        raise InputError("--beam-std and --gnss-std must not be negative")
+    _check(arguments)
     roll, pitch, yaw = map(math.radians, arguments.misalignment)
     scale = [0.01 * s for s in arguments.scale] * (3 if len(arguments.scale) == 1 else 1)
     scenario = Scenario(
@@ -80,3 +71,34 @@ def run(arguments: argparse.Namespace) -> None:
     )
     write_bag(scenario, arguments.output, Storage(arguments.storage), Compression(arguments.compression))
     print(f"wrote {arguments.output}")
+
+
+# Option -> smallest and largest value
+LIMITS = {
+    "duration": (1.0, 100_000.0),
+    "seed": (0, 2**63),
+    "misalignment": (-89.0, 89.0),
+    "scale": (-99.0, 99.0),
+    "mounting_rpy": (-6.3, 6.3),
+    "dvl_rate": (0.01, 1000.0),
+    "gnss_rate": (0.01, 1000.0),
+    "imu_rate": (0.01, 100.0),
+    "beam_std": (0.0, 10.0),
+    "gnss_std": (0.0, 10.0),
+}
+MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # no such sensor
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from ..io.errors import InputError
+
+    if len(arguments.scale) not in (1, 3):
+        raise InputError("--scale: give one number for all axes, or three")
+    for name, (low, high) in LIMITS.items():
+        given = getattr(arguments, name)
+        for value in given if isinstance(given, list | tuple) else [given]:
+            if not low <= value <= high and not (value == 0.0 and name in MAY_BE_ZERO):
+                raise InputError(f"--{name.replace('_', '-')}: {value:g} is outside {low:g} .. {high:g}")
+    for start, end in arguments.gnss_outage:
+        if not start < end:
+            raise InputError(f"--gnss-outage: {start:g} is not before {end:g}; give the beginning, then the end")

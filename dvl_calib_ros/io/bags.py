@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import heapq
 import shutil
+import sqlite3
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from enum import Enum
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import MessageDefinitionFormat
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
@@ -27,7 +28,8 @@ from rosbags.typesys.store import Typestore
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from .errors import InputError
 from .messages import IMU_TYPE, TWIST_TYPE
-from .salvage import MCAP_MAGIC, SQLITE_MAGIC, Salvaged, salvage_mcap, salvage_sqlite
+from .salvage import MCAP_MAGIC, SQLITE_MAGIC, DamagedError, Salvaged, salvage_mcap, salvage_sqlite
+from .yaml_files import load_yaml
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -35,6 +37,7 @@ else:
     from backports import zstd
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+ROS1_MAGIC = b"#ROSBAG"
 STORAGE_SUFFIXES = (".mcap", ".db3")
 
 
@@ -60,6 +63,11 @@ class _Definition(NamedTuple):
     text: str
 
 
+Messages = Callable[[set[str]], Iterator[tuple[int, str, str, bytes]]]
+"""Topics -> log time, topic, type and bytes of their messages."""
+Salvage = Callable[[Path], Iterator[Salvaged]]
+
+
 class _Source:
     """One recording: what is in it and its messages in order of log time."""
 
@@ -70,9 +78,11 @@ class _Source:
         counts: dict[str, int],
         definitions: dict[str, _Definition],
         span_ns: tuple[int, int],
-        messages: Callable[[set[str]], Iterator[tuple[int, str, str, bytes]]],
+        messages: Messages,
+        damage_noted: bool = False,
     ) -> None:
         self.path = path
+        self.damage_noted = damage_noted
         self.topics = topics
         self.counts = counts
         self.span_ns = span_ns
@@ -84,7 +94,7 @@ class _Source:
         """Types for a message: from the definition embedded in the bag, else Jazzy's."""
         if msgtype not in self._stores:
             definition = self._definitions.get(msgtype)
-            if definition is None or definition.format is MessageDefinitionFormat.NONE:
+            if definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip():
                 self._stores[msgtype] = get_typestore(Stores.ROS2_JAZZY)
             else:
                 store = get_typestore(Stores.EMPTY)
@@ -168,128 +178,218 @@ class BagReader:
     def _merged(self, topics: Iterable[str]) -> Iterator[_Raw]:
         wanted = set(topics)
         streams = [self._raw(index, wanted) for index in range(len(self._sources))]
-        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda raw: raw.log_ns)
+        merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda raw: raw.log_ns)
+        return (raw for raw in merged if raw.topic)
 
     def _raw(self, index: int, topics: set[str]) -> Iterator[_Raw]:
         source = self._sources[index]
+        start_ns = newest_ns = source.span_ns[0]
+        # a marker where it begins: merging opens a recording only when its time has come
+        yield _Raw(start_ns, index, "", "", b"")
         read = 0
-        newest_ns = source.span_ns[0]
         try:
             for log_ns, topic, msgtype, data in source.messages(topics):
-                if data[:4] == ZSTD_MAGIC:  # message compression, in a file without the metadata that would say so
+                if data[:4] == ZSTD_MAGIC:  # message compression; CDR begins otherwise
                     data = zstd.decompress(data)
                 yield _Raw(log_ns, index, topic, msgtype, data)
                 read += 1
                 newest_ns = log_ns
         except Exception as error:  # the readers raise all sorts of things on damaged bytes
-            self.notes.append(
-                f"{source.path}: damaged after {read} messages, {1e-9 * (newest_ns - source.span_ns[0]):.1f} s into "
-                f"the recording ({type(error).__name__}: {error}); what came before the damage is used"
-            )
+            if not source.damage_noted:
+                self.notes.append(
+                    f"{source.path}: damaged ({_said(error)}); read up to the damage: {read} messages, "
+                    f"{1e-9 * (newest_ns - start_ns):.1f} s"
+                )
 
     # ------------------------------------------------------------------ opening
 
     def _open(self, path: Path) -> list[_Source]:
-        if not path.exists():
-            raise InputError(f"{path}: no such file or folder")
-        if path.is_dir():
-            return self._open_folder(path)
-        return [self._open_file(path)]
+        try:
+            if path.is_dir():
+                return [self._open_file(file, file) for file in self._files_of(path)]
+            if not path.exists():
+                raise InputError(f"{path}: no such file or folder")
+            if not path.is_file():
+                raise InputError(f"{path}: neither file nor folder; give a rosbag2 folder, or a .mcap or .db3 file")
+            return [self._open_file(path, path)]
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check name, permissions and disk") from error
 
-    def _open_folder(self, folder: Path) -> list[_Source]:
+    def _files_of(self, folder: Path) -> list[Path]:
+        """The recordings in a folder: those that its metadata.yaml lists, or all if that is missing or damaged."""
         files = sorted(
             (file for file in folder.iterdir() if _storage_suffix(file) in STORAGE_SUFFIXES), key=_natural_order
         )
         if not files:
             raise InputError(f"{folder}: no bag, there is no .mcap or .db3 file in it")
-        if (folder / "metadata.yaml").exists():
-            with suppress(Exception):  # whatever is wrong with it shows when the files are opened one by one
-                return [self._with_rosbags(folder)]
-            self.notes.append(f"{folder}: metadata.yaml does not fit the files; they are read one by one")
-        else:
-            self.notes.append(f"{folder}: no metadata.yaml (recording cut off?); its files are read one by one")
-        return [self._open_file(file) for file in files]
+        listed = self._listed(folder)
+        if not listed:
+            return files
+        chosen = [file for file in files if file.name in listed or file.name.removesuffix(".zstd") in listed]
+        names = {file.name.removesuffix(".zstd") for file in chosen}
+        for name in listed:
+            if name.removesuffix(".zstd") not in names:
+                self.notes.append(f"{folder}: {name} is missing, which metadata.yaml lists; the rest is read")
+        if not chosen:
+            return files
+        for file in files:
+            if file not in chosen:
+                self.notes.append(f"{file}: not read, metadata.yaml does not list it; name the file to read it")
+        return chosen
 
-    def _open_file(self, path: Path) -> _Source:
+    def _listed(self, folder: Path) -> list[str]:
+        """Names of the files that metadata.yaml lists; none, with a note, if there is nothing to go by."""
+        try:
+            metadata = load_yaml(folder / "metadata.yaml", "metadata file")
+            return [PurePath(name).name for name in metadata["rosbag2_bagfile_information"]["relative_file_paths"]]
+        except (InputError, KeyError, TypeError):
+            self.notes.append(f"{folder}: no usable metadata.yaml (recording cut off?); all its files are read")
+            return []
+
+    def _open_file(self, path: Path, shown: Path) -> _Source:
+        """Open a recording. shown: how the user knows it, when it has been unpacked to another place."""
+        path = self._with_journal(path)
         if path.stat().st_size == 0:
-            raise InputError(f"{path}: the file is empty; nothing was recorded")
-        if path.suffix == ".zstd":
-            return self._open_file(self._decompressed(path))
+            raise InputError(f"{shown}: the file is empty; nothing was recorded")
         with path.open("rb") as file:
             magic = file.read(16)
+        if magic.startswith(ZSTD_MAGIC) and path == shown:
+            return self._open_file(self._decompressed(path), shown)
         if magic.startswith(MCAP_MAGIC):
             salvage = salvage_mcap
         elif magic.startswith(SQLITE_MAGIC):
             salvage = salvage_sqlite
+        elif magic.startswith(ROS1_MAGIC):
+            raise InputError(f"{shown}: a ROS 1 bag; convert it first: rosbags-convert --src {shown.name} --dst NEW")
         else:
-            raise InputError(f"{path}: no bag; give a rosbag2 folder, or a .mcap or .db3 file")
+            raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap or .db3 file")
         try:
-            return self._with_rosbags(path)
+            return self._with_rosbags(path, shown, salvage)
         except Exception as error:  # damaged files raise all sorts of things
-            return self._salvaged(path, salvage, f"{type(error).__name__}: {error}")
+            return self._salvaged(path, shown, salvage, _said(error))
 
     def _decompressed(self, path: Path) -> Path:
-        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
-        target = folder / path.stem
+        target = self._temporary_folder() / (path.stem if path.suffix == ".zstd" else path.name)
         try:
             with zstd.open(path, "rb") as packed, target.open("wb") as unpacked:
-                shutil.copyfileobj(packed, unpacked)
+                while piece := packed.read1():  # as it comes: what precedes damage must be out before the damage
+                    unpacked.write(piece)
         except (zstd.ZstdError, EOFError) as error:
             self.notes.append(f"{path}: damaged ({error}); what could be unpacked is used")
         return target
 
-    def _with_rosbags(self, path: Path) -> _Source:
+    def _with_journal(self, path: Path) -> Path:
+        """A database whose recorder died, with what lies in the journal beside it; `path` itself if there is none."""
+        journals = [path.with_name(f"{path.name}{suffix}") for suffix in ("-wal", "-journal")]
+        if not any(journal.is_file() and journal.stat().st_size for journal in journals):
+            return path
+        folder = self._temporary_folder()
+        for file in (path, *journals):
+            if file.is_file():
+                shutil.copyfile(file, folder / file.name)
+        copy = folder / path.name
+        try:
+            with closing(sqlite3.connect(copy)) as connection:
+                connection.execute("PRAGMA journal_mode=DELETE").fetchall()
+        except sqlite3.Error as error:
+            self.notes.append(f"{path}: its journal is damaged ({error}) and not used")
+            return path
+        return copy
+
+    def _temporary_folder(self) -> Path:
+        return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+
+    def _with_rosbags(self, path: Path, shown: Path, salvage: Salvage) -> _Source:
         # rosbags goes by the suffix; the content has already said what it is
         reader = Reader(path)
         reader.open()
         self._stack.callback(reader.close)
         connections = list(reader.connections)
+        # without chunk index, rosbags takes a message out of order for damage
+        indexed = bool(getattr(reader.storage, "chunks", True))
 
         def messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
             chosen = [connection for connection in connections if connection.topic in topics]
-            if chosen:
-                for connection, log_ns, data in reader.messages(connections=chosen):
+            newest_ns = -1
+            newest: list[tuple[str, bytes]] = []
+            try:
+                for connection, log_ns, data in reader.messages(connections=chosen) if chosen else ():
+                    if log_ns != newest_ns:
+                        newest_ns, newest = log_ns, []
+                    newest.append((connection.topic, data))
                     yield log_ns, connection.topic, connection.msgtype, data
+            except Exception:  # rosbags gives up the whole chunk; its beginning may be whole
+                yield from _rest(salvage(path), topics, newest_ns, newest)
+                raise
 
         counts: Counter[str] = Counter()
         for connection in connections:
             counts[connection.topic] += connection.msgcount
         return _Source(
-            path,
+            shown,
             {c.topic: c.msgtype for c in connections},
             counts,
             {c.msgtype: _Definition(c.msgdef.format, c.msgdef.data) for c in connections},
             (reader.start_time, reader.end_time),
-            messages,
+            messages if indexed else _in_file_order(path, salvage),
         )
 
-    def _salvaged(self, path: Path, salvage: Callable[[Path], Iterator[Salvaged]], why: str) -> _Source:
+    def _salvaged(self, path: Path, shown: Path, salvage: Salvage, why: str) -> _Source:
         formats = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
         topics: dict[str, str] = {}
         definitions: dict[str, _Definition] = {}
         counts: Counter[str] = Counter()
         first_ns, last_ns = 2**63 - 1, 0
-        for message in salvage(path):
-            if message.topic not in topics:
-                topics[message.topic] = message.msgtype
-                format_ = formats.get(message.encoding, MessageDefinitionFormat.NONE)
-                definitions[message.msgtype] = _Definition(format_, message.definition)
-            counts[message.topic] += 1
-            first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
+        damage = ""
+        try:
+            for message in salvage(path):
+                if message.topic not in topics:
+                    topics[message.topic] = message.msgtype
+                    format_ = formats.get(message.encoding, MessageDefinitionFormat.NONE)
+                    definitions[message.msgtype] = _Definition(format_, message.definition)
+                counts[message.topic] += 1
+                first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
+        except DamagedError as error:
+            damage = str(error)
         total = sum(counts.values())
         if not total:
-            raise InputError(f"{path}: damaged, and no whole message in it ({why})")
+            raise InputError(f"{shown}: damaged, and no whole message in it ({damage or why}); use another recording")
+        read = f"{total} whole messages, {1e-9 * (last_ns - first_ns):.1f} s"
         self.notes.append(
-            f"{path}: damaged or cut off ({why}); read up to the damage: {total} whole messages, "
-            f"{1e-9 * (last_ns - first_ns):.1f} s"
+            f"{shown}: damaged or cut off ({damage}); read up to the damage: {read}"
+            if damage
+            else f"{shown}: has no usable index ({why}); read from beginning to end: {read}"
         )
+        messages = _in_file_order(path, salvage)
+        return _Source(shown, topics, counts, definitions, (first_ns, last_ns), messages, damage_noted=True)
 
-        def messages(wanted: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
-            for message in salvage(path):
-                if message.topic in wanted:
-                    yield message.log_ns, message.topic, message.msgtype, message.data
 
-        return _Source(path, topics, counts, definitions, (first_ns, last_ns), messages)
+def _in_file_order(path: Path, salvage: Salvage) -> Messages:
+    def messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
+        for message in salvage(path):
+            if message.topic in topics:
+                yield message.log_ns, message.topic, message.msgtype, message.data
+
+    return messages
+
+
+def _rest(
+    salvaged: Iterator[Salvaged], topics: set[str], newest_ns: int, newest: list[tuple[str, bytes]]
+) -> Iterator[tuple[int, str, str, bytes]]:
+    """What of a damaged recording comes after the messages that its index led to (at newest_ns: `newest`)."""
+    rest = []
+    with suppress(DamagedError):
+        for message in salvaged:
+            is_later = message.log_ns > newest_ns or (
+                message.log_ns == newest_ns and (message.topic, message.data) not in newest
+            )
+            if is_later and message.topic in topics:
+                rest.append((message.log_ns, message.topic, message.msgtype, message.data))
+    yield from sorted(rest, key=lambda message: message[0])
+
+
+def _said(error: Exception) -> str:
+    return str(error) if isinstance(error, DamagedError | ReaderError) else f"{type(error).__name__}: {error}"
 
 
 def _storage_suffix(path: Path) -> str:
@@ -348,14 +448,25 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         try:
             self._writer.open()
-        except OSError as error:
-            raise InputError(f"{self._writer.path}: cannot be written: {error.strerror}") from error
+        except (OSError, sqlite3.Error) as error:
+            raise self._unwritable(error) from error
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._writer.__exit__(kind, error, trace)
+        try:
+            self._writer.__exit__(kind, error, trace)
+        except (OSError, sqlite3.Error) as failure:
+            error = failure
+        if error is not None:  # half a bag would pass for a whole one
+            shutil.rmtree(self._writer.path, ignore_errors=True)
+        if isinstance(error, OSError | sqlite3.Error):
+            raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:
+        why = getattr(error, "strerror", None) or error
+        return InputError(f"{self._writer.path}: cannot be written ({why}); free some space, or name another place")
 
     def dvl(self, topic: str, sample: DvlSample, frame_id: str = "dvl_link") -> None:
         """Write a DVL velocity as TwistWithCovarianceStamped."""

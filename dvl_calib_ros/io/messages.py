@@ -160,6 +160,7 @@ class MessageFeed:
             )
 
     def _problem(self, kind: str, sentence: str) -> None:
-        if self.problems.get(kind) != sentence:
-            self.problems[kind] = sentence
+        is_new = kind not in self.problems
+        self.problems[kind] = sentence
+        if is_new:  # two frames in turn, or ever new garbage, must not be told of at every message
             self._on_problem(sentence)

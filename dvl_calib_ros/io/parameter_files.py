@@ -11,7 +11,7 @@ import yaml
 
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from .errors import InputError
-from .yaml_files import load_yaml
+from .yaml_files import load_yaml, parse_scalar
 
 NODE_NAME = "dvl_calibration"
 # rclpy's own parameters, which a file for the node may hold as well
@@ -25,28 +25,19 @@ def load_parameters(path: Path | None, overrides: Sequence[str] = ()) -> Paramet
         Parameters.from_mapping(values)
     except ParameterError as error:
         raise InputError(f"{path}: {error}") from error
+    except OverflowError as error:
+        raise InputError(f"{path}: a whole number in it is too large ({error})") from error
     for override in overrides:
         name, separator, text = override.partition(":=")
         if not separator:
             raise InputError(f"{override!r}: give parameters as name:=value")
-        values[name] = _value(text)
+        value = parse_scalar(text)
+        if not is_ros_parameter(name):
+            values[name] = "" if value is None else value
     try:
         return Parameters.from_mapping(values)
-    except ParameterError as error:
-        raise InputError(str(error)) from error
-
-
-def _value(text: str) -> Any:
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
-    if isinstance(value, str):
-        try:
-            return float(value)  # 1e-3
-        except ValueError:
-            return value
-    return "" if value is None else value
+    except (ParameterError, OverflowError) as error:
+        raise InputError(f"-p {error}") from error
 
 
 def _node_parameters(path: Path) -> dict[str, Any]:
@@ -54,16 +45,20 @@ def _node_parameters(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
     values: dict[str, Any] = {}
-    found = False
-    for key, section in content.items():
-        for node, body in _sections(str(key), section):
-            found = True
-            if _is_for_node(node):
-                if not isinstance(body, dict):
-                    raise InputError(f"{path}: ros__parameters of {node} is not a list of name: value")
-                values.update(_flat(body))
-    if not found:
+    try:
+        sections = [found for key, section in content.items() for found in _sections(str(key), section)]
+        own = [(node, body) for node, body in sections if _is_for_node(node)]
+        for node, body in own:
+            if not isinstance(body, dict):
+                raise InputError(f"{path}: ros__parameters of {node} is not a list of name: value")
+            values.update(_flat(body))
+    except RecursionError as error:
+        raise InputError(f"{path}: no ROS 2 parameter file, it contains itself") from error
+    if not sections:
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
+    if not own:  # ROS would run with the defaults and say nothing
+        others = ", ".join(node for node, _ in sections)
+        raise InputError(f"{path}: nothing in it is for node {NODE_NAME}, only for {others}; use '/**:' or the name")
     return {name: value for name, value in values.items() if not is_ros_parameter(name)}
 
 

@@ -16,6 +16,7 @@ from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.samples import VelocityFrame
+from ..calibration.screening import is_valid_velocity, unit_quaternion
 from .bags import BagReader
 from .errors import InputError
 from .messages import IMU_TYPE, TWIST_TYPE, MessageFeed
@@ -62,7 +63,8 @@ def replay(
 
     on_progress: told the share (0..1) that is read. Raises InputError if there is no bag or no usable DVL topic.
     """
-    initial = load_initial_calibration(Path(parameters.initial_calibration)) if parameters.initial_calibration else None
+    saved = parameters.initial_calibration
+    initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
     topics = topics or Topics()
     prior = reference_prior(paths, parameters, topics) if parameters.prior_source == "reference" else None
     notes: list[str] = []
@@ -93,7 +95,9 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
     present = bag.topics
     where = ", ".join(map(str, paths))
     if not present:
-        raise InputError(f"{where}: the bag is empty, it has no topics")
+        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
+    if len({topics.dvl, topics.gnss, topics.imu}) < 3:
+        raise InputError("--dvl-topic, --gnss-topic and --imu-topic must be different topics")
     if topics.dvl not in present:
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
         raise InputError(f"{where}: no topic {topics.dvl!r}; set --dvl-topic. The bag has: {listing}")
@@ -103,7 +107,7 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         if name in present and present[name] != msgtype:
             raise InputError(f"{where}: topic {name} holds {present[name]}, expected {msgtype}; set --{role}-topic")
     if not bag.message_counts[topics.dvl]:
-        raise InputError(f"{where}: topic {topics.dvl} holds no messages")
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in present:
         notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
 
@@ -134,15 +138,16 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
     first_ns: int | None = None
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
+        _check_topics(bag, paths, chosen, [])
         for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
             if undecodable:
                 continue
             if topic == chosen.imu:
-                orientation = feed.imu(message, log_ns).orientation
+                orientation = unit_quaternion(feed.imu(message, log_ns).orientation)
                 rotation = None if orientation is None else rotation_from_quaternion(orientation).T
                 continue
             sample = feed.reference(message, log_ns)
-            if sample is None:
+            if sample is None or not is_valid_velocity(sample.velocity, parameters.max_speed):
                 continue
             first_ns = sample.stamp_ns if first_ns is None else first_ns
             if sample.stamp_ns - first_ns >= parameters.prior_window * 1e9:
@@ -167,7 +172,7 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     notes = []
     if not dvl["accepted"]:
-        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}")
+        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
     if pairing["without_attitude"]:
         notes.append(
             f"{pairing['without_attitude']} DVL samples have an earth-frame reference but no attitude from "
@@ -189,6 +194,12 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
                 "before believing it"
             )
     return notes
+
+
+def _remedy(feed: MessageFeed) -> str:
+    """What is known of the DVL's messages that were refused."""
+    known = [sentence for kind, sentence in feed.problems.items() if kind.startswith("dvl")]
+    return " ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 
 def _counted(counts: Any) -> str:

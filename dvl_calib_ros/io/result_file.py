@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
+import shlex
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -75,7 +77,8 @@ def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, An
 def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str:
     numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
     arguments = " ".join(f"--{name} {value:.9g}" for name, value in numbers)
-    return f"ros2 run tf2_ros static_transform_publisher {arguments} --frame-id {parent} --child-frame-id {child}"
+    frames = f"--frame-id {shlex.quote(parent)} --child-frame-id {shlex.quote(child)}"  # a bag may name any frame
+    return f"ros2 run tf2_ros static_transform_publisher {arguments} {frames}"
 
 
 def result_text(document: Mapping[str, Any]) -> str:
@@ -102,23 +105,29 @@ def save_text(path: Path, text: str) -> None:
 
     Raises InputError; then the old file is untouched.
     """
+    target = Path(os.path.realpath(path))  # a link stays a link
     temporary = ""
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=".dvl_calib.", suffix=".tmp")
+        with os.fdopen(handle, "wb") as file:
             os.fchmod(file.fileno(), 0o644)
-            file.write(text)
+            file.write(text.encode())
             file.flush()
             os.fsync(file.fileno())
-        if path.exists():
-            _keep_backup(path)
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
+        if target.exists():
+            _keep_backup(target)
+        os.replace(temporary, target)
+        temporary = ""
     except OSError as error:
-        with suppress(OSError):
-            os.unlink(temporary)
-        remedy = "free some space, or name a file on another disk" if error.errno == 28 else "name another place"
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = "free some space, or name a file on another disk" if full else "name another place"
         raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
+    finally:
+        if temporary:
+            with suppress(OSError):
+                os.unlink(temporary)
+    with suppress(OSError):  # the file is there; not every file system can sync a folder
+        _sync_folder(target.parent)
 
 
 def _keep_backup(path: Path) -> None:
@@ -139,15 +148,38 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def load_initial_calibration(path: Path) -> dict[str, GaussianState]:
-    """States and covariances of a result file, by model name. Raises InputError naming what is wrong in it."""
+def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:
+    """States and covariances of a result file, by model name. Raises InputError naming what is wrong in it.
+
+    mounting_rpy: the nominal mounting to go on with. The file's angles are relative to its own, which must be that.
+    """
     content = load_yaml(path, "result file")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
     models = content.get("models")
     if not isinstance(models, dict) or not models:
         raise InputError(f"{path}: damaged, it holds no models")
-    return {name: _gaussian(f"{path}: models: {name}", name, saved) for name, saved in models.items() if name in MODELS}
+    known = {
+        name: _gaussian(f"{path}: models: {name}", name, saved) for name, saved in models.items() if name in MODELS
+    }
+    _check_mounting(path, content, mounting_rpy)
+    if not known:
+        raise InputError(f"{path}: none of its models {', '.join(map(str, models))} is one of {', '.join(MODELS)}")
+    return known
+
+
+def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequence[float] | None) -> None:
+    if mounting_rpy is None:
+        return
+    try:
+        saved = [float(angle) for angle in content["mounting"]["nominal_rpy"]]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path}: damaged, it holds no mounting: nominal_rpy") from error
+    if len(saved) != 3 or not np.allclose(saved, mounting_rpy, rtol=0.0, atol=1e-9):
+        raise InputError(
+            f"{path}: its angles are relative to mounting_rpy {saved}, but mounting_rpy is {list(mounting_rpy)}; set "
+            "the same, or start without initial_calibration"
+        )
 
 
 def _gaussian(where: str, name: str, saved: Any) -> GaussianState:
@@ -156,7 +188,7 @@ def _gaussian(where: str, name: str, saved: Any) -> GaussianState:
         x = np.array(saved["state"], dtype=float)
         p = np.array(saved["covariance"], dtype=float)
         names = tuple(saved["state_names"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: damaged ({type(error).__name__}: {error})") from error
     if names != model.state_names or x.shape != (model.n_state,) or p.shape != (model.n_state, model.n_state):
         raise InputError(f"{where}: states {names} are not those of the model, {model.state_names}")

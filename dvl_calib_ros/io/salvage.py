@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Iterator
-from io import BytesIO
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
+from io import SEEK_CUR, BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
+from zlib import crc32
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -20,9 +22,11 @@ from mcap.records import Channel, Message, Schema
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC
-_LENGTH = struct.Struct("<Q")
+_RECORD_HEAD = struct.Struct("<BQ")  # opcode, length
+_READ = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK)
 # A record that claims more than this is damage: the largest that recorders write are chunks of a few MB.
 LARGEST_RECORD = 1 << 30
+SMALL_PIECE = 16
 
 
 class Salvaged(NamedTuple):
@@ -36,94 +40,130 @@ class Salvaged(NamedTuple):
     data: bytes
 
 
-class _CutError(Exception):
-    """The record is not all there."""
+class DamagedError(Exception):
+    """What is damaged, in words. Raised after the last message that is whole."""
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
-    """All whole messages up to the damage, in file order."""
+    """All whole messages up to the damage, in file order; then DamagedError, unless the recording is whole."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
+    size = path.stat().st_size
     with path.open("rb") as file:
-        size = path.stat().st_size
-        if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-            return
-        for opcode, content, whole in _records(file, size):
+        file.seek(len(MCAP_MAGIC))
+        for at, opcode, content, whole in _records(file, size):
             if opcode == Opcode.CHUNK:
-                yield from _salvage_chunk(content, schemas, channels)
+                yield from _salvage_chunk(at, content, whole, schemas, channels)
             elif whole:
-                message = _take(opcode, content, schemas, channels)
+                message = _take(at, opcode, content, schemas, channels)
                 if message is not None:
                     yield message
             if opcode == Opcode.DATA_END:
                 return
+    raise DamagedError(f"it stops at byte {size} without the end of the data")
 
 
-def _records(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes, bool]]:
-    """Opcode, content and whether it is whole, of every record up to the first that is cut or absurd."""
-    while True:
-        head = file.read(9)
-        if len(head) < 9:
-            return
-        (length,) = _LENGTH.unpack_from(head, 1)
-        if length > LARGEST_RECORD or head[0] == 0:
-            return
-        content = file.read(min(length, size))
-        whole = len(content) == length
-        yield head[0], content, whole
-        if not whole:
-            return
+def _records(file: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes, bool]]:
+    """Place, opcode, content and whether it is whole, of every record; after one that is not, DamagedError.
+
+    Records that hold no messages (attachments can be huge) come without their content.
+    """
+    while head := file.read(_RECORD_HEAD.size):
+        at = file.tell() - len(head)
+        if len(head) < _RECORD_HEAD.size:
+            raise DamagedError(f"cut off at byte {size}")
+        opcode, length = _RECORD_HEAD.unpack(head)
+        there = min(length, size - file.tell())
+        if opcode == 0 or (opcode in _READ and length > LARGEST_RECORD):
+            raise DamagedError(f"no record at byte {at}")
+        content = b""
+        if opcode in _READ:
+            content = file.read(there)
+        else:
+            file.seek(there, SEEK_CUR)
+        yield at, opcode, content, there == length
+        if there < length:
+            raise DamagedError(f"the record at byte {at} is {length - there} bytes short")
 
 
-def _salvage_chunk(content: bytes, schemas: dict[int, Schema], channels: dict[int, Channel]) -> Iterator[Salvaged]:
+def _salvage_chunk(
+    at: int, content: bytes, whole: bool, schemas: dict[int, Schema], channels: dict[int, Channel]
+) -> Iterator[Salvaged]:
     """Messages of a chunk that may be cut, in order of log time as an indexed reader gives them."""
-    try:
-        records = BytesIO(_decompress_start(content))
-    except _CutError:
-        return
+    unpacked, intact = _unpack_chunk(at, content, whole)
+    records = BytesIO(unpacked)
     found = []
-    for opcode, inner, whole in _records(records, records.getbuffer().nbytes):
-        message = _take(opcode, inner, schemas, channels) if whole else None
-        if message is not None:
-            found.append(message)
-    yield from sorted(found, key=lambda message: message.log_ns)
-
-
-def _decompress_start(content: bytes) -> bytes:
-    """As much of a chunk's records as its bytes give."""
-    at = _CHUNK_HEAD.size
-    if len(content) < at + 4:
-        raise _CutError
-    (name_length,) = struct.unpack_from("<I", content, at)
-    name = content[at + 4 : at + 4 + name_length]
-    compressed = content[at + 4 + name_length + 8 :]
-    if name == b"zstd":
-        import zstandard
-
-        decompressor = zstandard.ZstdDecompressor().decompressobj()
-        return _feed_pieces(decompressor.decompress, compressed, zstandard.ZstdError)
-    if name == b"lz4":
-        import lz4.frame
-
-        return _feed_pieces(lz4.frame.LZ4FrameDecompressor().decompress, compressed, RuntimeError)
-    if name == b"":
-        return compressed
-    raise _CutError
-
-
-def _feed_pieces(decompress, compressed: bytes, error: type[Exception]) -> bytes:  # type: ignore[no-untyped-def]
-    """Decompress piece by piece, so that damage costs what comes after it and not what comes before."""
-    output = bytearray()
-    piece = 4096
+    damage = None if intact else DamagedError(f"the chunk at byte {at} is cut off or damaged")
     try:
-        for start in range(0, len(compressed), piece):
-            output += decompress(compressed[start : start + piece])
-    except (error, EOFError):
-        pass
-    return bytes(output)
+        for inner_at, opcode, inner, inner_whole in _records(records, len(unpacked)):
+            message = _take(inner_at, opcode, inner, schemas, channels) if inner_whole else None
+            if message is not None:
+                found.append(message)
+    except DamagedError as error:
+        damage = DamagedError(f"in the chunk at byte {at}: {error}")
+    yield from sorted(found, key=lambda message: message.log_ns)
+    if damage is not None:
+        raise damage
 
 
-def _take(opcode: int, content: bytes, schemas: dict[int, Schema], channels: dict[int, Channel]) -> Salvaged | None:
+def _unpack_chunk(at: int, content: bytes, whole: bool) -> tuple[bytes, bool]:
+    """As much of a chunk's records as its bytes give, and whether that is all of them."""
+    try:
+        _, _, size, checksum = _CHUNK_HEAD.unpack_from(content)
+        (name_length,) = struct.unpack_from("<I", content, _CHUNK_HEAD.size)
+        start = _CHUNK_HEAD.size + 4 + name_length + 8
+        name = content[_CHUNK_HEAD.size + 4 : start - 8].decode()
+        unpacked = _DECOMPRESS[name](content[start:], min(size, LARGEST_RECORD))
+    except (struct.error, UnicodeDecodeError, KeyError) as error:
+        raise DamagedError(f"the head of the chunk at byte {at} is cut off or damaged") from error
+    intact = whole and len(unpacked) == size
+    if intact and checksum and crc32(unpacked) != checksum:
+        # one of its messages is wrong, and nothing says which: none can be believed
+        raise DamagedError(f"the checksum of the chunk at byte {at} does not match")
+    return unpacked, intact
+
+
+def _unpack_zstd(packed: bytes, size: int) -> bytes:
+    import zstandard
+
+    return _unpack_start(lambda: zstandard.ZstdDecompressor().decompressobj().decompress, packed, size)
+
+
+def _unpack_lz4(packed: bytes, size: int) -> bytes:
+    import lz4.frame
+
+    return _unpack_start(lambda: lz4.frame.LZ4FrameDecompressor().decompress, packed, size)
+
+
+_DECOMPRESS: Mapping[str, Callable[[bytes, int], bytes]] = {
+    "": lambda packed, _: packed,
+    "zstd": _unpack_zstd,
+    "lz4": _unpack_lz4,
+}
+
+
+def _unpack_start(new: Callable[[], Callable[[bytes], bytes]], packed: bytes, size: int) -> bytes:
+    """The first `size` bytes that a decompressor makes of `packed`, up to the damage.
+
+    A decompressor that meets damage withholds all that the call would have returned. So what is damaged is fed again
+    in small pieces, for the damage to cost what comes after it and not what comes before.
+    """
+    for piece in (len(packed) or 1, SMALL_PIECE):
+        decompress, output = new(), bytearray()
+        try:
+            for start in range(0, len(packed), piece):
+                output += decompress(packed[start : start + piece])
+                if len(output) > size:  # damage can make much of little; the chunk has said how much there is
+                    break
+            return bytes(output[:size])
+        except Exception:  # each library has errors of its own
+            continue
+    return bytes(output[:size])
+
+
+def _take(
+    at: int, opcode: int, content: bytes, schemas: dict[int, Schema], channels: dict[int, Channel]
+) -> Salvaged | None:
     """Take note of a schema or channel, or return a message."""
     stream = ReadDataStream(BytesIO(content))
     try:
@@ -145,37 +185,33 @@ def _take(opcode: int, content: bytes, schemas: dict[int, Schema], channels: dic
                 message.log_time,
                 message.data,
             )
-    except Exception:  # what is not a record is damage, whatever the parser makes of it
-        return None
+    except Exception as error:  # what is not a record is damage, whatever the parser makes of it
+        raise DamagedError(f"the record at byte {at} is damaged") from error
     return None
 
 
 def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
-    """All messages of a damaged rosbag2 database that SQLite can still reach, in the order they were written."""
-    connection = sqlite3.connect(f"file:{path}?immutable=1", uri=True)
-    try:
-        topics = dict(_rows(connection, "SELECT id, name FROM topics"))
-        types = dict(_rows(connection, "SELECT id, type FROM topics"))
-        definitions = {
-            name: (encoding, text)
-            for name, encoding, text in _rows(
-                connection, "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            )
-        }
-        # by rowid: the index on timestamp may lie behind the damage
-        for topic_id, log_ns, data in _rows(
-            connection, "SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id"
-        ):
-            if topic_id in topics:
-                encoding, text = definitions.get(types[topic_id], ("", ""))
-                yield Salvaged(topics[topic_id], types[topic_id], encoding, text, log_ns, data)
-    finally:
-        connection.close()
+    """All messages of a rosbag2 database that SQLite can still reach, in the order they were written.
+
+    Then DamagedError, if it stopped at damage.
+    """
+    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as connection:
+        try:
+            topics = {key: (name, kind) for key, name, kind in connection.execute("SELECT id, name, type FROM topics")}
+            definitions = _sqlite_definitions(connection)
+            # by rowid: the index on timestamp may lie behind the damage
+            rows = connection.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id")
+            for topic_id, log_ns, data in rows:
+                if topic_id in topics:
+                    name, kind = topics[topic_id]
+                    yield Salvaged(name, kind, *definitions.get(kind, ("", "")), log_ns, bytes(data))
+        except (sqlite3.Error, TypeError, ValueError) as error:  # damage that SQLite sees, and damage that it does not
+            raise DamagedError(str(error)) from error
 
 
-def _rows(connection: sqlite3.Connection, query: str) -> Iterator[tuple]:  # type: ignore[type-arg]
-    """Rows up to the first that cannot be read."""
-    try:
-        yield from connection.execute(query)
-    except sqlite3.Error:
-        return
+def _sqlite_definitions(connection: sqlite3.Connection) -> dict[str, tuple[str, str]]:
+    """Type -> encoding and text of the embedded definitions; bags of before ROS 2 Iron have none."""
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    with suppress(sqlite3.Error):
+        return {kind: (encoding, text) for kind, encoding, text in connection.execute(query)}
+    return {}

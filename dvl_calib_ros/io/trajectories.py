@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import heapq
 import re
+import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from .bags import BagWriter, Compression, Storage
 from .errors import InputError
 
 N_COLUMNS = 4
+SUFFIXES = ("csv", "npy")
 
 
 def read_columns(path: Path, unit: str) -> tuple[Array, Array]:
@@ -42,7 +44,7 @@ def read_columns(path: Path, unit: str) -> tuple[Array, Array]:
 def _read_npy(path: Path) -> Array:
     try:
         return np.asarray(np.load(path, allow_pickle=False), dtype=float)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # damaged files raise all sorts of things, MemoryError among them
         raise InputError(f"{path}: not a NumPy array file of numbers ({error})") from error
 
 
@@ -74,7 +76,9 @@ def _is_number(text: str) -> bool:
 
 
 def _check_header(path: Path, header: list[str], unit: str) -> None:
-    units = [re.search(r"\[(.*)\]", cell) for cell in header]
+    if len(header) != N_COLUMNS:
+        raise InputError(f"{path}: has {len(header)} columns, expected time and three values")
+    units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
     for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
         if found and found.group(1).strip() != expected:
             raise InputError(f"{path}: column {cell!r} is not in {expected}; convert it first")
@@ -82,9 +86,12 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
         raise InputError(f"{path}: the first column is {header[0]!r}, expected time")
 
 
-def stamps_ns(time: Array, start_ns: int) -> list[int]:
-    """Times (N,) s from a start, as integer nanoseconds."""
-    return [start_ns + round(float(t) * 1e9) for t in time]
+def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:
+    """Times (N,) s of a file from a start, as integer nanoseconds. Raises InputError for what no stamp can hold."""
+    stamps = [start_ns + round(float(t) * 1e9) for t in time]
+    if stamps[0] < 0 or stamps[-1] >= 2**31 * 1_000_000_000:
+        raise InputError(f"{path}: from {time[0]:g} to {time[-1]:g} s, after --start, is not in 1970 .. 2038")
+    return stamps
 
 
 def body_from(frame: str) -> Array:
@@ -97,7 +104,10 @@ def read_dvl(path: Path, start_ns: int, frame: str, std: float) -> list[DvlSampl
     time, velocity = read_columns(path, "m/s")
     covariance = np.eye(3) * std**2 if std else None
     rows = (velocity @ body_from(frame).T).tolist()
-    return [DvlSample(at, (x, y, z), covariance) for at, (x, y, z) in zip(stamps_ns(time, start_ns), rows, strict=True)]
+    return [
+        DvlSample(at, (x, y, z), covariance)
+        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
+    ]
 
 
 def read_reference(path: Path, start_ns: int, frame: str, std: float) -> list[ReferenceSample]:
@@ -108,7 +118,7 @@ def read_reference(path: Path, start_ns: int, frame: str, std: float) -> list[Re
     rows = (velocity @ body_from(frame).T).tolist()
     return [
         ReferenceSample(at, (x, y, z), covariance, earth)
-        for at, (x, y, z) in zip(stamps_ns(time, start_ns), rows, strict=True)
+        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
     ]
 
 
@@ -122,7 +132,7 @@ def read_attitude(path: Path, start_ns: int) -> list[ImuSample]:
     rates = angular_velocities(time, rotations)
     return [
         ImuSample(at, quaternion_from_rotation(rotation), (x, y, z))
-        for at, rotation, (x, y, z) in zip(stamps_ns(time, start_ns), rotations, rates.tolist(), strict=True)
+        for at, rotation, (x, y, z) in zip(stamps_ns(path, time, start_ns), rotations, rates.tolist(), strict=True)
     ]
 
 
@@ -139,7 +149,10 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """How recordings become bags: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given)."""
+    """How recordings become bags: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given).
+
+    Raises InputError.
+    """
 
     frame: str = "frd"
     gnss_frame: str = "frd"
@@ -148,6 +161,11 @@ class ImportOptions:
     start_ns: int = 1_600_000_000_000_000_000
     storage: Storage = Storage.MCAP
     compression: Compression = Compression.NONE
+
+    def __post_init__(self) -> None:
+        for name, std in (("--dvl-std", self.dvl_std), ("--gnss-std", self.gnss_std)):
+            if not 0.0 <= std <= 100.0:
+                raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
 
 
 GNSS_FRAME_IDS = {"enu": "map", "ned": "ned", "flu": "base_link", "frd": "base_link"}
@@ -179,16 +197,21 @@ def import_recording(
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, dict[str, int]]:
     """Write every recording of a folder (NAME_dvl.csv or .npy, _gnss, _attitude) to output/NAME. Raises InputError."""
-    recordings = sorted(path for suffix in ("csv", "npy") for path in folder.glob(f"*_dvl.{suffix}"))
-    if not recordings:
+    names = sorted({path.stem.removesuffix("_dvl") for kind in SUFFIXES for path in folder.glob(f"*_dvl.{kind}")})
+    if not names:
         raise InputError(f"{folder}: no recordings in it; they are named NAME_dvl.csv or NAME_dvl.npy")
-    written = {}
-    for dvl in recordings:
-        name = dvl.stem.removesuffix("_dvl")
-        parts = [_partner(folder, f"{name}_{role}") for role in ("gnss", "attitude")]
-        written[output / name] = import_recording(dvl, parts[0], parts[1], output / name, options)
+    written: dict[Path, dict[str, int]] = {}
+    try:
+        for name in names:
+            dvl, gnss, attitude = (_file(folder, f"{name}_{role}") for role in ("dvl", "gnss", "attitude"))
+            assert dvl is not None
+            written[output / name] = import_recording(dvl, gnss, attitude, output / name, options)
+    except BaseException:  # all or nothing, so that the corrected folder can be imported again
+        for bag in written:
+            shutil.rmtree(bag, ignore_errors=True)
+        raise
     return written
 
 
-def _partner(folder: Path, stem: str) -> Path | None:
-    return next((path for suffix in ("csv", "npy") if (path := folder / f"{stem}.{suffix}").is_file()), None)
+def _file(folder: Path, stem: str) -> Path | None:
+    return next((path for kind in SUFFIXES if (path := folder / f"{stem}.{kind}").is_file()), None)

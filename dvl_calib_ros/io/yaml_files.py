@@ -1,4 +1,4 @@
-"""YAML, safely loaded, with the numbers that ROS 2 accepts."""
+"""YAML, safely loaded, with the numbers and texts that ROS 2 takes for such."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from .errors import InputError
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """SafeLoader that takes 1e-3 for a number, as rcl's YAML parser does (YAML 1.1 wants 1.0e-3)."""
+    """SafeLoader that takes scalars for what rcl's YAML parser does.
+
+    1e-3 is a number (YAML 1.1 wants 1.0e-3), 2026-05-01 is text (YAML 1.1 has dates).
+    """
 
 
 _Loader.add_implicit_resolver(
@@ -22,6 +25,20 @@ _Loader.add_implicit_resolver(
 )
 
 
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    for first, resolvers in _Loader.yaml_implicit_resolvers.items()
+}
+
+
+def parse_scalar(text: str) -> Any:
+    """A value as written after ``name:=``; text that is no YAML is text."""
+    try:
+        return yaml.load(text, Loader=_Loader)  # a SafeLoader
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return text
+
+
 def load_yaml(path: Path, what: str) -> Any:
     """Content of a YAML file. Raises InputError naming the file, the line and what the file should have been."""
     try:
@@ -29,8 +46,10 @@ def load_yaml(path: Path, what: str) -> Any:
             return yaml.load(file, Loader=_Loader)  # a SafeLoader
     except FileNotFoundError:
         raise InputError(f"{path}: no such {what}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as {what}: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as {what} ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: no {what}, not text: {error}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        where = str(error).replace("\n", " ")
+        where = " ".join(str(error).split())
         raise InputError(f"{path}: no {what}, not valid YAML: {where}") from error

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -54,7 +54,7 @@ class CalibrationNode(Node):
         self._feed = MessageFeed(self._calibrator, self._warn)
         self._correction: Correction | None = None
         self._corrected_by = ""
-        self._published_updates = 0
+        self._published = ("", 0)
         self._started = time.monotonic()
         self._last_dvl: float | None = None
 
@@ -67,9 +67,9 @@ class CalibrationNode(Node):
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
-        self._estimate_publisher = self.create_publisher(TwistWithCovarianceStamped, "~/estimate", latched)
-        self._corrected_publisher = self.create_publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 10)
-        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
+        self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 10)
+        self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
         self._subscribe(TwistWithCovarianceStamped, "dvl/twist", self._on_dvl)
         self._subscribe(TwistWithCovarianceStamped, "gnss/twist", self._on_reference)
@@ -81,6 +81,11 @@ class CalibrationNode(Node):
         # steady: diagnostics go on while simulated time stands still or jumps
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._log_configuration()
+
+    def _publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Any:
+        # every event callback is one more thing that the executor looks at for every message
+        events = PublisherEventCallbacks(use_default_callbacks=False)
+        return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def _warn(self, sentence: str) -> None:
         self.get_logger().warning(sentence)
@@ -127,7 +132,7 @@ class CalibrationNode(Node):
             topic,
             callback,
             profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
         )
 
     def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
@@ -155,13 +160,14 @@ class CalibrationNode(Node):
         return message
 
     def _publish_if_updated(self) -> None:
-        if self._calibrator.n_updates != self._published_updates:
+        name = self._calibrator.selected
+        if self._published != (name, self._calibrator.n_given(name)):
             self._publish_estimate()
 
     def _publish_estimate(self) -> None:
         calibrator = self._calibrator
-        self._published_updates = calibrator.n_updates
         model = MODELS[calibrator.selected]
+        self._published = (model.name, calibrator.n_given(model.name))
         state = calibrator.state(model.name)
         self._correction = Correction(model, state, calibrator.parameters.rotation_dvl_from_body)
         self._corrected_by = model.name

@@ -1,0 +1,26 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20261121)
+
+
+@pytest.fixture(scope="session")
+def snapir() -> Path:
+    """Folder of the Snapir sea trials: $DVL_CALIB_SNAPIR, or ../shared/data/snapir beside the project."""
+    named = os.environ.get("DVL_CALIB_SNAPIR")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data" / "snapir"
+    if not (folder / "T12_dvl.csv").is_file():
+        pytest.skip(f"no Snapir data in {folder}; name its folder in DVL_CALIB_SNAPIR")
+    return folder

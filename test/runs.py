@@ -1,0 +1,91 @@
+"""Simulated runs for the tests of the core: matched to the models, so that what comes out is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.simulation.sensors import measure_dvl_matched
+from dvl_calib_ros.simulation.trajectories import make_motion
+
+START_NS = 1_700_000_000_123_456_789
+SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class MatchedRun:
+    """What to simulate. phi: rad. scale: one number. Rates in Hz."""
+
+    trajectory: str = "box"
+    seconds: float = 120.0
+    phi: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: float = 0.0
+    dvl_std: float = 0.0
+    gnss_std: float = 0.0
+    mounting_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    frame: VelocityFrame = VelocityFrame.BODY
+    dvl_every: int = 20  # of the motion's 100 Hz
+    gnss_every: int = 20
+    gnss_phase: int = 0
+    imu_every: int = 5
+    dvl_late_ns: int = 0
+    seed: int = 0
+
+
+def make_samples(run: MatchedRun) -> list[DvlSample | ReferenceSample | ImuSample]:
+    """All samples in order of stamps (of measurement), IMU first, then GNSS, then DVL."""
+    rng = np.random.default_rng(run.seed)
+    motion = make_motion(run.trajectory, run.seconds, 100.0)
+    mounting = rotation_from_rpy(run.mounting_rpy).T
+    at_dvl = motion.velocity_body + np.cross(motion.angular_velocity, run.lever_arm)
+    scale = np.full(3, run.scale)
+    measured = measure_dvl_matched(at_dvl, np.array(run.phi), scale, run.dvl_std, mounting, rng)
+    reference = motion.velocity_body + rng.normal(0, run.gnss_std, motion.velocity_body.shape)
+    if run.frame is not VelocityFrame.BODY:
+        reference = np.einsum("nij,nj->ni", motion.rotation_enu_from_body, reference)
+    if run.frame is VelocityFrame.NED:
+        reference = reference[:, [1, 0, 2]] * [1, 1, -1]
+    stamps = [START_NS + round(t * 1e9) for t in motion.time]
+    samples: list = []
+    for i, stamp in enumerate(stamps):
+        if run.imu_every and i % run.imu_every == 0:
+            rotation, rate = motion.rotation_enu_from_body[i], motion.angular_velocity[i]
+            samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), tuple(rate.tolist())))
+        if run.gnss_every and (i - run.gnss_phase) % run.gnss_every == 0:
+            samples.append(ReferenceSample(stamp, tuple(reference[i].tolist()), None, run.frame))
+        if i % run.dvl_every == 0:
+            samples.append(DvlSample(stamp + run.dvl_late_ns, tuple(measured[i].tolist())))
+    return samples
+
+
+def feed(calibrator: Calibrator, samples) -> Calibrator:
+    for sample in samples:
+        if isinstance(sample, DvlSample):
+            calibrator.feed_dvl(sample)
+        elif isinstance(sample, ReferenceSample):
+            calibrator.feed_reference(sample)
+        else:
+            calibrator.feed_imu(sample)
+    return calibrator
+
+
+def calibrate(samples, parameters: Parameters | None = None, **options) -> Calibrator:
+    return feed(Calibrator(parameters or Parameters(), **options), samples)
+
+
+def only(samples, *kinds):
+    return [sample for sample in samples if isinstance(sample, kinds)]
+
+
+def shifted(samples, nanoseconds: int):
+    return [sample._replace(stamp_ns=sample.stamp_ns + nanoseconds) for sample in samples]
+
+
+def variant(run: MatchedRun, **changes) -> MatchedRun:
+    return replace(run, **changes)

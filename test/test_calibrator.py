@@ -1,0 +1,410 @@
+"""The calibrator as its users see it: what it does with order, frames, gaps, garbage and switches."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from runs import SECOND, START_NS, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+
+PHI, SCALE = (2e-5, -3e-5, 4e-5), 3e-5
+EXACT = MatchedRun(phi=PHI, scale=SCALE)
+NOISY = MatchedRun(phi=(0.02, -0.03, 0.04), scale=0.004, dvl_std=0.01, gnss_std=0.1, gnss_phase=7, seconds=60)
+WIDE = Parameters(initial_std_misalignment=1.0, initial_std_scale=0.5, gnss_aided_std=1e-3)
+AIDED = [name for name, model in MODELS.items() if model.aided]
+
+
+def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
+    for name in MODELS:
+        np.testing.assert_allclose(a.state(name).x, b.state(name).x, rtol=0, atol=atol)
+        np.testing.assert_allclose(a.state(name).p, b.state(name).p, rtol=0, atol=atol)
+    assert a.selection.segments == b.selection.segments
+
+
+# ---------------------------------------------------------------- what comes out
+
+
+@pytest.mark.parametrize("frame", VelocityFrame)
+@pytest.mark.parametrize("mounting", [(0, 0, 0), (0.1, -0.2, 0.8), (np.pi, 0, 0.3)])
+def test_gnss_models_recover_the_errors_from_a_reference_in_any_frame(frame, mounting):
+    run = variant(EXACT, frame=frame, mounting_rpy=mounting, imu_every=1)
+    calibrator = calibrate(make_samples(run), WIDE.replace(mounting_rpy=mounting))
+    for name in ("M1", "M3"):
+        np.testing.assert_allclose(calibrator.state(name).x, [*PHI, SCALE], atol=2e-7)
+
+
+def test_a_lever_arm_is_compensated_with_the_angular_velocity():
+    run = variant(EXACT, lever_arm=(2.0, -0.5, 1.0), imu_every=1)
+    bent = calibrate(make_samples(run), WIDE)
+    straight = calibrate(make_samples(run), WIDE.replace(lever_arm=run.lever_arm))
+    np.testing.assert_allclose(straight.state("M1").x, [*PHI, SCALE], atol=1e-7)
+    assert np.abs(bent.state("M1").x - [*PHI, SCALE]).max() > 1e-3
+    unknown = calibrate(only(make_samples(run), DvlSample, ReferenceSample), WIDE.replace(lever_arm=run.lever_arm))
+    assert unknown.counts["dvl"]["lever_arm_uncompensated"] == unknown.counts["dvl"]["usable"]
+
+
+def test_late_dvl_stamps_are_compensated_before_pairing():
+    run = variant(EXACT, dvl_late_ns=340_000_000)
+    late = calibrate(make_samples(run), WIDE)
+    right = calibrate(make_samples(run), WIDE.replace(dvl_time_offset=0.34))
+    np.testing.assert_allclose(right.state("M1").x, [*PHI, SCALE], atol=1e-7)
+    assert np.abs(late.state("M1").x - [*PHI, SCALE]).max() > 1e-5
+
+
+def test_message_covariances_are_turned_into_the_dvl_frame_and_added():
+    run = variant(NOISY, gnss_phase=0, mounting_rpy=(0, 0, np.pi / 2))
+    own, gnss = np.diag([1e-4, 2e-4, 3e-4]), np.diag([0.01, 0.04, 0.09])
+    samples = [
+        sample if isinstance(sample, ImuSample)
+        else sample._replace(covariance=own if isinstance(sample, DvlSample) else gnss)
+        for sample in make_samples(run)
+    ]  # fmt: skip
+    parameters = Parameters(mounting_rpy=run.mounting_rpy, gate_probability=0.0)
+    calibrator = calibrate(samples, parameters)
+    t = parameters.rotation_dvl_from_body
+    r = t @ gnss @ t.T + own  # = diag(0.04, 0.01, 0.09) + own
+    information, right = np.diag([1 / 0.05**2] * 3 + [1 / 0.006**2]), np.zeros(4)
+    references = {s.stamp_ns: s for s in only(samples, ReferenceSample)}
+    for sample in only(samples, DvlSample):
+        g = t @ references[sample.stamp_ns].velocity
+        h = np.column_stack([[0, g[2], -g[1]], [-g[2], 0, g[0]], [g[1], -g[0], 0], -g])
+        information += h.T @ np.linalg.inv(r) @ h
+        right += h.T @ np.linalg.inv(r) @ (g - sample.velocity)
+    np.testing.assert_allclose(calibrator.state("M1").x, np.linalg.solve(information, right), atol=1e-12)
+    np.testing.assert_allclose(calibrator.state("M1").p, np.linalg.inv(information), atol=1e-12)
+
+
+def test_a_covariance_is_used_only_where_it_is_given_and_wanted():
+    samples = make_samples(NOISY)
+    claimed = [s._replace(covariance=np.eye(3) * 1e-4) if isinstance(s, ReferenceSample) else s for s in samples]
+    ignored = calibrate(claimed, Parameters(use_message_covariance=False, gate_probability=0))
+    plain = calibrate(samples, Parameters(gate_probability=0))
+    assert_same(ignored, plain)
+    assert calibrate(claimed, Parameters(gate_probability=0)).state("M1").p[2, 2] < 0.1 * plain.state("M1").p[2, 2]
+
+
+# ---------------------------------------------------------------- order, blocks, switching
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), frame=st.sampled_from(list(VelocityFrame)))
+def test_the_order_in_which_topics_arrive_does_not_matter(seed, frame):
+    """Each topic in its own order, but lagging the others by up to 0.9 s: the same to the last bit."""
+    run = variant(NOISY, frame=frame, seconds=30)
+    parameters = Parameters(lever_arm=(1.0, 0.0, 0.5), gnss_hysteresis=1.0)
+    samples = [
+        s
+        for s in make_samples(run)
+        if not (isinstance(s, ReferenceSample) and 10 < (s.stamp_ns - START_NS) / SECOND < 18)
+    ]
+    expected = calibrate(samples, parameters)
+    source = random.Random(seed)
+    lag = {kind: source.uniform(0, 0.9) for kind in (DvlSample, ReferenceSample, ImuSample)}
+    jitter = {kind: 0.0 for kind in lag}
+    arrivals = []
+    for sample in samples:
+        kind = type(sample)
+        arrival = sample.stamp_ns / SECOND + lag[kind] * source.random()
+        jitter[kind] = max(jitter[kind], arrival)  # a topic keeps its own order
+        arrivals.append((jitter[kind], len(arrivals), sample))
+    shuffled = calibrate([sample for _, _, sample in sorted(arrivals)], parameters)
+    assert_same(shuffled, expected)
+    assert shuffled.counts["pairing"] == expected.counts["pairing"]
+
+
+@pytest.mark.parametrize("block_size", [2, 64, 10_000])
+def test_blocks_change_nothing_but_the_speed(block_size):
+    samples = make_samples(NOISY)
+    assert_same(calibrate(samples, block_size=block_size), calibrate(samples), atol=1e-12)
+
+
+def test_switching_models_at_any_time_equals_having_run_that_model_from_the_start():
+    samples = make_samples(NOISY)
+    switched = Calibrator(Parameters(model="M1"))
+    source = random.Random(4)
+    for at, sample in enumerate(samples):
+        feed(switched, [sample])
+        if at % 97 == 0:
+            name = source.choice(list(MODELS))
+            switched.set_parameters(switched.parameters.replace(model=name))
+            from_start = calibrate(samples[: at + 1], Parameters(model=name))
+            assert switched.selected == from_start.selected == name
+            np.testing.assert_array_equal(switched.estimate().state, from_start.estimate().state)
+            np.testing.assert_array_equal(switched.estimate().covariance, from_start.estimate().covariance)
+
+
+def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and_hysteresis():
+    run = variant(NOISY, seconds=100, gnss_phase=0)
+    outage = [
+        s
+        for s in make_samples(run)
+        if not (isinstance(s, ReferenceSample) and 40 <= (s.stamp_ns - START_NS) / SECOND < 60)
+    ]
+    segments = calibrate(outage).selection.segments
+    assert [segment.model for segment in segments] == ["M7", "M3", "M7", "M3"]
+    at = [(segment.from_ns - START_NS) / SECOND for segment in segments]
+    # lost 2 s after 39.8 s (the first sample beyond is at 42.0), then 3 s of hysteresis; back 3 s after 60 s
+    np.testing.assert_allclose(at, [0.0, 3.0, 45.0, 63.0], atol=1e-6)
+
+
+def test_a_flapping_receiver_does_not_flap_the_output():
+    run = variant(NOISY, seconds=100, gnss_phase=0)
+    flapping = [
+        s for s in make_samples(run)
+        if not (isinstance(s, ReferenceSample) and ((s.stamp_ns - START_NS) // SECOND) % 8 < 5)
+    ]  # fmt: skip
+    assert len(calibrate(flapping, Parameters(gnss_hysteresis=6.0)).selection.segments) == 1
+
+
+def test_a_model_set_by_parameter_is_selected_at_once_and_stays():
+    calibrator = calibrate(make_samples(NOISY), Parameters(model="M6"))
+    assert [segment.model for segment in calibrator.selection.segments] == ["M6"]
+    calibrator.set_parameters(Parameters(model="M2"))
+    assert calibrator.result().segments[-1].model == calibrator.selected == "M2"
+
+
+# ---------------------------------------------------------------- pairing
+
+
+def test_dvl_samples_without_a_reference_around_them_are_counted_as_unpaired():
+    samples = make_samples(variant(NOISY, seconds=30, gnss_phase=0))
+    cut = [s for s in samples if not (isinstance(s, ReferenceSample) and 10 < (s.stamp_ns - START_NS) / SECOND < 20)]
+    calibrator = calibrate(cut)
+    pairing = calibrator.counts["pairing"]
+    assert pairing["unpaired"] == 49  # 10.2 .. 19.8 at 5 Hz
+    assert pairing["paired"] == calibrator.estimate("M1").used + calibrator.estimate("M1").gated == 101
+    assert calibrator.estimate("M7").used == 150
+
+
+def test_an_earth_frame_reference_without_attitude_is_not_used_and_counted():
+    calibrator = calibrate(only(make_samples(variant(NOISY, frame=VelocityFrame.ENU)), DvlSample, ReferenceSample))
+    counts = calibrator.counts
+    assert counts["pairing"]["paired"] == 0
+    assert counts["pairing"]["without_attitude"] > 280
+    assert calibrator.estimate("M3").used == 0
+    assert calibrator.selected == "M7"
+
+
+def test_a_fast_dvl_does_not_make_more_of_a_slow_reference_than_there_is():
+    """20 DVL samples share the noise of each GNSS sample: σ must be that of the GNSS samples, not 4.5 times smaller."""
+    slow = calibrate(make_samples(variant(NOISY, seconds=300, dvl_every=100, gnss_every=100, gnss_phase=0)))
+    fast = calibrate(make_samples(variant(NOISY, seconds=300, dvl_every=5, gnss_every=100, gnss_phase=0)))
+    assert fast.estimate("M3").used == pytest.approx(20 * slow.estimate("M3").used, rel=0.05)
+    np.testing.assert_allclose(fast.estimate("M3").std, slow.estimate("M3").std, rtol=0.05)
+
+
+# ---------------------------------------------------------------- what is not used
+
+
+BAD = [
+    DvlSample(START_NS + 1, (float("nan"), 0.0, 0.0)),
+    DvlSample(START_NS + 2, (1.0, float("inf"), 0.0)),
+    DvlSample(START_NS + 3, (1.0, 0.0, 0.0), np.diag([1e-4, -1.0, 1e-4])),
+    DvlSample(START_NS + 4, (1.0, 0.0, 0.0), np.full((3, 3), np.nan)),
+    DvlSample(START_NS + 5, (11.0, 0.0, 0.0)),
+    DvlSample(START_NS + 6, (1.0, 0.0, 0.0), np.ones((3, 3))),
+    DvlSample(START_NS + 7, (1e308, 1e308, 0.0)),
+]
+
+
+def test_invalid_dvl_samples_are_dropped_counted_and_without_effect():
+    samples = make_samples(NOISY)
+    spoiled = calibrate(BAD + samples)
+    assert_same(spoiled, calibrate(samples))
+    assert spoiled.counts["dvl"]["invalid"] == len(BAD)
+
+
+@pytest.mark.parametrize("variance", [0.0, 1e-310, 5e-324])
+def test_a_zero_or_denormal_covariance_means_not_given(variance):
+    samples = make_samples(NOISY)
+    zero = [s._replace(covariance=np.eye(3) * variance) if not isinstance(s, ImuSample) else s for s in samples]
+    assert_same(calibrate(zero), calibrate(samples))
+
+
+def test_slow_samples_are_not_used():
+    run = variant(NOISY, trajectory="box", seconds=200)
+    calibrator = calibrate(make_samples(run), Parameters(min_speed=1.2))
+    counts = calibrator.counts["dvl"]
+    assert 0 < counts["slow"] < counts["accepted"]
+    assert calibrator.estimate("M7").used == counts["usable"]
+
+
+def test_samples_in_turns_are_not_used_and_none_without_a_turn_rate():
+    samples = make_samples(NOISY)
+    gated = calibrate(samples, Parameters(max_turn_rate=0.05)).counts["dvl"]
+    assert 0 < gated["turning"] < gated["accepted"]
+    blind = calibrate(only(samples, DvlSample, ReferenceSample), Parameters(max_turn_rate=0.05)).counts["dvl"]
+    # the last ones are still waiting for an IMU that may only be late
+    assert blind["no_turn_rate"] + blind["awaiting_imu"] == blind["accepted"] > 0
+
+
+def test_an_outlier_is_gated_and_changes_nothing():
+    samples = make_samples(NOISY)
+    position = next(i for i, s in enumerate(samples) if i > 500 and isinstance(s, ReferenceSample))
+    spoiled = [*samples]
+    spoiled[position] = samples[position]._replace(velocity=(-3.0, 4.0, 1.0))
+    hit, clean = calibrate(spoiled), calibrate(samples)
+    for name in AIDED:
+        assert hit.estimate(name).gated >= clean.estimate(name).gated + 1
+        assert np.abs(hit.state(name).x - clean.state(name).x).max() < 0.3 * clean.estimate(name).std.max()
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_whatever_comes_the_counts_add_up_and_the_state_stays_finite(seed):
+    source = random.Random(seed)
+    calibrator = Calibrator(Parameters(max_turn_rate=source.choice([0.0, 0.5])))
+    values = [0.0, 1.0, -2.0, 1e-310, 1e6, 1e308, float("nan"), float("inf"), -0.3]
+    at = START_NS
+    for _ in range(300):
+        at += source.choice([SECOND // 5, SECOND // 5, 0, -SECOND, 3 * SECOND, 10**12, -(10**12)])
+        vector = tuple(source.choice([1.0, 1.5, source.choice(values)]) for _ in range(3))
+        covariance = source.choice([None, np.eye(3) * source.choice(values)])
+        kind = source.randrange(3)
+        if kind == 0:
+            calibrator.feed_dvl(DvlSample(at, vector, covariance))
+        elif kind == 1:
+            calibrator.feed_reference(ReferenceSample(at, vector, covariance, source.choice(list(VelocityFrame))))
+        else:
+            orientation = source.choice([None, (0.0, 0.0, 0.0, 1.0), (*vector, 0.5)])
+            calibrator.feed_imu(ImuSample(at, orientation, source.choice([None, vector])))
+    check_sums(calibrator)
+    for name in MODELS:
+        state = calibrator.state(name)
+        assert np.isfinite(state.x).all()
+        assert np.linalg.eigvalsh(state.p)[0] > 0.0
+
+
+def check_sums(calibrator: Calibrator):
+    counts = calibrator.counts
+    assert all(value >= 0 for group in counts.values() for value in group.values())
+    dvl, pairing = counts["dvl"], counts["pairing"]
+    lost = ("invalid", "wrong_frame", "duplicate", "out_of_order", "stray", "held")
+    assert dvl["received"] == dvl["accepted"] + sum(dvl[key] for key in lost)
+    unused = ("slow", "turning", "no_turn_rate", "awaiting_imu")
+    assert dvl["accepted"] == dvl["usable"] + sum(dvl[key] for key in unused)
+    passed_on = dvl["accepted"] - dvl["awaiting_imu"]
+    assert passed_on == pairing["paired"] + pairing["unpaired"] + pairing["awaiting_reference"]
+    for name, model in MODELS.items():
+        estimate = calibrator.estimate(name)
+        given_to = estimate.used + estimate.gated
+        assert given_to <= (pairing["paired"] if model.aided else dvl["usable"])
+        if not model.aided:
+            assert given_to == dvl["usable"]
+
+
+# ---------------------------------------------------------------- restarts
+
+
+@pytest.mark.parametrize("leader", [DvlSample, ReferenceSample, ImuSample])
+def test_a_bag_that_loops_starts_the_calibration_anew_whichever_topic_jumps_first(leader):
+    samples = make_samples(variant(NOISY, frame=VelocityFrame.ENU))
+    told: list[str] = []
+    looped = calibrate(samples, on_event=told.append)
+    first = [s for s in samples if isinstance(s, leader)][:3]  # they arrive before the others' first
+    feed(looped, first + [s for s in samples if s not in first])
+    assert looped.counts["calibration"]["restarts"] == 1
+    assert "starts anew" in told[0]
+    expected = calibrate(first + [s for s in samples if s not in first])
+    assert_same(looped, expected, atol=1e-12)
+
+
+def test_a_dropout_of_ten_minutes_is_bridged_and_nothing_is_lost():
+    samples = make_samples(NOISY)
+    cut = len(samples) // 2
+    gap = samples[:cut] + shifted(samples[cut:], 600 * SECOND)
+    calibrator = calibrate(gap)
+    assert calibrator.counts["dvl"]["accepted"] == len(only(samples, DvlSample))
+    assert calibrator.counts["calibration"]["restarts"] == 0
+
+
+def test_one_stamp_far_in_the_future_does_no_harm():
+    samples = make_samples(NOISY)
+    stray = [s._replace(stamp_ns=s.stamp_ns + 10**18) for s in samples[300:303]]
+    spoiled = [*samples[:300], stray[0], *samples[300:600], stray[1], *samples[600:]]
+    assert_same(calibrate(spoiled), calibrate(samples))
+
+
+def test_reset_forgets_everything():
+    samples = make_samples(NOISY)
+    calibrator = calibrate(samples)
+    calibrator.reset()
+    assert_same(calibrator, Calibrator(Parameters()))
+    assert_same(feed(calibrator, samples), calibrate(samples))
+
+
+# ---------------------------------------------------------------- priors
+
+
+def test_an_initial_window_gives_m5_and_m6_the_mean_of_the_dvls_own_sway_and_heave():
+    samples = make_samples(variant(NOISY, trajectory="straight"))
+    calibrator = calibrate(samples, Parameters(prior_source="initial_window", prior_window=10.0))
+    first = np.array([s.velocity for s in only(samples, DvlSample)[:50]])
+    np.testing.assert_allclose(calibrator._prior.sway_heave, first.mean(axis=0)[1:], atol=1e-12)
+    assert calibrator.estimate("M5").used + calibrator.estimate("M5").gated == 250
+    assert calibrator.estimate("M7").used == 300
+    given_it = calibrate(
+        only(samples, DvlSample)[50:],
+        Parameters(prior_source="fixed", prior_sway_heave=tuple(calibrator._prior.sway_heave)),
+    )
+    np.testing.assert_allclose(calibrator.state("M5").x, given_it.state("M5").x, atol=1e-12)
+
+
+def test_a_prior_from_the_reference_is_refused_live():
+    with pytest.raises(ParameterError, match="prior_source: reference needs recorded data"):
+        Calibrator(Parameters(prior_source="reference"))
+
+
+def test_process_noise_lets_old_samples_fade():
+    fixed = calibrate(make_samples(NOISY))
+    walking = calibrate(make_samples(NOISY), Parameters(process_std_misalignment=1e-3, process_std_scale=1e-4))
+    assert (walking.estimate("M1").std > fixed.estimate("M1").std).all()
+
+
+# ---------------------------------------------------------------- convergence
+
+
+def test_a_straight_run_does_not_show_roll_and_the_operator_is_told_what_to_fly():
+    entries = calibrate(make_samples(variant(NOISY, trajectory="straight"))).estimate("M3").observability
+    roll, pitch, yaw, _ = entries
+    assert (roll.observed, pitch.observed, yaw.observed) == (False, True, True)
+    assert "turns" in roll.missing and not yaw.missing
+
+
+def test_with_a_dvl_turned_by_90_degrees_it_is_the_other_axis_that_is_roll():
+    run = variant(NOISY, trajectory="straight", mounting_rpy=(0, 0, np.pi / 2))
+    entries = calibrate(make_samples(run), Parameters(mounting_rpy=run.mounting_rpy)).estimate("M3").observability
+    assert [entry.axis for entry in entries] == ["pitch", "roll", "yaw", "scale"]
+    assert [entry.observed for entry in entries[:3]] == [True, False, True]
+
+
+def test_convergence_goes_from_collecting_over_coarse_to_fine():
+    samples = make_samples(variant(NOISY, trajectory="straight", seconds=150, gnss_std=0.02))
+    parameters = Parameters(gnss_aided_std=0.02, fine_std_misalignment=0.003)
+    calibrator = Calibrator(parameters)
+    seen = [calibrator.estimate("M3").convergence.value]
+    for start in range(0, len(samples), 50):
+        feed(calibrator, samples[start : start + 50])
+        state = calibrator.estimate("M3").convergence.value
+        if state != seen[-1]:
+            seen.append(state)
+    assert seen == ["collecting", "coarse", "fine"]
+
+
+def test_what_other_topics_still_bring_from_before_a_restart_is_not_paired_with_what_comes_after():
+    samples = make_samples(variant(NOISY, frame=VelocityFrame.ENU))
+    first = only(samples, DvlSample)[:3]
+    rest = [s for s in samples if s not in first]
+    late = only(samples[-60:], ReferenceSample, ImuSample)
+    looped = calibrate([s for s in samples if s not in late] + first + late + rest)
+    assert_same(looped, calibrate(first + rest), atol=1e-12)
+    counts = looped.counts
+    assert counts["reference"]["before_restart"] + counts["imu"]["before_restart"] == len(late)
