@@ -105,7 +105,7 @@ def estimate_cells(estimate: Estimate) -> list[str]:
     return cells
 
 
-ESTIMATE_COLUMNS = ("φx roll °", "φy pitch °", "φz yaw °", "scale %")
+ESTIMATE_COLUMNS = ("φx °", "φy °", "φz °", "δk %")
 
 
 def result_table(result: Result, models: Sequence[str], title: str) -> Table:

@@ -310,14 +310,17 @@ class BagReader:
 
         def messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
             chosen = [connection for connection in connections if connection.topic in topics]
-            newest_ns = -1
+            newest_ns, read = -1, 0
             newest: list[tuple[str, bytes]] = []
             try:
                 for connection, log_ns, data in reader.messages(connections=chosen) if chosen else ():
                     if log_ns != newest_ns:
                         newest_ns, newest = log_ns, []
                     newest.append((connection.topic, data))
+                    read += 1
                     yield log_ns, connection.topic, connection.msgtype, data
+                if read < (announced := sum(connection.msgcount for connection in chosen)):
+                    raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
             except Exception:  # rosbags gives up the whole chunk; its beginning may be whole
                 yield from _rest(salvage(path), topics, newest_ns, newest)
                 raise

@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from .errors import InputError
 from .yaml_files import load_yaml, parse_scalar
@@ -119,6 +120,14 @@ def parameter_table() -> str:
         lines.append(
             f"| `{name}` | {_shown(spec.default)} | {about} | {'' if spec.read_only else 'yes'} | {spec.description} |"
         )
+    return "\n".join(lines) + "\n"
+
+
+def model_table() -> str:
+    """The README's table of models, in Markdown."""
+    lines = ["| model | states | assumes | is wrong |", "|---|---|---|---|"]
+    for model in MODELS.values():
+        lines.append(f"| {model.name} | {' '.join(model.state_names)} | {model.assumes} | {model.wrong_when} |")
     return "\n".join(lines) + "\n"
 
 

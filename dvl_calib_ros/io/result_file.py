@@ -59,6 +59,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, An
             for name, std in names.items()
         },
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
+        "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],
         "mounting": {
             "nominal_rpy": list(parameters["mounting_rpy"]),
             "corrected_rpy": rpy.tolist(),

@@ -6,15 +6,15 @@ and indexes gives up, or returns half a message; the records inside are parsed b
 
 from __future__ import annotations
 
-import sqlite3
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from io import SEEK_CUR, BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
+import apsw
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Message, Schema
@@ -190,28 +190,58 @@ def _take(
     return None
 
 
+class _WholePages(apsw.VFSFile):  # type: ignore[misc]
+    """A database without its last page if that is cut: SQLite would take the missing bytes for zeros."""
+
+    page_size = 4096
+
+    def xFileSize(self) -> int:  # noqa: N802
+        size: int = super().xFileSize()
+        return size - size % self.page_size
+
+
+class _WholePagesVfs(apsw.VFS):  # type: ignore[misc]
+    def __init__(self, path: Path) -> None:
+        self.name = f"whole-pages-{id(self)}"
+        with path.open("rb") as file:
+            self._page_size = struct.unpack(">H", file.read(18)[16:])[0]
+        super().__init__(self.name, "")
+
+    def xOpen(self, name: Any, flags: list[int]) -> _WholePages:  # noqa: N802
+        file = _WholePages("", name, flags)
+        file.page_size = 65536 if self._page_size == 1 else max(self._page_size, 1)
+        return file
+
+
 def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
     """All messages of a rosbag2 database that SQLite can still reach, in the order they were written.
 
     Then DamagedError, if it stopped at damage.
     """
-    with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as connection:
-        try:
+    try:
+        vfs = _WholePagesVfs(path)
+        uri = f"{path.absolute().as_uri()}?immutable=1"
+        flags = apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+        with closing(apsw.Connection(uri, flags=flags, vfs=vfs.name)) as connection:
+            # without it, SQLite opens no file that is shorter than its first page says
+            connection.execute("PRAGMA writable_schema=ON")
             topics = {key: (name, kind) for key, name, kind in connection.execute("SELECT id, name, type FROM topics")}
             definitions = _sqlite_definitions(connection)
             # by rowid: the index on timestamp may lie behind the damage
             rows = connection.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY id")
             for topic_id, log_ns, data in rows:
-                if topic_id in topics:
-                    name, kind = topics[topic_id]
-                    yield Salvaged(name, kind, *definitions.get(kind, ("", "")), log_ns, bytes(data))
-        except (sqlite3.Error, TypeError, ValueError) as error:  # damage that SQLite sees, and damage that it does not
-            raise DamagedError(str(error)) from error
+                if not isinstance(data, bytes):
+                    raise TypeError(f"a message is {type(data).__name__}, not bytes")
+                name, kind = topics[topic_id]
+                yield Salvaged(name, kind, *definitions.get(kind, ("", "")), int(log_ns), data)
+    # damage that SQLite sees, and damage that it does not
+    except (apsw.Error, struct.error, KeyError, TypeError, ValueError) as error:
+        raise DamagedError(f"{type(error).__name__}: {error}") from error
 
 
-def _sqlite_definitions(connection: sqlite3.Connection) -> dict[str, tuple[str, str]]:
+def _sqlite_definitions(connection: apsw.Connection) -> dict[str, tuple[str, str]]:
     """Type -> encoding and text of the embedded definitions; bags of before ROS 2 Iron have none."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-    with suppress(sqlite3.Error):
+    with suppress(apsw.Error):
         return {kind: (encoding, text) for kind, encoding, text in connection.execute(query)}
     return {}

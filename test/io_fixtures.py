@@ -1,0 +1,122 @@
+"""Tiny recordings for the tests of files and commands."""
+
+from __future__ import annotations
+
+import heapq
+import io
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.typesys import Stores, get_typestore
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.io.bags import BagReader, BagWriter, Compression, Storage
+from dvl_calib_ros.io.messages import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.io.replay import Replayed, replay
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+TOPICS = {"dvl/twist": TWIST_TYPE, "gnss/twist": TWIST_TYPE, "imu/data": IMU_TYPE}
+Sample = DvlSample | ReferenceSample | ImuSample
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+
+
+@cache
+def run(seconds: float = 40.0, frame: VelocityFrame = VelocityFrame.ENU) -> tuple[Sample, ...]:
+    """A simulated run, in order of stamps."""
+    errors = DvlErrors((0.02, -0.03, 0.05), (0.004,) * 3, beam_std=0.005)
+    samples = simulate(Scenario(seconds=seconds, errors=errors, gnss_frame=frame))
+    return tuple(heapq.merge(samples.imu, samples.gnss, samples.dvl, key=lambda sample: sample.stamp_ns))
+
+
+def write_bag(
+    path: Path,
+    samples: Iterable[Sample],
+    storage: str = "mcap",
+    compression: str = "none",
+    dvl_frame: str = "dvl_link",
+    prefix: str = "",
+) -> Path:
+    frame_ids = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
+    with BagWriter(path, Storage(storage), Compression(compression)) as bag:
+        for sample in samples:
+            if isinstance(sample, DvlSample):
+                bag.dvl(f"{prefix}dvl/twist", sample, dvl_frame)
+            elif isinstance(sample, ReferenceSample):
+                bag.reference(f"{prefix}gnss/twist", sample, frame_ids[sample.frame])
+            else:
+                bag.imu(f"{prefix}imu/data", sample)
+    return path
+
+
+def storage_file(bag: Path) -> Path:
+    """The one file in a bag that is not metadata.yaml."""
+    (file,) = (file for file in bag.iterdir() if file.name != "metadata.yaml")
+    return file
+
+
+def rewrite(path: Path, change: Callable[[str, Any], Any], samples: Iterable[Sample]) -> Path:
+    """A bag of these samples with every message changed: change(topic, message) -> message, or None to leave it out."""
+    source = write_bag(path.with_name(f"{path.name}_source"), samples)
+    with BagReader([source]) as bag:
+        messages = [(m.topic, m.log_ns, change(m.topic, m.message)) for m in bag.messages(TOPICS)]
+    with BagWriter(path) as bag:
+        for topic, log_ns, message in messages:
+            if message is not None:
+                bag._write(topic, TOPICS[topic], log_ns, message)
+    return path
+
+
+def mcap_bytes(messages: Iterable[tuple[str, int, bytes]], **options: Any) -> bytes:
+    """An MCAP file as the mcap library writes it: with checksums, small chunks, any compression."""
+    output = io.BytesIO()
+    writer = McapWriter(output, **{"chunk_size": 2048, "compression": CompressionType.NONE, **options})
+    writer.start("ros2")
+    channels: dict[str, int] = {}
+    for topic, log_ns, data in messages:
+        if topic not in channels:
+            definition, _ = JAZZY.generate_msgdef(TOPICS[topic], ros_version=2)
+            schema = writer.register_schema(TOPICS[topic], "ros2msg", definition.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(channels[topic], log_ns, data, log_ns)
+    writer.finish()
+    return output.getvalue()
+
+
+def raw(*paths: Path) -> list[tuple[str, int, bytes]]:
+    with BagReader(paths) as bag:
+        return list(bag.raw_messages(bag.topics))
+
+
+def raw_and_notes(*paths: Path) -> tuple[list[tuple[str, int, bytes]], list[str]]:
+    with BagReader(paths) as bag:
+        return list(bag.raw_messages(bag.topics)), bag.notes
+
+
+def replayed(*paths: Path, **parameters: Any) -> Replayed:
+    return replay(paths, Parameters(**parameters))
+
+
+def estimates(*paths: Path, **parameters: Any) -> dict[str, list[float]]:
+    """Model -> state and covariance, to be compared."""
+    result = replayed(*paths, **parameters).result
+    return {name: [*each.state, *np.ravel(each.covariance)] for name, each in result.estimates.items()}
+
+
+def steady_run(count: int, seed: int = 7) -> list[Sample]:
+    """DVL and body reference at the same stamps: nothing waits for a partner where such a run is cut."""
+    rng = np.random.default_rng(seed)
+    samples: list[Sample] = []
+    for i in range(count):
+        stamp = 1_700_000_000_000_000_000 + i * 200_000_000
+        truth = np.array([1.5 + 0.3 * np.sin(i / 9), 0.2 * np.cos(i / 7), 0.0])
+        measured = truth + np.cross((0.02, -0.03, 0.05), truth) + rng.normal(0, 0.01, 3)
+        samples.append(ReferenceSample(stamp, tuple((truth + rng.normal(0, 0.05, 3)).tolist())))
+        samples.append(DvlSample(stamp, tuple(measured.tolist())))
+    return samples
