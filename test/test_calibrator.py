@@ -386,6 +386,13 @@ def test_with_a_dvl_turned_by_90_degrees_it_is_the_other_axis_that_is_roll():
     assert [entry.observed for entry in entries[:3]] == [True, False, True]
 
 
+def test_a_dvl_at_45_degrees_lacks_roll_not_pitch_on_a_straight_leg():
+    run = variant(NOISY, trajectory="straight", mounting_rpy=(0, 0, np.pi / 4))
+    estimate = calibrate(make_samples(run), Parameters(mounting_rpy=run.mounting_rpy)).estimate("M3")
+    assert [entry.axis for entry in estimate.observability] == ["roll", "roll", "yaw", "scale"]
+    assert [entry.observed for entry in estimate.observability[:3]] == [False, False, True]
+
+
 def test_convergence_goes_from_collecting_over_coarse_to_fine():
     samples = make_samples(variant(NOISY, trajectory="straight", seconds=150, gnss_std=0.02))
     parameters = Parameters(gnss_aided_std=0.02, fine_std_misalignment=0.003)

@@ -152,7 +152,7 @@ def test_a_padded_model_in_the_bank_is_the_model_alone(name, rng):
 
 
 def test_a_tilted_mounting_keeps_its_known_tilt_when_heave_is_zeroed(rng):
-    """r_z := 0 in the DVL frame, as the paper writes it, would undo a mounting's pitch; in the body frame it does not."""
+    """The paper's r_z := 0 in the DVL frame would undo a mounting's pitch; zero heave in the body frame does not."""
     t = rotation_from_rpy((0.0, 0.3, 0.0)).T
     velocity = np.column_stack([rng.uniform(1, 2, 100), rng.normal(0, 0.2, 100), np.zeros(100)])
     for name in ("M3", "M4"):

@@ -441,7 +441,6 @@ class Calibrator:
         model = MODELS[name or self.selected]
         state, covariance = self.state(model.name)
         used, gated, mean_nis = self._bank(model.name).counts(model.name)
-        entries = observability(model, covariance, self.parameters)
         return Estimate(
             model=model.name,
             state=state,
@@ -450,8 +449,8 @@ class Calibrator:
             gated=gated,
             mean_nis=mean_nis,
             nis_bounds=nis_bounds(model, self.parameters, used),
-            convergence=convergence(entries, self.parameters),
-            observability=entries,
+            convergence=convergence(model, covariance, self.parameters),
+            observability=observability(model, covariance, self.parameters),
         )
 
     def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:

@@ -30,8 +30,8 @@ class Convergence(Enum):
 class Observability(NamedTuple):
     """One parameter of one model.
 
-    std: standard deviation (rad, or dimensionless). observed: the data has halved the prior's. axis: roll, pitch, yaw
-    (the body axis that a misalignment turns about most) or scale. missing: what to fly, '' once observed.
+    std: standard deviation (rad, or dimensionless). observed: the data has halved the prior's. axis: the body axis
+    (roll, pitch, yaw) that an angle's uncertainty turns about, or scale. missing: what to fly, '' once observed.
     """
 
     name: str
@@ -42,25 +42,40 @@ class Observability(NamedTuple):
 
 
 def observability(model: Model, covariance: Array, parameters: Parameters) -> tuple[Observability, ...]:
-    """One entry per state of the model, from its covariance (n, n)."""
+    """One entry per state of the model, from its covariance (n, n).
+
+    What the data lacks is a motion of the vehicle, so the cause is looked for in the body frame: with a DVL mounted
+    at 45 degrees, a straight leg leaves φx and φy uncertain together, and both for want of roll.
+    """
     prior_std = np.sqrt(np.diag(prior(model, parameters).p))
+    in_body = body_angle_std(covariance, parameters)
     entries = []
     for index, name in enumerate(model.state_names):
         std = math.sqrt(covariance[index, index])
         observed = bool(std <= OBSERVED_SHARE * prior_std[index])
         axis = "scale"
         if index < 3:  # row i of T is the i-th DVL axis in the body
-            axis = _BODY_AXES[int(np.argmax(np.abs(parameters.rotation_dvl_from_body[index])))]
+            axis = _BODY_AXES[int(np.argmax(np.abs(parameters.rotation_dvl_from_body[index]) * in_body))]
         entries.append(Observability(name, std, observed, axis, "" if observed else model.shown_by[axis]))
     return tuple(entries)
 
 
-def convergence(entries: tuple[Observability, ...], parameters: Parameters) -> Convergence:
-    """fine: an angle is observed, every observed angle and the scale are below their thresholds."""
-    angles = [entry for entry in entries if entry.axis != "scale" and entry.observed]
-    scales = [entry for entry in entries if entry.axis == "scale"]
-    if not any(entry.observed for entry in entries):
+def body_angle_std(covariance: Array, parameters: Parameters) -> Array:
+    """Standard deviations (3,) rad of the misalignment about the body's axes: roll, pitch, yaw."""
+    t = parameters.rotation_dvl_from_body
+    return np.sqrt(np.diag(t.T @ covariance[:3, :3] @ t))
+
+
+def convergence(model: Model, covariance: Array, parameters: Parameters) -> Convergence:
+    """How far a model is. fine: an angle is observed, every observed angle and the scale are below their thresholds.
+
+    Angles are those about the body's axes, which are what a motion shows or does not show.
+    """
+    angles = body_angle_std(covariance, parameters)
+    scales = np.sqrt(np.diag(covariance)[3:])
+    observed_angles = angles <= OBSERVED_SHARE * parameters.initial_std_misalignment
+    observed_scales = scales <= OBSERVED_SHARE * parameters.initial_std_scale
+    if not observed_angles.any() and not observed_scales.any():
         return Convergence.COLLECTING
-    angles_fine = bool(angles) and all(entry.std < parameters.fine_std_misalignment for entry in angles)
-    scales_fine = all(entry.std < parameters.fine_std_scale for entry in scales)
-    return Convergence.FINE if angles_fine and scales_fine else Convergence.COARSE
+    angles_fine = observed_angles.any() and (angles[observed_angles] < parameters.fine_std_misalignment).all()
+    return Convergence.FINE if angles_fine and (scales < parameters.fine_std_scale).all() else Convergence.COARSE

@@ -107,7 +107,7 @@ def save_text(path: Path, text: str) -> None:
     Raises InputError; then the old file is untouched.
     """
     target = Path(os.path.realpath(path))  # a link stays a link
-    temporary = ""
+    temporary = backup = ""
     try:
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=".dvl_calib.", suffix=".tmp")
         with os.fdopen(handle, "wb") as file:
@@ -116,29 +116,31 @@ def save_text(path: Path, text: str) -> None:
             file.flush()
             os.fsync(file.fileno())
         if target.exists():
-            _keep_backup(target)
+            backup = _second_name(target, f"{temporary}.bak")
         os.replace(temporary, target)
         temporary = ""
+        if backup:
+            os.replace(backup, target.with_name(f"{target.name}.bak"))
+            backup = ""
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         remedy = "free some space, or name a file on another disk" if full else "name another place"
         raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
     finally:
-        if temporary:
+        for left in filter(None, (temporary, backup)):
             with suppress(OSError):
-                os.unlink(temporary)
+                os.unlink(left)
     with suppress(OSError):  # the file is there; not every file system can sync a folder
         _sync_folder(target.parent)
 
 
-def _keep_backup(path: Path) -> None:
-    backup = path.with_name(path.name + ".bak")
-    with suppress(FileNotFoundError):
-        backup.unlink()
+def _second_name(path: Path, name: str) -> str:
+    """Make the file known under this name, too."""
     try:
-        os.link(path, backup)
+        os.link(path, name)
     except OSError:  # a file system without hard links
-        shutil.copy2(path, backup)
+        shutil.copy2(path, name)
+    return name
 
 
 def _sync_folder(folder: Path) -> None:
@@ -160,6 +162,8 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
     models = content.get("models")
     if not isinstance(models, dict) or not models:
         raise InputError(f"{path}: damaged, it holds no models")
+    if "parameters" not in content:  # the last that is written
+        raise InputError(f"{path}: damaged, its end is missing")
     known = {
         name: _gaussian(f"{path}: models: {name}", name, saved) for name, saved in models.items() if name in MODELS
     }

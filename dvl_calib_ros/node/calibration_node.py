@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.models import MODELS
-from ..calibration.parameters import ParameterError, Parameters
+from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
@@ -91,9 +91,10 @@ class CalibrationNode(Node):
         self.get_logger().warning(sentence)
 
     def _log_configuration(self) -> None:
-        p = self._calibrator.parameters
-        changed = {name: value for name, value in p.as_dict().items() if value != Parameters().as_dict()[name]}
-        self.get_logger().info(f"model {p.model}; parameters that are not at their default: {changed or 'none'}")
+        default = Parameters().as_dict()
+        given = self._calibrator.parameters.as_dict()
+        changed = {name: value for name, value in given.items() if value != default[name]}
+        self.get_logger().info(f"model {given['model']}; parameters not at their default: {changed or 'none'}")
 
     # ------------------------------------------------------------------ input
 
@@ -263,9 +264,8 @@ class CalibrationNode(Node):
             self._publish_estimate()
 
     def _changed(self, parameters: list[Parameter]) -> Parameters:
-        own = Parameters().as_dict()
         return self._calibrator.parameters.replace(
-            **{parameter.name: parameter.value for parameter in parameters if parameter.name in own}
+            **{parameter.name: parameter.value for parameter in parameters if parameter.name in SCHEMA}
         )
 
     # ------------------------------------------------------------------ end

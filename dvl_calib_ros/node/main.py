@@ -32,21 +32,24 @@ def main(args: Sequence[str] | None = None) -> int:
         print(f"calibration_node: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     signal.signal(signal.SIGHUP, _stop)  # the operator's terminal is gone: save, like on SIGTERM
+    node = None
     try:
         node = CalibrationNode()
+        rclpy.spin(node)
     except (ParameterError, InputError) as error:
         print(f"calibration_node: {error}", file=sys.stderr)
-        rclpy.try_shutdown()
         return 2
-    try:
-        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+    except Exception:
+        if rclpy.ok():  # when stopped in the middle of something, rclpy raises whatever that something runs into
+            raise
     finally:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not cut the saving short
-        node.finish()
-        node.destroy_node()
+        if node is not None:
+            node.finish()
+            node.destroy_node()
         rclpy.try_shutdown()
     return 0
 

@@ -26,10 +26,10 @@ from .player import BagPlayer
 
 # place in ~/estimate's covariance diagonal, factor to what people read
 SHOWN = {
-    "phi_x": ("φx roll °", 3, math.degrees(1.0)),
-    "phi_y": ("φy pitch °", 4, math.degrees(1.0)),
-    "phi_z": ("φz yaw °", 5, math.degrees(1.0)),
-    "delta_k": ("scale %", 0, 100.0),
+    "phi_x": ("φx °", 3, math.degrees(1.0)),
+    "phi_y": ("φy °", 4, math.degrees(1.0)),
+    "phi_z": ("φz °", 5, math.degrees(1.0)),
+    "delta_k": ("δk %", 0, 100.0),
 }
 
 

@@ -1,0 +1,97 @@
+"""A ROS 2 world of one's own for a test: a domain that nobody else is on, this host only."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import rclpy
+from conftest import ROOT
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+
+PATIENCE_S = 60.0
+_domains = itertools.count(os.getpid())
+NODE = "dvl_calibration"
+
+
+def until(condition: Callable[[], Any], what: str) -> Any:
+    """Wait for a condition; fail, saying for what, if it does not come."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (value := condition()):
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S:.0f} s in vain for {what}"
+        time.sleep(0.01)
+    return value
+
+
+class World:
+    """A domain with a client node that is spun in the background."""
+
+    def __init__(self) -> None:
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        self.domain = next(_domains) % 100 + 1
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=self.domain)
+        self.node = rclpy.create_node("test_client", context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._spinning = threading.Thread(target=self._spin, daemon=True)
+        self._spinning.start()
+
+    def _spin(self) -> None:
+        with suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self._spinning.join()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+    def call(self, service_type: type, name: str, request: Any = None) -> Any:
+        client = self.node.create_client(service_type, name)
+        assert client.wait_for_service(PATIENCE_S), f"no service {name}"
+        future = client.call_async(request or service_type.Request())
+        until(future.done, f"the answer of {name}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        return self.call(SetParameters, f"{NODE}/set_parameters", request).results[0]
+
+    def received(self, message_type: type, topic: str, qos: Any = 10) -> list[Any]:
+        """A list that fills with what comes on a topic, once its publisher is found."""
+        messages: list[Any] = []
+        subscription = self.node.create_subscription(message_type, topic, messages.append, qos)
+        until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
+        return messages
+
+    @contextmanager
+    def calibration_node(self, *ros_arguments: str, stop: signal.Signals = signal.SIGINT):
+        """The node in a process of its own, with (name:=value) parameters; stopped at the end."""
+        command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args"]
+        for argument in ros_arguments:
+            command += ["-p", argument]
+        environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain), "PYTHONPATH": str(ROOT)}
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT
+        )
+        try:
+            yield process
+            process.send_signal(stop)
+            process.output = process.communicate(timeout=PATIENCE_S)[0]  # type: ignore[attr-defined]
+        finally:
+            process.kill()
+            process.wait()
