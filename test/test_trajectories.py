@@ -137,9 +137,10 @@ def test_what_is_wrong_in_a_file_is_said_with_file_and_row_and_nothing_is_writte
     assert not (tmp_path / "bag").exists()
 
 
-@pytest.mark.parametrize(
-    "table", [np.zeros((3, 3)), np.zeros(4), np.zeros((0, 4)), np.array([["a"] * 4]), np.array({})]
-)
+ODD = [np.zeros((3, 3)), np.zeros(4), np.zeros((0, 4)), np.array([["a"] * 4]), np.array({}), np.zeros(2, "f8,f8,f8,f8")]
+
+
+@pytest.mark.parametrize("table", ODD)
 def test_an_array_of_another_shape_or_kind_is_refused(tmp_path, table):
     np.save(tmp_path / "a.npy", table, allow_pickle=True)
     with pytest.raises(InputError, match=r"a\.npy: "):
