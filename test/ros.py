@@ -20,7 +20,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 
-PATIENCE_S = 60.0
+PATIENCE_S = 20.0
 _domains = itertools.count(os.getpid())
 NODE = "dvl_calibration"
 
@@ -34,6 +34,13 @@ def until(condition: Callable[[], Any], what: str) -> Any:
     return value
 
 
+def answered(future: Any) -> bool:
+    """Whether an answer comes within a sixth of our patience."""
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    return done.wait(PATIENCE_S / 6)
+
+
 class World:
     """A domain with a client node that is spun in the background."""
 
@@ -43,6 +50,7 @@ class World:
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=self.domain)
         self.node = rclpy.create_node("test_client", context=self.context)
+        self._clients: dict[str, Any] = {}
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._spinning = threading.Thread(target=self._spin, daemon=True)
@@ -59,23 +67,35 @@ class World:
         rclpy.shutdown(context=self.context)
 
     def call(self, service_type: type, name: str, request: Any = None) -> Any:
-        client = self.node.create_client(service_type, name)
-        assert client.wait_for_service(PATIENCE_S), f"no service {name}"
-        future = client.call_async(request or service_type.Request())
-        until(future.done, f"the answer of {name}")
-        self.node.destroy_client(client)
-        return future.result()
+        """Answer of a service.
+
+        A client is kept for later calls: an answer to a client that the server has only just discovered can get lost
+        in the middleware, and then the call is made again.
+        """
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(service_type, name)
+            assert self._clients[name].wait_for_service(PATIENCE_S), f"no service {name}"
+        for _ in range(6):
+            future = self._clients[name].call_async(request or service_type.Request())
+            if answered(future):
+                return future.result()
+        raise AssertionError(f"no answer from {name}")
 
     def set_parameter(self, name: str, value: Any) -> Any:
         message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
         request = SetParameters.Request(parameters=[message])
         return self.call(SetParameters, f"{NODE}/set_parameters", request).results[0]
 
-    def received(self, message_type: type, topic: str, qos: Any = 10) -> list[Any]:
-        """A list that fills with what comes on a topic, once its publisher is found."""
+    def received(self, message_type: type, topic: str, qos: Any = 10, publisher: Any = None) -> list[Any]:
+        """A list that fills with what comes on a topic, once subscriber and publisher have found each other.
+
+        publisher: the publisher itself, where it is in this process: only it knows when it has found us.
+        """
         messages: list[Any] = []
         subscription = self.node.create_subscription(message_type, topic, messages.append, qos)
         until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
+        if publisher is not None:
+            until(lambda: publisher.get_subscription_count() > 0, f"the publisher of {topic} to find its subscriber")
         return messages
 
     @contextmanager

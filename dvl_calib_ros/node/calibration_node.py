@@ -68,7 +68,7 @@ class CalibrationNode(Node):
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
         self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
-        self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 10)
+        self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
         self._subscribe(TwistWithCovarianceStamped, "dvl/twist", self._on_dvl)
