@@ -50,7 +50,8 @@ def shell(*arguments, **environment) -> subprocess.CompletedProcess:
 
 def in_fresh_process(statement: str, modules: list[str]) -> list[str]:
     """Which of these modules a statement imports."""
-    script = f"import sys\ntry:\n    {statement}\nexcept SystemExit: pass\nprint(*(m for m in {modules} if m in sys.modules))"
+    shown = f"print(*(m for m in {modules} if m in sys.modules))"
+    script = f"import sys\ntry:\n    {statement}\nexcept SystemExit: pass\n{shown}"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     return done.stdout.splitlines()[-1].split()
 
@@ -152,7 +153,7 @@ def test_only_the_models_asked_for_are_shown(capsys, bag, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("models", "name"), [("M3,M9", "'M9'"), ("m3", "'m3'"), ("", "at least one"), (",", "at least")]
+    ("models", "name"), [("M3,M9", "'M9'"), ("m3", "'m3'"), ("", "at least one"), (",", "at least one")]
 )
 def test_a_model_that_is_none_is_named_with_those_there_are(capsys, bag, models, name):
     error = fail(capsys, "replay", bag, "--models", models)

@@ -53,7 +53,11 @@ def load(arguments: argparse.Namespace) -> Parameters:
 
 def console(stderr: bool = False) -> Console:
     """A rich console; plain text where the output is no terminal, never narrower than a table needs there."""
-    from rich.console import Console
+    from rich.console import Console as RichConsole
+
+    class Console(RichConsole):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # main knows what to do; rich would exit with 1
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 160
     return Console(stderr=stderr, width=wide, highlight=False, emoji=False)
