@@ -1,0 +1,59 @@
+"""The batch path against filterpy's KalmanFilter doing the same updates."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from ..calibration import kalman
+from ..calibration.bank import prior
+from ..calibration.models import MODELS, Observations
+from ..calibration.parameters import Parameters
+from ..io.errors import InputError
+from . import Measurement
+
+N_SAMPLES = 20_000
+TARGET = 100.0
+
+
+def measure() -> list[Measurement]:
+    """Whole history of M3 over N_SAMPLES. Raises InputError without filterpy."""
+    try:
+        from filterpy.kalman import KalmanFilter
+    except ImportError as error:
+        raise InputError("the batch benchmark compares with filterpy: pip install 'dvl_calib_ros[test]'") from error
+    rng = np.random.default_rng(0)
+    reference = rng.normal([1.5, 0.1, 0.0], 0.3, (N_SAMPLES, 3))
+    seen = Observations(reference + rng.normal(0, 0.2, (N_SAMPLES, 3)), reference, None, np.eye(3), np.zeros(2))
+    model, noise = MODELS["M3"], 0.04 * np.eye(3)
+    z, h = model.linearise(seen)
+    start = prior(model, Parameters())
+
+    started = time.process_time()
+    data = kalman.Measurements(
+        z[None], h[None], noise[None, None], np.ones(N_SAMPLES), np.ones((1, N_SAMPLES), bool), np.array([np.inf])
+    )
+    history = kalman.history(start.x[None], start.p[None], data)
+    ours = time.process_time() - started
+
+    peer_filter = KalmanFilter(dim_x=model.n_state, dim_z=3)
+    peer_filter.x, peer_filter.P, peer_filter.R = start.x[:, None], start.p.copy(), noise
+    states = np.empty((N_SAMPLES, model.n_state))
+    started = time.process_time()
+    for i in range(N_SAMPLES):
+        peer_filter.update(z[i][:, None], H=h[i])
+        states[i] = peer_filter.x[:, 0]
+    peer = time.process_time() - started
+
+    difference = float(np.abs(history.x[0] - states).max())
+    return [
+        Measurement(
+            f"batch path, history of {N_SAMPLES} updates, CPU (largest difference {difference:.0e})",
+            f"{1e6 * ours / N_SAMPLES:.2f} µs/update",
+            f"{1e6 * peer / N_SAMPLES:.1f} µs/update (filterpy)",
+            f"{peer / ours:.0f} x faster",
+            f">= {TARGET:.0f} x",
+            peer / ours >= TARGET,
+        )
+    ]
