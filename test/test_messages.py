@@ -10,7 +10,7 @@ import pytest
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.io.messages import MessageFeed, linear_covariance, stamp_ns
+from dvl_calib_ros.io.messages import LinearCovariance, MessageFeed, stamp_ns
 
 SECOND = 10**9
 
@@ -55,7 +55,10 @@ def test_stamps_keep_their_nanoseconds():
 
 
 def test_the_linear_covariance_is_the_upper_left_of_the_six_by_six():
-    assert linear_covariance(list(range(36))).tolist() == [[0, 1, 2], [6, 7, 8], [12, 13, 14]]
+    read = LinearCovariance()
+    for _ in range(2):
+        assert read(list(range(36))).tolist() == [[0, 1, 2], [6, 7, 8], [12, 13, 14]]
+    assert read([0.5] * 36).tolist() == [[0.5] * 3] * 3
 
 
 def test_a_dvl_message_becomes_the_sample_it_describes():

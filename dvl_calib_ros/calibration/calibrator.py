@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,13 +25,14 @@ from .observability import convergence, observability
 from .parameters import ParameterError, Parameters
 from .results import Estimate, Result
 from .samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from .screening import is_valid_velocity, unit_quaternion, usable_covariance
+from .screening import CovarianceScreen, is_valid_velocity, unit_quaternion
 from .selection import Selection
 from .streams import Bracket, Order, S, Sequencer, Track
 
 SECOND_NS = 1_000_000_000
 # How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS
+NEVER_NS = 2**63 - 1
 
 
 class _Moving(NamedTuple):
@@ -46,12 +47,14 @@ class _Moving(NamedTuple):
 
 
 class _Paired(NamedTuple):
-    """A DVL sample with its reference velocity in the body frame."""
+    """A DVL sample with its reference velocity, in the body or, with an orientation, in ENU or NED."""
 
     sample: _Moving
     velocity: Vector
     covariance: Array | None
     weight: float
+    frame: VelocityFrame
+    orientation: Quaternion | None
 
 
 class Calibrator:
@@ -79,6 +82,7 @@ class Calibrator:
         self._on_event = on_event
         self.restarts = 0
         self._offset_ns = round(parameters.dvl_time_offset * 1e9)
+        self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
         self._lever_arm: Vector | None = (
             tuple(parameters.lever_arm) if any(parameters.lever_arm) else None  # type: ignore[assignment]
         )
@@ -114,6 +118,9 @@ class Calibrator:
         self._awaiting_reference: deque[_Moving] = deque()
         self._unaided_block: list[tuple[_Moving, bool]] = []
         self._aided_block: list[_Paired] = []
+        # what the first waiting DVL samples wait for: samples on these tracks, or any stream's stamp reaching this
+        self._blocked_by: tuple[Track[Any], ...] = ()
+        self._deadline_ns = NEVER_NS
         self._first_ns: int | None = None
         self.last_ns: int | None = None
         self._decided_ns: int | None = None
@@ -125,7 +132,7 @@ class Calibrator:
         """Take a DVL sample; whether it is valid and in order."""
         tally = self._tally["dvl"]
         tally["received"] += 1
-        valid, covariance = usable_covariance(sample.covariance)
+        valid, covariance = self._dvl_covariance(sample.covariance)
         if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
             tally["invalid"] += 1
             return False
@@ -148,44 +155,55 @@ class Calibrator:
         """Take a reference (GNSS) velocity."""
         tally = self._tally["reference"]
         tally["received"] += 1
-        valid, covariance = usable_covariance(sample.covariance)
+        valid, covariance = self._reference_covariance(sample.covariance)
         if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
             tally["invalid"] += 1
             return
         if self._decided_ns is not None and sample.stamp_ns < self._decided_ns:
             tally["late"] += 1  # a DVL sample has gone on without it: max_latency is too short
-        sample = sample._replace(covariance=covariance)
-        if self._keep("reference", self._reference_order, self._reference, sample):
-            self._advance()
+        if covariance is not sample.covariance:
+            sample = ReferenceSample(sample.stamp_ns, sample.velocity, covariance, sample.frame)
+        self._keep("reference", self._reference_order, self._reference, sample)
 
     def feed_imu(self, sample: ImuSample) -> None:
         """Take attitude and angular velocity."""
         tally = self._tally["imu"]
         tally["received"] += 1
-        orientation, angular_velocity = unit_quaternion(sample.orientation), sample.angular_velocity
-        if angular_velocity is not None and not math.isfinite(sum(angular_velocity)):
-            angular_velocity = None
+        stamp_ns, given, angular_velocity = sample
+        orientation = unit_quaternion(given)
+        if angular_velocity is not None:
+            x, y, z = angular_velocity
+            if not math.isfinite(x + y + z):
+                angular_velocity = None
         if orientation is None and angular_velocity is None:
             tally["invalid"] += 1
             return
-        sample = ImuSample(sample.stamp_ns, orientation, angular_velocity)
-        kept = self._keep("imu", self._imu_order, self._imu, sample)
-        if kept and (self._awaiting_imu or self._awaiting_reference):
-            self._advance()
+        if orientation is not given or angular_velocity is not sample.angular_velocity:
+            sample = ImuSample(stamp_ns, orientation, angular_velocity)
+        self._keep("imu", self._imu_order, self._imu, sample)
 
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
         self._tally[stream]["received"] += 1
         self._tally[stream][reason] += 1
 
-    def _keep(self, name: str, sequencer: Sequencer[S], track: Track[S], sample: S) -> bool:
-        """Put a sample on its track if its stamp allows; whether the track has grown."""
+    def _keep(self, name: str, sequencer: Sequencer[S], track: Track[S], sample: S) -> None:
+        """Put a sample on its track if its stamp allows, and let waiting DVL samples go on if it decides them."""
+        if not self._before_restart and sequencer.goes_on(sample.stamp_ns):
+            track.append(sample)
+        elif not self._keep_unusual(name, sequencer, track, sample):
+            return
+        if sample.stamp_ns >= self._deadline_ns or track in self._blocked_by:
+            self._advance()
+
+    def _keep_unusual(self, name: str, sequencer: Sequencer[S], track: Track[S], sample: S) -> bool:
+        """`_keep` for what is not simply the next sample; whether the track has grown."""
         order, admitted = sequencer.admit(sample)
         self._count_order(self._tally[name], order)
         if order is Order.CONFIRMED_RESTART:
             track.clear()
             self._before_restart.discard(name)
-        elif name in self._before_restart and admitted:
+        if name in self._before_restart and admitted:
             dvl_ns = self._dvl_order.last_ns or 0
             if admitted[-1].stamp_ns > dvl_ns + self._max_jump_ns:
                 self._tally[name]["before_restart"] += len(admitted)
@@ -220,22 +238,23 @@ class Calibrator:
     # ------------------------------------------------------------------ pairing
 
     def _advance(self) -> None:
-        """Let DVL samples go on as far as their partners are decided."""
-        newest = (self._dvl_order.last_ns, self._reference.newest_ns, self._imu.newest_ns)
-        horizon_ns = max(stamp for stamp in newest if stamp is not None)
+        """Let DVL samples go on as far as their partners are decided; note what the next ones wait for."""
+        horizon_ns = max(self._dvl_order.last_ns or 0, self._reference.newest_ns or 0, self._imu.newest_ns or 0)
+        self._blocked_by = ()
+        self._deadline_ns = NEVER_NS
         while self._awaiting_imu:
             sample = self._awaiting_imu[0]
-            if self._needs_turn_rate and not self._imu.decided(sample.stamp_ns, horizon_ns):
+            if self._needs_turn_rate and not self._is_decided(self._imu, sample.stamp_ns, horizon_ns):
                 break
             self._awaiting_imu.popleft()
             self._to_unaided(sample)
         while self._awaiting_reference:
             sample = self._awaiting_reference[0]
-            if not self._reference.decided(sample.stamp_ns, horizon_ns):
+            if not self._is_decided(self._reference, sample.stamp_ns, horizon_ns):
                 break
             bracket = self._reference.bracket(sample.stamp_ns)
             in_earth_frame = bracket is not None and bracket.after.frame is not VelocityFrame.BODY
-            if in_earth_frame and not self._imu.decided(sample.stamp_ns, horizon_ns):
+            if in_earth_frame and not self._is_decided(self._imu, sample.stamp_ns, horizon_ns):
                 break
             self._awaiting_reference.popleft()
             self._decided_ns = sample.stamp_ns
@@ -244,6 +263,14 @@ class Calibrator:
             self._update_unaided()
         if len(self._aided_block) >= self._block_size:
             self._update_aided()
+
+    def _is_decided(self, track: Track[Any], stamp_ns: int, horizon_ns: int) -> bool:
+        """Whether a DVL sample need not wait for a track any more; if it must, note for what and until when."""
+        if track.decided(stamp_ns, horizon_ns):
+            return True
+        self._blocked_by = (*self._blocked_by, track)
+        self._deadline_ns = min(self._deadline_ns, track.deadline_ns(stamp_ns))
+        return False
 
     def _to_unaided(self, sample: _Moving) -> None:
         if self._needs_turn_rate:
@@ -290,24 +317,20 @@ class Calibrator:
             velocity = _mix(before.velocity, after.velocity, fraction)
             # The mean of two samples is less noisy than each, but its neighbours share them: over a run a reference
             # sample carries its own information once, which is what the plain mean of the covariances gives.
-            covariance = None
-            if before.covariance is not None and after.covariance is not None:
+            if before.covariance is None or after.covariance is None:
+                covariance = None
+            elif before.covariance is not after.covariance:
                 covariance = (1.0 - fraction) * before.covariance + fraction * after.covariance
         weight = 1.0
         if before is not None and sample.interval_ns > 0:
             weight = 1.0 / max(1, round((after.stamp_ns - before.stamp_ns) / sample.interval_ns))
+        orientation = None
         if after.frame is not VelocityFrame.BODY:
             orientation = self._orientation(sample.stamp_ns)
             if orientation is None:
                 self._tally["pairing"]["without_attitude"] += 1
                 return None
-            rotation = rotation_from_quaternion(orientation).T
-            if after.frame is VelocityFrame.NED:
-                rotation = rotation @ ENU_FROM_NED
-            x, y, z = (rotation @ velocity).tolist()
-            velocity = (x, y, z)
-            covariance = None if covariance is None else rotation @ covariance @ rotation.T
-        return _Paired(sample, velocity, covariance, weight)
+        return _Paired(sample, velocity, covariance, weight, after.frame, orientation)
 
     def _angular_velocity(self, stamp_ns: int) -> Vector | None:
         bracket = self._imu.bracket(stamp_ns)
@@ -348,10 +371,14 @@ class Calibrator:
         if not block:
             return
         samples = [paired.sample for paired in block]
-        seen = self._observations(samples, np.array([paired.velocity for paired in block]))
+        velocity = np.array([paired.velocity for paired in block])
+        rotation = _body_from_reference(block)
+        if rotation is not None:
+            velocity = np.einsum("nij,nj->ni", rotation, velocity)
+        seen = self._observations(samples, velocity)
         weight = np.array([paired.weight for paired in block])
-        stamps = [sample.stamp_ns for sample in samples]
-        self._aided.update(stamps, seen, self._aided_covariance(block), weight, np.ones(len(block), dtype=bool))
+        noise = self._aided_covariance(block, rotation)
+        self._aided.update([s.stamp_ns for s in samples], seen, noise, weight, np.ones(len(block), dtype=bool))
 
     def _observations(self, samples: list[_Moving], reference_body: Array | None) -> Observations:
         lever = None
@@ -366,19 +393,18 @@ class Calibrator:
             sway_heave=self._prior.sway_heave,
         )
 
-    def _aided_covariance(self, block: list[_Paired]) -> Array:
+    def _aided_covariance(self, block: list[_Paired], body_from_reference: Array | None) -> Array:
         """R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
-        if not self.parameters.use_message_covariance or all(paired.covariance is None for paired in block):
+        given = [paired.covariance is not None for paired in block]
+        if not self.parameters.use_message_covariance or not any(given):
             return self._aided_noise
         rotation = self.parameters.rotation_dvl_from_body
-        noise = np.empty((len(block), 3, 3))
-        for i, paired in enumerate(block):
-            if paired.covariance is None:
-                noise[i] = self._aided_noise[0]
-            else:
-                own = self._unaided_noise[0] if paired.sample.covariance is None else paired.sample.covariance
-                noise[i] = rotation @ paired.covariance @ rotation.T + own
-        return noise
+        rotation = rotation if body_from_reference is None else rotation @ body_from_reference
+        unknown, dvl_unknown = self._aided_noise[0], self._unaided_noise[0]
+        reference = np.array([unknown if paired.covariance is None else paired.covariance for paired in block])
+        own = np.array([dvl_unknown if (cov := paired.sample.covariance) is None else cov for paired in block])
+        noise = rotation @ reference @ np.swapaxes(rotation, -1, -2) + own
+        return noise if all(given) else np.where(np.array(given)[:, None, None], noise, unknown)
 
     # ------------------------------------------------------------------ output
 
@@ -507,3 +533,14 @@ def _mix(a: Vector, b: Vector, fraction: float) -> Vector:
         a[1] + (b[1] - a[1]) * fraction,
         a[2] + (b[2] - a[2]) * fraction,
     )
+
+
+def _body_from_reference(block: list[_Paired]) -> Array | None:
+    """Rotations (N, 3, 3) that take each reference velocity to the body frame; None if all are in it."""
+    if all(paired.orientation is None for paired in block):
+        return None
+    # attitude is enu from body, so its transpose turns ENU into the body; the quaternion's conjugate is just that
+    conjugates = [(-q[0], -q[1], -q[2], q[3]) if (q := p.orientation) else (0.0, 0.0, 0.0, 1.0) for p in block]
+    rotation = rotation_from_quaternion(np.array(conjugates))
+    is_ned = np.array([paired.frame is VelocityFrame.NED for paired in block])
+    return np.where(is_ned[:, None, None], rotation @ ENU_FROM_NED, rotation) if is_ned.any() else rotation

@@ -82,16 +82,15 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
     return x, y, z, w
 
 
-def rotation_from_quaternion(q: Quaternion) -> Array:
-    """Rotation matrix (3, 3) of one unit quaternion (x, y, z, w)."""
-    x, y, z, w = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def rotation_from_quaternion(q: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) in the order x, y, z, w."""
+    x, y, z, w = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def slerp(q0: Quaternion, q1: Quaternion, fraction: float) -> Quaternion:
@@ -105,7 +104,7 @@ def slerp(q0: Quaternion, q1: Quaternion, fraction: float) -> Quaternion:
         angle = math.acos(dot)
         w0 = math.sin((1.0 - fraction) * angle) / math.sin(angle)
         w1 = sign * math.sin(fraction * angle) / math.sin(angle)
-    x, y, z, w = (w0 * a + w1 * b for a, b in zip(q0, q1, strict=True))
+    x, y, z, w = w0 * q0[0] + w1 * q1[0], w0 * q0[1] + w1 * q1[1], w0 * q0[2] + w1 * q1[2], w0 * q0[3] + w1 * q1[3]
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     return x / norm, y / norm, z / norm, w / norm
 

@@ -37,12 +37,30 @@ def usable_covariance(covariance: Array | None) -> tuple[bool, Array | None]:
     return minor > 0.0 and determinant > 0.0, covariance
 
 
+class CovarianceScreen:
+    """`usable_covariance` that recognises the covariance of the sample before: most streams repeat it."""
+
+    def __init__(self) -> None:
+        self._seen: Array | None = None
+        self._result: tuple[bool, Array | None] = (True, None)
+
+    def __call__(self, covariance: Array | None) -> tuple[bool, Array | None]:
+        """As `usable_covariance`; the same object in gives the same object out."""
+        if covariance is not self._seen:
+            self._result = usable_covariance(covariance)
+            self._seen = covariance
+        return self._result
+
+
 def unit_quaternion(q: Quaternion | None) -> Quaternion | None:
     """The quaternion with its length made one; None if it has none worth the name (nan, or all zero)."""
     if q is None:
         return None
     x, y, z, w = q
-    norm = math.sqrt(x * x + y * y + z * z + w * w) if all(map(math.isfinite, q)) else 0.0
-    if not 0.5 < norm < 2.0:
+    square = x * x + y * y + z * z + w * w
+    if abs(square - 1.0) < 1e-9:
+        return q
+    if not 0.25 < square < 4.0:  # nan and inf, too
         return None
-    return x / norm, y / norm, z / norm, w / norm
+    scale = 1.0 / math.sqrt(square)
+    return x * scale, y * scale, z * scale, w * scale

@@ -47,6 +47,14 @@ class Sequencer(Generic[S]):
         self.held: S | None = None
         self.stray = 0
 
+    def goes_on(self, stamp_ns: int) -> bool:
+        """Take note of a stamp and say True if it simply is the next one, as nearly all are; else call `admit`."""
+        last = self.last_ns
+        if last is None or self.held is not None or not last < stamp_ns <= last + self._max_jump_ns:
+            return False
+        self.last_ns = stamp_ns
+        return True
+
     def admit(self, sample: S) -> tuple[Order, tuple[S, ...]]:
         """What the sample is, and the samples that may now go on (the held one before it, once confirmed)."""
         stamp, last = sample.stamp_ns, self.last_ns
@@ -128,10 +136,13 @@ class Track(Generic[S]):
         max_gap of the newest sample) should have come by now.
         """
         newest = self.newest_ns
-        if newest is None:
-            return horizon_ns >= stamp_ns + self._max_latency_ns
-        last_chance_ns = max(stamp_ns, newest + self._max_gap_ns)
-        return newest >= stamp_ns or horizon_ns >= last_chance_ns + self._max_latency_ns
+        return (newest is not None and newest >= stamp_ns) or horizon_ns >= self.deadline_ns(stamp_ns)
+
+    def deadline_ns(self, stamp_ns: int) -> int:
+        """The horizon from which a time that this stream has not reached is decided all the same."""
+        newest = self.newest_ns
+        last_chance_ns = stamp_ns if newest is None else max(stamp_ns, newest + self._max_gap_ns)
+        return last_chance_ns + self._max_latency_ns
 
     def bracket(self, stamp_ns: int) -> Bracket[S] | None:
         """The samples around a time; None without one at or after it, or across too long a gap."""

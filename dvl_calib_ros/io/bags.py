@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, suppress
 from enum import Enum
+from operator import itemgetter
 from pathlib import Path, PurePath
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -41,21 +42,11 @@ ROS1_MAGIC = b"#ROSBAG"
 STORAGE_SUFFIXES = (".mcap", ".db3")
 
 
-class BagMessage(NamedTuple):
-    """One message: decoded, or None with the reason in `undecodable`."""
-
-    topic: str
-    log_ns: int
-    message: Any
-    undecodable: str = ""
-
-
-class _Raw(NamedTuple):
-    log_ns: int
-    source: int
-    topic: str
-    msgtype: str
-    data: bytes
+# Plain tuples: there is one per message, and a named one would cost as much as a third of its decoding.
+BagMessage = tuple[str, int, Any, str]
+"""Topic, log time (ns), decoded message (None if it cannot be decoded), and then why."""
+_Raw = tuple[int, int, str, str, bytes]
+"""Log time (ns), index of the source, topic, type, CDR bytes; topic '' marks where a source begins."""
 
 
 class _Definition(NamedTuple):
@@ -163,35 +154,37 @@ class BagReader:
         """Messages of these topics."""
         for log_ns, source, topic, msgtype, data in self._merged(topics):
             try:
-                store = self._sources[source].typestore(msgtype)
-                yield BagMessage(topic, log_ns, store.deserialize_cdr(data, msgtype))
+                message, why = self._sources[source].typestore(msgtype).deserialize_cdr(data, msgtype), ""
             except SerdeError as error:
-                yield BagMessage(topic, log_ns, None, str(error))
+                message, why = None, str(error)
             except Exception as error:  # a damaged definition or message can break the generated decoder anyhow
-                yield BagMessage(topic, log_ns, None, f"{type(error).__name__}: {error}")
+                message, why = None, f"{type(error).__name__}: {error}"
+            yield topic, log_ns, message, why
 
     def raw_messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, bytes]]:
         """Topic, log time and CDR bytes of the messages of these topics."""
-        for raw in self._merged(topics):
-            yield raw.topic, raw.log_ns, raw.data
+        for log_ns, _, topic, _, data in self._merged(topics):
+            yield topic, log_ns, data
 
     def _merged(self, topics: Iterable[str]) -> Iterator[_Raw]:
         wanted = set(topics)
         streams = [self._raw(index, wanted) for index in range(len(self._sources))]
-        merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda raw: raw.log_ns)
-        return (raw for raw in merged if raw.topic)
+        if len(streams) == 1:
+            next(streams[0])  # the marker
+            return streams[0]
+        return (raw for raw in heapq.merge(*streams, key=itemgetter(0)) if raw[2])
 
     def _raw(self, index: int, topics: set[str]) -> Iterator[_Raw]:
         source = self._sources[index]
         start_ns = newest_ns = source.span_ns[0]
         # a marker where it begins: merging opens a recording only when its time has come
-        yield _Raw(start_ns, index, "", "", b"")
+        yield start_ns, index, "", "", b""
         read = 0
         try:
             for log_ns, topic, msgtype, data in source.messages(topics):
                 if data[:4] == ZSTD_MAGIC:  # message compression; CDR begins otherwise
                     data = zstd.decompress(data)
-                yield _Raw(log_ns, index, topic, msgtype, data)
+                yield log_ns, index, topic, msgtype, data
                 read += 1
                 newest_ns = log_ns
         except Exception as error:  # the readers raise all sorts of things on damaged bytes

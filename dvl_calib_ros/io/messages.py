@@ -32,9 +32,25 @@ def stamp_ns(stamp: Any) -> int:
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
-def linear_covariance(covariance: Any) -> Array:
-    """Linear (3, 3) part of a twist covariance (36,)."""
-    return np.asarray(covariance, dtype=float).reshape(6, 6)[:3, :3]
+class LinearCovariance:
+    """Takes the linear (3, 3) part out of twist covariances (36,).
+
+    Most drivers send the same covariance with every message; it stays the same object then, and what is made of it
+    need not be made again.
+    """
+
+    def __init__(self) -> None:
+        self._bytes = b""
+        self._linear: Array = np.zeros((3, 3))
+
+    def __call__(self, covariance: Any) -> Array:
+        """(36,) -> (3, 3)."""
+        array = np.asarray(covariance, dtype=float)
+        content = array.tobytes()
+        if content != self._bytes:
+            self._bytes = content
+            self._linear = array.reshape(6, 6)[:3, :3].copy()
+        return self._linear
 
 
 class MessageFeed:
@@ -48,6 +64,8 @@ class MessageFeed:
         self.calibrator = calibrator
         self.problems: dict[str, str] = {}
         self.zero_stamps = 0
+        self._dvl_covariance = LinearCovariance()
+        self._reference_covariance = LinearCovariance()
         self._on_problem = on_problem
         self.dvl_frame: str | None = calibrator.parameters.dvl_frame or None
         self._imu_frame: str | None = None
@@ -63,7 +81,7 @@ class MessageFeed:
         sample = DvlSample(
             self._stamp_ns("dvl", message.header, received_ns),
             (linear.x, linear.y, linear.z),
-            linear_covariance(message.twist.covariance),
+            self._dvl_covariance(message.twist.covariance),
         )
         return sample if self.calibrator.feed_dvl(sample) else None
 
@@ -80,7 +98,7 @@ class MessageFeed:
         sample = ReferenceSample(
             self._stamp_ns("reference", message.header, received_ns),
             (linear.x, linear.y, linear.z),
-            linear_covariance(message.twist.covariance),
+            self._reference_covariance(message.twist.covariance),
             frame,
         )
         self.calibrator.feed_reference(sample)
