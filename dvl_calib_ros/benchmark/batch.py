@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
 from ..calibration import kalman
 from ..calibration.bank import prior
+from ..calibration.frames import Array
 from ..calibration.models import MODELS, Observations
 from ..calibration.parameters import Parameters
 from ..io.errors import InputError
@@ -15,6 +17,7 @@ from . import Measurement
 
 N_SAMPLES = 20_000
 TARGET = 100.0
+ROUNDS = 7
 
 
 def measure() -> list[Measurement]:
@@ -30,23 +33,25 @@ def measure() -> list[Measurement]:
     z, h = model.linearise(seen)
     start = prior(model, Parameters())
 
-    started = time.process_time()
-    data = kalman.Measurements(
-        z[None], h[None], noise[None, None], np.ones(N_SAMPLES), np.ones((1, N_SAMPLES), bool), np.array([np.inf])
-    )
-    history = kalman.history(start.x[None], start.p[None], data)
-    ours = time.process_time() - started
+    def run_ours() -> Array:
+        data = kalman.Measurements(
+            z[None], h[None], noise[None, None], np.ones(N_SAMPLES), np.ones((1, N_SAMPLES), bool), np.array([np.inf])
+        )
+        return kalman.history(start.x[None], start.p[None], data).x[0]
 
-    peer_filter = KalmanFilter(dim_x=model.n_state, dim_z=3)
-    peer_filter.x, peer_filter.P, peer_filter.R = start.x[:, None], start.p.copy(), noise
-    states = np.empty((N_SAMPLES, model.n_state))
-    started = time.process_time()
-    for i in range(N_SAMPLES):
-        peer_filter.update(z[i][:, None], H=h[i])
-        states[i] = peer_filter.x[:, 0]
-    peer = time.process_time() - started
+    def run_peer() -> Array:
+        peer = KalmanFilter(dim_x=model.n_state, dim_z=3)
+        peer.x, peer.P, peer.R = start.x[:, None], start.p.copy(), noise
+        states, covariances = np.empty((N_SAMPLES, model.n_state)), np.empty((N_SAMPLES, *start.p.shape))
+        for i in range(N_SAMPLES):
+            peer.update(z[i][:, None], H=h[i])
+            states[i], covariances[i] = peer.x[:, 0], peer.P
+        return states
 
-    difference = float(np.abs(history.x[0] - states).max())
+    # in turns, the best of each: what else the machine does only ever adds
+    times = [(_cpu_seconds(run_ours), _cpu_seconds(run_peer)) for _ in range(ROUNDS)]
+    ours, peer = min(ours for ours, _ in times), min(peer for _, peer in times)
+    difference = float(np.abs(run_ours() - run_peer()).max())
     return [
         Measurement(
             f"batch path, history of {N_SAMPLES} updates, CPU (largest difference {difference:.0e})",
@@ -57,3 +62,9 @@ def measure() -> list[Measurement]:
             peer / ours >= TARGET,
         )
     ]
+
+
+def _cpu_seconds(work: Callable[[], object]) -> float:
+    started = time.process_time()
+    work()
+    return time.process_time() - started

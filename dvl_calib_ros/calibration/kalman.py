@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ Mask = NDArray[np.bool_]
 # Gate decisions of a block are found by repetition (see `batch`); a block that needs more than this goes to the
 # recursion instead. Data with ordinary outliers settles in two or three.
 MAX_GATE_PASSES = 12
+# Samples of a history that are worked on at once.
+HISTORY_PIECE = 4096
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,11 @@ class Measurements:
     usable: Mask
     gate: Array
 
+    def part(self, at: slice) -> Measurements:
+        """The samples of a slice."""
+        r = self.r if self.r.shape[1] == 1 else self.r[:, at]
+        return Measurements(self.z[:, at], self.h[:, at], r, self.weight[at], self.usable[:, at], self.gate)
+
 
 @dataclass(frozen=True)
 class Updated:
@@ -63,12 +71,11 @@ class Updated:
 
 @dataclass(frozen=True)
 class History:
-    """State after every sample: x (K, N, n), p (K, N, n, n); used and nis as in `Updated`."""
+    """State after every sample: x (K, N, n), p (K, N, n, n); used as in `Updated`."""
 
     x: Array
     p: Array
     used: Mask
-    nis: Array
 
 
 def recursion(x: Array, p: Array, data: Measurements, process: Array | None = None) -> Updated:
@@ -108,98 +115,141 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
 
 def batch(x: Array, p: Array, data: Measurements) -> Updated:
     """Filter N samples at once, without process noise; the same result as `recursion`."""
-    solved = _solve(x, p, data)
+    solved = _solve(x, p, data, want_nis=True)
     if solved is None:
         return recursion(x, p, data)
-    information, information_state, used, nis = solved
-    p = np.linalg.inv(information[:, -1])
-    p = 0.5 * (p + p.transpose(0, 2, 1))
-    return Updated((p @ information_state[:, -1, :, None])[:, :, 0], p, used, nis)
+    p_after = np.linalg.inv(_full([[column[:, -1] for column in row] for row in solved.information]))
+    p_after = 0.5 * (p_after + p_after.transpose(0, 2, 1))
+    state = np.stack([column[:, -1] for column in solved.information_state], axis=-1)
+    return Updated((p_after @ state[:, :, None])[:, :, 0], p_after, solved.used, solved.nis)
 
 
 def history(x: Array, p: Array, data: Measurements) -> History:
-    """Filter N samples at once, without process noise, and keep the state after each of them."""
-    solved = _solve(x, p, data)
-    if solved is None:
-        return _recursion_history(x, p, data)
-    information, information_state, used, nis = solved
-    low, inverse_diagonal = _cholesky(_elements(information[:, 1:]))
+    """Filter N samples at once, without process noise, and keep the state after each of them.
+
+    Long runs go in pieces whose arrays stay in the processor's cache.
+    """
+    k, n_samples = data.z.shape[:2]
     n = x.shape[1]
-    unit = np.eye(n)
-    shape = (len(information), information.shape[1] - 1)
-    columns = []
-    for j in range(n):
-        right = [np.full(shape, unit[i, j]) for i in range(n)]
-        columns.append(_backward(low, inverse_diagonal, _forward(low, inverse_diagonal, right)))
-    p_all = np.moveaxis(np.array(columns), (0, 1), (-1, -2))
-    p_all = 0.5 * (p_all + np.swapaxes(p_all, -1, -2))
-    x_all = np.einsum("knij,knj->kni", p_all, information_state[:, 1:])
-    return History(x_all, p_all, used, nis)
+    # element by element in memory, as they are computed; seen from outside with the elements last
+    x_all, p_all = np.empty((n, k, n_samples)), np.empty((n, n, k, n_samples))
+    used = np.empty((k, n_samples), dtype=bool)
+    for start in range(0, n_samples, HISTORY_PIECE):
+        at = slice(start, start + HISTORY_PIECE)
+        x, p = _history_piece(x, p, data.part(at), x_all[..., at], p_all[..., at], used[:, at])
+    return History(np.moveaxis(x_all, 0, -1), np.moveaxis(p_all, (0, 1), (-2, -1)), used)
 
 
-def _solve(x: Array, p: Array, data: Measurements) -> tuple[Array, Array, Mask, Array] | None:
-    """Information Λ (K, N+1, n, n) and Λx (K, N+1, n) before and after every sample, used, nis.
+def _history_piece(
+    x: Array, p: Array, data: Measurements, x_out: Array, p_out: Array, used_out: Mask
+) -> tuple[Array, Array]:
+    """Fill in a piece of the history, x_out (n, K, N), p_out (n, n, K, N), used_out (K, N); the state after it."""
+    solved = _solve(x, p, data, want_nis=False)
+    if solved is None:
+        for i in range(data.z.shape[1]):
+            after = recursion(x, p, data.part(slice(i, i + 1)))
+            x, p = after.x, after.p
+            x_out[..., i], p_out[..., i], used_out[:, i] = x.T, np.moveaxis(p, 0, -1), after.used[:, 0]
+        return x, p
+    inverse = _invert_lower(*_cholesky([[column[:, 1:] for column in row] for row in solved.information]))
+    n = x.shape[1]
+    for i in range(n):
+        for j in range(i + 1):  # P = L⁻ᵀ L⁻¹
+            _dot([inverse[row][i] for row in range(i, n)], [inverse[row][j] for row in range(i, n)], p_out[i, j])
+            p_out[j, i] = p_out[i, j]
+    state = [column[:, 1:] for column in solved.information_state]
+    for i in range(n):
+        _dot(p_out[i], state, x_out[i])
+    used_out[:] = solved.used
+    return x_out[..., -1].T.copy(), np.moveaxis(p_out[..., -1], -1, 0).copy()
+
+
+# Small dense algebra, element by element, each element an array over models and time: for 3x3 and 4x4 matrices this
+# is ten times faster than a LAPACK call per matrix. Symmetric matrices and lower triangles are lists of rows [i][j<=i].
+
+Elements = Sequence[Sequence[Array]]
+
+
+class _Solved(NamedTuple):
+    """Information Λ (lower triangle) and Λx, each (K, N+1) before and after every sample; used, nis (K, N)."""
+
+    information: list[list[Array]]
+    information_state: list[Array]
+    used: Mask
+    nis: Array
+
+
+def _solve(x: Array, p: Array, data: Measurements, want_nis: bool) -> _Solved | None:
+    """The information after every sample.
 
     Whether a sample passes the gate depends on the samples before it. So: assume all pass, compute every state at
     once, gate every sample against its state, and repeat with what passed until nothing changes. Each pass settles at
     least the first sample still wrong, so the fixed point is the recursion's own sequence of decisions. None when it
     does not settle in MAX_GATE_PASSES.
     """
+    n, m = x.shape[1], data.z.shape[2]
     prior = np.linalg.inv(p)
-    wh = np.matmul(np.linalg.inv(data.r) * data.weight[:, None, None], data.h)
-    gained = np.matmul(data.h.swapaxes(-1, -2), wh)
-    gained_state = np.einsum("knmi,knm->kni", wh, data.z)
+    prior_state = (prior @ x[:, :, None])[:, :, 0]
+    h = np.ascontiguousarray(np.moveaxis(data.h, (2, 3), (0, 1)))  # (m, n, K, N)
+    z = np.ascontiguousarray(np.moveaxis(data.z, 2, 0))  # (m, K, N)
+    wh = _weighted(data, h)
+    # with room in front for the prior: the running sums are then taken in place
+    room = (x.shape[0], data.z.shape[1] + 1)
+    gained = [[_gain(wh[:, i], h[:, j], room) for j in range(i + 1)] for i in range(n)]
+    gained_state = [_gain(wh[:, i], z, room) for i in range(n)]
     gated = bool(np.isfinite(data.gate).any())
-    used = data.usable
+    used, all_used = data.usable, bool(data.usable.all())
+    nis: Array = np.zeros(data.usable.shape)
     for _ in range(MAX_GATE_PASSES):
-        information = _running_sum(prior, gained, used[:, :, None, None])
-        information_state = _running_sum((prior @ x[:, :, None])[:, :, 0], gained_state, used[:, :, None])
-        nis = _normalised_innovation_squared(information[:, :-1], information_state[:, :-1], data)
+        mask = None if all_used else used
+        information = [[_running_sum(prior[:, i, j], gained[i][j], mask) for j in range(i + 1)] for i in range(n)]
+        information_state = [_running_sum(prior_state[:, i], gained_state[i], mask) for i in range(n)]
+        if gated or want_nis:
+            nis = _normalised_innovation_squared(information, information_state, h, z, data.r, m)
         passed = data.usable & (nis <= data.gate[:, None])
         if not gated or np.array_equal(passed, used):
-            return information, information_state, used, np.where(data.usable, nis, 0.0)
-        used = passed
+            return _Solved(information, information_state, used, np.where(data.usable, nis, 0.0))
+        used, all_used = passed, False
     return None
 
 
-def _running_sum(first: Array, gained: Array, used: Mask) -> Array:
-    return np.cumsum(np.concatenate([first[:, None], gained * used], axis=1), axis=1)
+def _weighted(data: Measurements, h: Array) -> Array:
+    """R⁻¹H times the samples' weights, (m, n, K, N)."""
+    inverse = np.linalg.inv(data.r)
+    m = len(h)
+    if data.r.shape[:2] == (1, 1):
+        wh = (inverse[0, 0] @ h.reshape(m, -1)).reshape(h.shape)
+    else:
+        wh = np.stack([_dot([inverse[..., i, k] for k in range(m)], h) for i in range(m)])
+    if (data.weight != 1.0).any():
+        wh *= data.weight
+    return wh
 
 
-def _recursion_history(x: Array, p: Array, data: Measurements) -> History:
-    xs, ps, used, nis = [], [], [], []
-    for i in range(data.z.shape[1]):
-        at = slice(i, i + 1)
-        one = Measurements(
-            data.z[:, at],
-            data.h[:, at],
-            data.r if data.r.shape[1] == 1 else data.r[:, at],
-            data.weight[at],
-            data.usable[:, at],
-            data.gate,
-        )
-        after = recursion(x, p, one)
-        x, p = after.x, after.p
-        xs.append(x)
-        ps.append(p)
-        used.append(after.used[:, 0])
-        nis.append(after.nis[:, 0])
-    return History(np.stack(xs, axis=1), np.stack(ps, axis=1), np.stack(used, axis=1), np.stack(nis, axis=1))
+def _gain(a: Array, b: Array, room: tuple[int, int]) -> Array:
+    gained = np.empty(room)
+    _dot(a, b, gained[:, 1:])
+    return gained
 
 
-# Small dense algebra, element by element, each element an array over models and time: for 3x3 and 4x4 matrices this
-# is ten times faster than a LAPACK call per matrix.
+def _running_sum(first: Array, gained: Array, used: Mask | None) -> Array:
+    """The prior's (K,) and what each sample adds (K, 1 + N, the first column free) -> sums (K, N+1)."""
+    gained[:, 0] = first
+    if used is None:
+        return np.cumsum(gained, axis=1)
+    total = np.empty_like(gained)
+    total[:, 0] = first
+    np.multiply(gained[:, 1:], used, out=total[:, 1:])
+    return np.cumsum(total, axis=1, out=total)
 
-Elements = Sequence[Sequence[Array]]
+
+def _full(lower: Elements) -> Array:
+    """Rows [i][j<=i] of a symmetric matrix -> (..., n, n)."""
+    n = len(lower)
+    return np.stack([np.stack([lower[max(i, j)][min(i, j)] for j in range(n)], axis=-1) for i in range(n)], axis=-2)
 
 
-def _elements(matrices: Array) -> Elements:
-    """(..., n, n) -> nested list [i][j] of contiguous arrays (...), lower triangle only."""
-    n = matrices.shape[-1]
-    return [[np.ascontiguousarray(matrices[..., i, j]) for j in range(i + 1)] for i in range(n)]
-
-
-def _cholesky(a: Elements) -> tuple[Elements, list[Array]]:
+def _cholesky(a: Elements) -> tuple[list[list[Array]], list[Array]]:
     """Lower L with A = L Lᵀ, and the inverses of its diagonal."""
     low: list[list[Array]] = []
     inverse_diagonal: list[Array] = []
@@ -207,8 +257,8 @@ def _cholesky(a: Elements) -> tuple[Elements, list[Array]]:
         low.append([])
         for j in range(i + 1):
             value = row[j]
-            for k in range(j):
-                value = value - low[i][k] * low[j][k]
+            if j:
+                value = value - _dot(low[i][:j], low[j][:j] if j < i else low[i][:j])
             if i == j:
                 value = np.sqrt(value)
                 inverse_diagonal.append(1.0 / value)
@@ -218,43 +268,48 @@ def _cholesky(a: Elements) -> tuple[Elements, list[Array]]:
     return low, inverse_diagonal
 
 
+def _invert_lower(low: Elements, inverse_diagonal: Sequence[Array]) -> list[list[Array]]:
+    """L⁻¹."""
+    n = len(low)
+    inverse: list[list[Array]] = []
+    for i in range(n):
+        inverse.append([])
+        for j in range(i):
+            total = _dot(low[i][j:i], [inverse[row][j] for row in range(j, i)])
+            inverse[i].append(-(total * inverse_diagonal[i]))
+        inverse[i].append(inverse_diagonal[i])
+    return inverse
+
+
 def _forward(low: Elements, inverse_diagonal: Sequence[Array], b: Sequence[Array]) -> list[Array]:
     """L⁻¹ b."""
     y: list[Array] = []
     for i, value in enumerate(b):
-        for k in range(i):
-            value = value - low[i][k] * y[k]
+        if i:
+            value = value - _dot(low[i][:i], y)
         y.append(value * inverse_diagonal[i])
     return y
 
 
-def _backward(low: Elements, inverse_diagonal: Sequence[Array], y: Sequence[Array]) -> list[Array]:
-    """L⁻ᵀ y."""
-    n = len(y)
-    x: list[Array] = [y[0]] * n
-    for i in reversed(range(n)):
-        value = y[i]
-        for k in range(i + 1, n):
-            value = value - low[k][i] * x[k]
-        x[i] = value * inverse_diagonal[i]
-    return x
-
-
-def _dot(a: list[Array], b: Sequence[Array]) -> Array:
-    total = a[0] * b[0]
-    for left, right in zip(a[1:], b[1:], strict=True):
-        total = total + left * right
+def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array, out: Array | None = None) -> Array:
+    """Sum of products of two rows of arrays."""
+    total: Array = np.multiply(a[0], b[0], out=out)
+    if len(a) > 1:
+        product = np.empty_like(total)
+        for left, right in zip(a[1:], b[1:], strict=False):
+            np.multiply(left, right, out=product)
+            total += product
     return total
 
 
-def _normalised_innovation_squared(information: Array, information_state: Array, data: Measurements) -> Array:
+def _normalised_innovation_squared(
+    information: Elements, information_state: Sequence[Array], h: Array, z: Array, r: Array, m: int
+) -> Array:
     """νᵀS⁻¹ν (K, N) with S = HPHᵀ + R and ν = z - Hx, from Λ = P⁻¹ = LLᵀ: with U = L⁻¹Hᵀ, HPHᵀ = UᵀU."""
-    low, inverse_diagonal = _cholesky(_elements(information))
-    m, n = data.h.shape[2:]
-    y = _forward(low, inverse_diagonal, [information_state[..., i] for i in range(n)])
-    h = np.ascontiguousarray(np.moveaxis(data.h, (2, 3), (0, 1)))
-    u = [_forward(low, inverse_diagonal, list(h[row])) for row in range(m)]
-    s = [[_dot(u[i], u[j]) + data.r[..., i, j] for j in range(i + 1)] for i in range(m)]
-    innovation = [data.z[..., row] - _dot(u[row], y) for row in range(m)]
+    low, inverse_diagonal = _cholesky([[column[:, :-1] for column in row] for row in information])
+    y = _forward(low, inverse_diagonal, [column[:, :-1] for column in information_state])
+    u = [_forward(low, inverse_diagonal, h[row]) for row in range(m)]
+    s = [[_dot(u[i], u[j]) + r[..., i, j] for j in range(i + 1)] for i in range(m)]
+    innovation = [z[row] - _dot(u[row], y) for row in range(m)]
     whitened = _forward(*_cholesky(s), innovation)
     return _dot(whitened, whitened)

@@ -136,19 +136,24 @@ class CalibrationNode(Node):
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
         )
 
+    def _received_ns(self, message: Any) -> int:
+        """Time of reception, asked of the clock only for a message that has no stamp of its own."""
+        stamp = message.header.stamp
+        return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
+
     def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
         self._last_dvl = time.monotonic()
-        sample = self._feed.dvl(message, self.get_clock().now().nanoseconds)
+        sample = self._feed.dvl(message, self._received_ns(message))
         if sample is not None:
             self._publish_corrected(sample)
         self._publish_if_updated()
 
     def _on_reference(self, message: TwistWithCovarianceStamped) -> None:
-        self._feed.reference(message, self.get_clock().now().nanoseconds)
+        self._feed.reference(message, self._received_ns(message))
         self._publish_if_updated()
 
     def _on_imu(self, message: Imu) -> None:
-        self._feed.imu(message, self.get_clock().now().nanoseconds)
+        self._feed.imu(message, self._received_ns(message))
         self._publish_if_updated()
 
     # ------------------------------------------------------------------ output
