@@ -65,7 +65,7 @@ def rewrite(path: Path, change: Callable[[str, Any], Any], samples: Iterable[Sam
     """A bag of these samples with every message changed: change(topic, message) -> message, or None to leave it out."""
     source = write_bag(path.with_name(f"{path.name}_source"), samples)
     with BagReader([source]) as bag:
-        messages = [(m.topic, m.log_ns, change(m.topic, m.message)) for m in bag.messages(TOPICS)]
+        messages = [(topic, log_ns, change(topic, message)) for topic, log_ns, message, _ in bag.messages(TOPICS)]
     with BagWriter(path) as bag:
         for topic, log_ns, message in messages:
             if message is not None:

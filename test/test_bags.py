@@ -179,7 +179,7 @@ def test_the_definition_embedded_in_the_bag_is_used(tmp_path, storage):
             message = types[TWIST_TYPE](20.0, types["std_msgs/msg/Header"](stamp, "dvl_link"), inner)
             writer.write(connection, (100 + i) * 10**9, vendor.serialize_cdr(message, TWIST_TYPE))
     with BagReader([tmp_path / "bag"]) as bag:
-        linear = next(iter(bag.messages(["dvl/twist"]))).message.twist.twist.linear
+        linear = next(iter(bag.messages(["dvl/twist"])))[2].twist.twist.linear
     assert (linear.x, linear.y, linear.z) == (1.5, 0.1, 0.05)
     samples = [DvlSample((100 + i) * 10**9, (1.5, 0.1, 0.05)) for i in range(50)]
     standard = write_bag(tmp_path / "standard", samples)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..calibration.advice import data_advice, gate_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
 from ..calibration.parameters import Parameters
@@ -169,30 +170,14 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
 
 def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
     """What the counts say that a user should not overlook."""
-    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
-    notes = []
+    dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    if pairing["without_attitude"]:
-        notes.append(
-            f"{pairing['without_attitude']} DVL samples have an earth-frame reference but no attitude from "
-            f"{topics.imu}: the models with GNSS could not use them (set --imu-topic?)"
-        )
-    if dvl["no_turn_rate"]:
-        notes.append(f"{dvl['no_turn_rate']} samples have no angular velocity for max_turn_rate and are not used")
-    if dvl.get("lever_arm_uncompensated"):
-        notes.append(f"lever_arm is not compensated in {dvl['lever_arm_uncompensated']} samples: no angular velocity")
-    if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
-        notes.append("every sample is slower than min_speed: nothing was learnt")
+    notes = data_advice(result)
     if feed.zero_stamps:
         notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
     for estimate in result.estimates.values():
-        given = estimate.used + estimate.gated
-        if given and estimate.gated > 0.2 * given:
-            notes.append(
-                f"{estimate.model}: {estimate.gated} of {given} samples are gated; check mounting_rpy and the frames "
-                "before believing it"
-            )
+        notes += gate_advice(estimate)
     return notes
 
 

@@ -6,14 +6,13 @@ import math
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from ..calibration.advice import consistency_advice, data_advice, gate_advice
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate, Result
 from ..calibration.selection import Selection
 
 # A DVL that has sent nothing for so long is a fault, s.
 SILENCE_S = 5.0
-# Share of gated samples above which the configuration is more likely wrong than the data.
-SUSPICIOUS_GATED = 0.2
 
 
 def diagnose(
@@ -21,7 +20,8 @@ def diagnose(
 ) -> DiagnosticStatus:
     """Status of the running calibration. dvl_silent_s: wall time since the last DVL message, None before the first."""
     estimate = result.estimate
-    faults, warnings = _faults(dvl_silent_s, running_s), _warnings(estimate, problems)
+    faults = _faults(dvl_silent_s, running_s)
+    warnings = problems + data_advice(result) + gate_advice(estimate) + consistency_advice(estimate)
     level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
     status = DiagnosticStatus(level=level, name="dvl_calibration: calibration", hardware_id="dvl")
     status.message = "; ".join(faults + warnings) or f"{result.selected} {estimate.convergence.value}"
@@ -43,16 +43,6 @@ def _faults(dvl_silent_s: float | None, running_s: float) -> list[str]:
     if dvl_silent_s is None:
         return ["no DVL message yet: check the topic dvl/twist and its type"] if running_s > SILENCE_S else []
     return [f"no DVL message for {dvl_silent_s:.0f} s"] if dvl_silent_s > SILENCE_S else []
-
-
-def _warnings(estimate: Estimate, problems: list[str]) -> list[str]:
-    warnings = list(problems)
-    given = estimate.used + estimate.gated
-    if given >= 20 and estimate.gated > SUSPICIOUS_GATED * given:
-        warnings.append(f"{estimate.gated} of {given} samples gated: check mounting_rpy and the frames")
-    if estimate.used >= 20 and estimate.mean_nis > estimate.nis_bounds[1]:
-        warnings.append("innovations larger than R and P allow: σ is too small, raise gnss_aided_std or gnss_free_std")
-    return warnings
 
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:

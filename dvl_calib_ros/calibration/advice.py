@@ -1,0 +1,50 @@
+"""What a calibration's counts say that a user must not overlook: sentences, for the replay and for /diagnostics."""
+
+from __future__ import annotations
+
+from .results import Estimate, Result
+
+# Share of gated samples above which the configuration is more likely wrong than the data.
+SUSPICIOUS_GATED = 0.2
+# Fewer samples say nothing yet.
+ENOUGH_SAMPLES = 20
+
+
+def data_advice(result: Result) -> list[str]:
+    """What is wrong with the data that came, and the remedy."""
+    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+    sentences = []
+    if pairing["without_attitude"]:
+        sentences.append(
+            f"{pairing['without_attitude']} DVL samples have an earth-frame reference but no attitude: the models with "
+            "GNSS cannot use them; is the IMU topic right, and does it give an orientation?"
+        )
+    if dvl["no_turn_rate"]:
+        sentences.append(f"{dvl['no_turn_rate']} samples have no angular velocity for max_turn_rate and are not used")
+    if dvl.get("lever_arm_uncompensated"):
+        count = dvl["lever_arm_uncompensated"]
+        sentences.append(f"lever_arm is not compensated in {count} samples: no angular velocity")
+    if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
+        sentences.append("every sample is slower than min_speed: nothing is learnt")
+    return sentences
+
+
+def gate_advice(estimate: Estimate) -> list[str]:
+    """Whether a model's gate throws away so much that the configuration must be wrong."""
+    given = estimate.used + estimate.gated
+    if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
+        return []
+    return [
+        f"{estimate.model}: {estimate.gated} of {given} samples are gated; check mounting_rpy and the frames before "
+        "believing it"
+    ]
+
+
+def consistency_advice(estimate: Estimate) -> list[str]:
+    """Whether a model's innovations are larger than it believes; smaller ones only make σ too large."""
+    if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
+        return []
+    return [
+        f"{estimate.model}: innovations are larger than R and P allow (mean NIS {estimate.mean_nis:.1f}, at most "
+        f"{estimate.nis_bounds[1]:.1f}): σ is too small, raise gnss_aided_std or gnss_free_std"
+    ]
