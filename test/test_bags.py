@@ -241,7 +241,7 @@ def test_an_earth_frame_reference_without_attitude_is_said(tmp_path):
     bag = write_bag(tmp_path / "bag", [s for s in run() if hasattr(s, "velocity")])
     replay = replayed(bag)
     assert replay.result.estimates["M3"].used == 0
-    assert any("no attitude" in note and "--imu-topic" in note for note in replay.notes)
+    assert any("no attitude" in note and "IMU topic" in note for note in replay.notes)
 
 
 @pytest.mark.parametrize("frame", [VelocityFrame.BODY, VelocityFrame.ENU])
