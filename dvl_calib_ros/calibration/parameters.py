@@ -72,7 +72,10 @@ class ParameterSpec:
     def _number(self, name: str, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             raise ParameterError(f"{name}: expected a number, got {value!r}")
-        number = float(value)
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
         if not math.isfinite(number):
             raise ParameterError(f"{name}: {number} is not finite")
         if (self.low is not None and number < self.low) or (self.high is not None and number > self.high):

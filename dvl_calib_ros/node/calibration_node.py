@@ -47,7 +47,7 @@ class CalibrationNode(Node):
             check_writable(Path(parameters.result_file))
         initial = None
         if parameters.initial_calibration:
-            initial = load_initial_calibration(Path(parameters.initial_calibration))
+            initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
         self._calibrator = Calibrator(parameters, initial=initial, on_event=self._warn)
@@ -227,6 +227,7 @@ class CalibrationNode(Node):
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
+        self._feed.problems.clear()
         self._correction = None
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"

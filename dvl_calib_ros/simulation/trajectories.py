@@ -97,9 +97,13 @@ def _smoothed(one_round: list[Leg], seconds: float, time: Array) -> tuple[Array,
         yaw_rates.append(leg.yaw_rate)
         if end > seconds:
             break
-    spread = np.linspace(-1.5, 1.5, 31)
-    at = np.searchsorted(ends, np.clip(time[:, None] + spread, 0.0, seconds))
-    return np.array(speeds)[at].mean(axis=1), np.array(yaw_rates)[at].mean(axis=1)
+    speed, yaw_rate = np.zeros_like(time), np.zeros_like(time)
+    shifts = np.linspace(-1.5, 1.5, 31)
+    for shift in shifts:
+        at = np.searchsorted(ends, np.clip(time + shift, 0.0, seconds))
+        speed += np.array(speeds)[at] / len(shifts)
+        yaw_rate += np.array(yaw_rates)[at] / len(shifts)
+    return speed, yaw_rate
 
 
 def _integral(time: Array, rate: Array) -> Array:
