@@ -75,7 +75,7 @@ class ParameterSpec:
         try:
             number = float(value)
         except OverflowError:
-            number = math.inf
+            raise ParameterError(f"{name}: the whole number is too large") from None
         if not math.isfinite(number):
             raise ParameterError(f"{name}: {number} is not finite")
         if (self.low is not None and number < self.low) or (self.high is not None and number > self.high):

@@ -26,8 +26,6 @@ def load_parameters(path: Path | None, overrides: Sequence[str] = ()) -> Paramet
         Parameters.from_mapping(values)
     except ParameterError as error:
         raise InputError(f"{path}: {error}") from error
-    except OverflowError as error:
-        raise InputError(f"{path}: a whole number in it is too large ({error})") from error
     for override in overrides:
         name, separator, text = override.partition(":=")
         if not separator:
@@ -37,7 +35,7 @@ def load_parameters(path: Path | None, overrides: Sequence[str] = ()) -> Paramet
             values[name] = "" if value is None else value
     try:
         return Parameters.from_mapping(values)
-    except (ParameterError, OverflowError) as error:
+    except ParameterError as error:
         raise InputError(f"-p {error}") from error
 
 
