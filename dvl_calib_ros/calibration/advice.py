@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from .results import Estimate, Result
+from collections.abc import Mapping
+
+from .results import Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -10,9 +12,9 @@ SUSPICIOUS_GATED = 0.2
 ENOUGH_SAMPLES = 20
 
 
-def data_advice(result: Result) -> list[str]:
-    """What is wrong with the data that came, and the remedy."""
-    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """What is wrong with the data that came, and the remedy; from `Calibrator.counts`."""
+    dvl, pairing = counts["dvl"], counts["pairing"]
     sentences = []
     if pairing["without_attitude"]:
         sentences.append(

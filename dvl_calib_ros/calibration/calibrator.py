@@ -5,8 +5,8 @@
     feed_reference ─► valid? ─► in order? ─► track                               with GNSS, automatic selection
     feed_imu ───────► valid? ─► in order? ─► track
 
-The node, the replay and the evaluation all use this class; only `block_size` differs (how many samples are gathered
-before the models are updated: 1 live, many offline), and that changes nothing but the speed.
+The node, the replay and the evaluation all use this class; only `block_size` differs, and that changes nothing but the
+speed.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Calibrator:
     """Calibrates with all models at once, see the module's picture.
 
     prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
-    by model name. block_size: samples gathered for an update of the models. on_event: told of restarts in words.
+    by model name. block_size: samples that are gathered before the models are updated, if nobody asks for their state
+    earlier. on_event: told of restarts in words.
     """
 
     def __init__(
@@ -451,12 +452,15 @@ class Calibrator:
 
     def n_given(self, name: str) -> int:
         """Number of samples that a model was given so far; it grows when there may be a new estimate."""
-        return self._bank(name).n_given
+        waiting = self._aided_block if MODELS[name].aided else self._unaided_block
+        return self._bank(name).n_given + len(waiting)
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model."""
-        self._update_unaided()
-        self._update_aided()
+        if MODELS[name].aided:
+            self._update_aided()
+        else:
+            self._update_unaided()
         return self._bank(name).state(name)
 
     def _bank(self, name: str) -> ModelBank:

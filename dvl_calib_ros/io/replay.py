@@ -173,7 +173,7 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    notes = data_advice(result)
+    notes = data_advice(result.counts)
     if feed.zero_stamps:
         notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
     for estimate in result.estimates.values():

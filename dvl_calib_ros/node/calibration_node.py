@@ -35,6 +35,9 @@ from .parameters import declare_parameters
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
 QUEUE = 5000
+# The selected model is updated as its samples come, because its estimate is published; the others when they are asked
+# for, or when so many samples have come together.
+BLOCK_SIZE = 64
 
 
 class CalibrationNode(Node):
@@ -50,7 +53,7 @@ class CalibrationNode(Node):
             initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
-        self._calibrator = Calibrator(parameters, initial=initial, on_event=self._warn)
+        self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
         self._feed = MessageFeed(self._calibrator, self._warn)
         self._correction: Correction | None = None
         self._corrected_by = ""
@@ -212,13 +215,8 @@ class CalibrationNode(Node):
 
     def _publish_diagnostics(self) -> None:
         silent = None if self._last_dvl is None else time.monotonic() - self._last_dvl
-        status = diagnose(
-            self._calibrator.result(),
-            self._calibrator.selection,
-            list(self._feed.problems.values()),
-            silent,
-            time.monotonic() - self._started,
-        )
+        problems = list(self._feed.problems.values())
+        status = diagnose(self._calibrator, problems, silent, time.monotonic() - self._started)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)

@@ -1,37 +1,38 @@
-"""What /diagnostics says: one status, made of a calibration's result."""
+"""What /diagnostics says: one status of the running calibration."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from ..calibration.advice import consistency_advice, data_advice, gate_advice
+from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
-from ..calibration.results import Estimate, Result
-from ..calibration.selection import Selection
+from ..calibration.results import Estimate
 
 # A DVL that has sent nothing for so long is a fault, s.
 SILENCE_S = 5.0
 
 
 def diagnose(
-    result: Result, selection: Selection, problems: list[str], dvl_silent_s: float | None, running_s: float
+    calibrator: Calibrator, problems: list[str], dvl_silent_s: float | None, running_s: float
 ) -> DiagnosticStatus:
     """Status of the running calibration. dvl_silent_s: wall time since the last DVL message, None before the first."""
-    estimate = result.estimate
+    estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     faults = _faults(dvl_silent_s, running_s)
-    warnings = problems + data_advice(result) + gate_advice(estimate) + consistency_advice(estimate)
+    warnings = problems + data_advice(counts) + gate_advice(estimate) + consistency_advice(estimate)
     level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
     status = DiagnosticStatus(level=level, name="dvl_calibration: calibration", hardware_id="dvl")
-    status.message = "; ".join(faults + warnings) or f"{result.selected} {estimate.convergence.value}"
+    status.message = "; ".join(faults + warnings) or f"{estimate.model} {estimate.convergence.value}"
     values = {
-        "model": result.selected,
-        "why": result.selected_because,
+        "model": estimate.model,
+        "why": selection.reason(calibrator.parameters),
         "gnss": selection.gnss.reason,
         "convergence": estimate.convergence.value,
         **_estimate_values(estimate),
-        **_count_values(result),
+        **_count_values(estimate, counts),
     }
     for number, problem in enumerate(problems, start=1):
         values[f"problem {number}"] = problem
@@ -58,9 +59,9 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     return values
 
 
-def _count_values(result: Result) -> dict[str, str]:
-    values = {"samples used": str(result.estimate.used), "samples gated": str(result.estimate.gated)}
-    for stream, counts in result.counts.items():
-        for name, count in counts.items():
+def _count_values(estimate: Estimate, counts: Mapping[str, Mapping[str, int]]) -> dict[str, str]:
+    values = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}
+    for stream, tally in counts.items():
+        for name, count in tally.items():
             values[f"{stream} {name}"] = str(count)
     return values
