@@ -127,6 +127,8 @@ def _compare(out: Any, bag: Path, saved: Path, latency: str) -> None:
         table.add_row(selected, *common.estimate_cells(estimate), f"{difference:.1e}")
     out.print(table)
     model = load_yaml(saved, "result file")["model"]
-    out.print(f"The node ended on {model}, the replay on {offline.selected}.")
+    start_ns = offline.first_ns or 0
+    switches = ", ".join(f"{(at - start_ns) * 1e-9:.1f} s {name}" for at, name in offline.segments)
+    out.print(f"The node ended on {model}, the replay on {offline.selected}; auto ran, by stamps: {switches}.")
     verdict = "agree" if worst < 1e-12 else "[red]DIFFER[/]"
     out.print(f"Live and offline {verdict}: the largest difference in any state or covariance is {worst:.1e}.")
