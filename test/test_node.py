@@ -150,6 +150,17 @@ def test_a_bad_configuration_is_refused_at_the_start_in_one_line(arguments, said
     assert len(own) == 1 and own[0].startswith("calibration_node: ")
 
 
+def test_the_node_needs_nothing_that_a_ros_machine_does_not_have():
+    """rosbags, mcap and rich are not in ROS: the node, and `dvl-calib run`, must do without."""
+    code = (
+        "import sys\n"
+        "for name in ('rosbags', 'mcap', 'rich'): sys.modules[name] = None\n"
+        "import dvl_calib_ros.node.main, dvl_calib_ros.node.calibration_node, dvl_calib_ros.cli.run\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
 # ---------------------------------------------------------------- in this process
 
 

@@ -11,6 +11,11 @@ SUSPICIOUS_GATED = 0.2
 # Fewer samples say nothing yet.
 ENOUGH_SAMPLES = 20
 
+INITIAL_WINDOW_WARNING = (
+    "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 and "
+    "M6 gain nothing over no calibration; prefer fixed"
+)
+
 
 def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     """What is wrong with the data that came, and the remedy; from `Calibrator.counts`."""

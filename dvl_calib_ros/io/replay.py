@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..calibration.advice import data_advice, gate_advice
+from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
 from ..calibration.parameters import Parameters
@@ -84,12 +84,6 @@ def replay(
     result = calibrator.result()
     notes += _warnings(result, topics, feed)
     return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link")
-
-
-INITIAL_WINDOW_WARNING = (
-    "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 and "
-    "M6 gain nothing over no calibration; prefer fixed"
-)
 
 
 def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:

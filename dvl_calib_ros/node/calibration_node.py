@@ -20,6 +20,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from ..calibration.advice import INITIAL_WINDOW_WARNING
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.models import MODELS
@@ -28,7 +29,6 @@ from ..calibration.samples import DvlSample
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
-from ..io.replay import INITIAL_WINDOW_WARNING
 from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
 from .diagnostics import diagnose
 from .parameters import declare_parameters
