@@ -129,6 +129,18 @@ def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_
     assert load_yaml(saved, "result file")["model"] == "M7"
 
 
+def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_lost(world, tmp_path):
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    with world.calibration_node(f"result_file:={folder / 'result.yaml'}") as process:
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        until(lambda: diagnostics, "the node to run")
+        folder.rmdir()
+    assert process.returncode == 0
+    assert "could not be written" in process.output
+    assert "models:" in process.output and "covariance:" in process.output
+
+
 @pytest.mark.parametrize(
     "arguments, said",
     [
