@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")
-        _compare(out, bag, saved, latency)
-    return 0
+        agree = _compare(out, bag, saved, latency)
+    return 0 if agree else 1
 
 
 def _latency(speed: float) -> str:
@@ -101,7 +101,7 @@ def _truth() -> dict[str, float]:
     return angles | {"delta_k": 100.0 * scale[0]}
 
 
-def _compare(out: Any, bag: Path, saved: Path, latency: str) -> None:
+def _compare(out: Any, bag: Path, saved: Path, latency: str) -> bool:
     import numpy as np
     from rich.table import Table
 
@@ -132,3 +132,4 @@ def _compare(out: Any, bag: Path, saved: Path, latency: str) -> None:
     out.print(f"The node ended on {model}, the replay on {offline.selected}; auto ran, by stamps: {switches}.")
     verdict = "agree" if worst < 1e-12 else "[red]DIFFER[/]"
     out.print(f"Live and offline {verdict}: the largest difference in any state or covariance is {worst:.1e}.")
+    return worst < 1e-12
