@@ -113,14 +113,18 @@ def _unpack_chunk(at: int, content: bytes, whole: bool) -> tuple[bytes, bool]:
         (name_length,) = struct.unpack_from("<I", content, _CHUNK_HEAD.size)
         start = _CHUNK_HEAD.size + 4 + name_length + 8
         name = content[_CHUNK_HEAD.size + 4 : start - 8].decode()
-        unpacked = _DECOMPRESS[name](content[start:], min(size, LARGEST_RECORD))
+        (packed_size,) = struct.unpack_from("<Q", content, start - 8)
+        # of the two lengths either may be what is damaged: one that fits says that all of the chunk is there
+        packed = content[start:] if whole else content[start : start + packed_size]
+        unpacked = _DECOMPRESS[name](packed, min(size, LARGEST_RECORD))
     except (struct.error, UnicodeDecodeError, KeyError) as error:
         raise DamagedError(f"the head of the chunk at byte {at} is cut off or damaged") from error
-    intact = whole and len(unpacked) == size
-    if intact and checksum and crc32(unpacked) != checksum:
-        # one of its messages is wrong, and nothing says which: none can be believed
+    intact = len(unpacked) == size
+    all_there = whole or len(packed) == packed_size
+    if all_there and checksum and (not intact or crc32(unpacked) != checksum):
+        # all of it is there and some of it is wrong, nothing says which: none of its messages can be believed
         raise DamagedError(f"the checksum of the chunk at byte {at} does not match")
-    return unpacked, intact
+    return unpacked, whole and all_there and intact
 
 
 def _unpack_zstd(packed: bytes, size: int) -> bytes:
