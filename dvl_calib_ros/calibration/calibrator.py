@@ -14,7 +14,8 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -33,6 +34,7 @@ SECOND_NS = 1_000_000_000
 # How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS
 NEVER_NS = 2**63 - 1
+V = TypeVar("V")
 
 
 class _Moving(NamedTuple):
@@ -334,26 +336,23 @@ class Calibrator:
         return _Paired(sample, velocity, covariance, weight, after.frame, orientation)
 
     def _angular_velocity(self, stamp_ns: int) -> Vector | None:
-        bracket = self._imu.bracket(stamp_ns)
-        if bracket is None:
-            return None
-        before, after, fraction = bracket
-        if fraction == 1.0:
-            return after.angular_velocity
-        if before is None or before.angular_velocity is None or after.angular_velocity is None:
-            return None
-        return _mix(before.angular_velocity, after.angular_velocity, fraction)
+        return self._from_imu(stamp_ns, attrgetter("angular_velocity"), _mix)
 
     def _orientation(self, stamp_ns: int) -> Quaternion | None:
+        return self._from_imu(stamp_ns, attrgetter("orientation"), slerp)
+
+    def _from_imu(
+        self, stamp_ns: int, read: Callable[[ImuSample], V | None], mix: Callable[[V, V, float], V]
+    ) -> V | None:
+        """What the IMU gives for a time, interpolated; None where it has nothing to interpolate between."""
         bracket = self._imu.bracket(stamp_ns)
         if bracket is None:
             return None
-        before, after, fraction = bracket
-        if fraction == 1.0:
-            return after.orientation
-        if before is None or before.orientation is None or after.orientation is None:
-            return None
-        return slerp(before.orientation, after.orientation, fraction)
+        after = read(bracket.after)
+        if bracket.fraction == 1.0 or bracket.before is None:
+            return after
+        before = read(bracket.before)
+        return None if before is None or after is None else mix(before, after, bracket.fraction)
 
     # ------------------------------------------------------------------ models
 

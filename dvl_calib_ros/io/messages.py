@@ -124,7 +124,7 @@ class MessageFeed:
         self._problem(f"{stream} undecodable", f"{stream}: a message could not be decoded ({reason}); it is skipped")
 
     def _stamp_ns(self, stream: str, header: Any, received_ns: int) -> int:
-        stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        stamp = stamp_ns(header.stamp)
         if stamp:
             return stamp
         self.zero_stamps += 1

@@ -26,6 +26,7 @@ from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
+from ..calibration.screening import usable_covariance
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
@@ -197,8 +198,8 @@ class CalibrationNode(Node):
             name = calibrator.selected
             self._correction = Correction(MODELS[name], calibrator.state(name), parameters.rotation_dvl_from_body)
             self._corrected_by = name
-        noise = sample.covariance
-        if noise is None or not noise.any():
+        _, noise = usable_covariance(sample.covariance)
+        if noise is None:
             noise = np.eye(3) * parameters.gnss_free_std**2
         velocity, covariance = self._correction.apply(np.array(sample.velocity), noise)
         stamp_ns = sample.stamp_ns - round(parameters.dvl_time_offset * 1e9)
