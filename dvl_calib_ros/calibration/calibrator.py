@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
@@ -64,7 +64,8 @@ class Calibrator:
 
     prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
     by model name. block_size: samples that are gathered before the models are updated, if nobody asks for their state
-    earlier. on_event: told of restarts in words.
+    earlier. on_event: told of restarts in words. on_block: told of every block that the models are given, its stamps
+    (ns) and observations; those with a reference are the paired ones.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class Calibrator:
         initial: Mapping[str, GaussianState] | None = None,
         block_size: int = 1,
         on_event: Callable[[str], None] = lambda _: None,
+        on_block: Callable[[Sequence[int], Observations], None] = lambda *_: None,
     ) -> None:
         if parameters.prior_source == "reference" and prior_sway_heave is None:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
@@ -83,6 +85,7 @@ class Calibrator:
         self._initial = initial
         self._block_size = block_size
         self._on_event = on_event
+        self._on_block = on_block
         self.restarts = 0
         self._offset_ns = round(parameters.dvl_time_offset * 1e9)
         self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
@@ -364,6 +367,7 @@ class Calibrator:
         seen = self._observations(samples, None)
         known = np.array([known for _, known in block])
         stamps = [sample.stamp_ns for sample in samples]
+        self._on_block(stamps, seen)
         self._unaided.update(stamps, seen, self._unaided_noise, np.ones(len(samples)), known)
 
     def _update_aided(self) -> None:
@@ -378,7 +382,9 @@ class Calibrator:
         seen = self._observations(samples, velocity)
         weight = np.array([paired.weight for paired in block])
         noise = self._aided_covariance(block, rotation)
-        self._aided.update([s.stamp_ns for s in samples], seen, noise, weight, np.ones(len(block), dtype=bool))
+        stamps = [sample.stamp_ns for sample in samples]
+        self._on_block(stamps, seen)
+        self._aided.update(stamps, seen, noise, weight, np.ones(len(block), dtype=bool))
 
     def _observations(self, samples: list[_Moving], reference_body: Array | None) -> Observations:
         lever = None
