@@ -1,0 +1,176 @@
+"""What an evaluation found: immutable plain data that outlives the code that made it.
+
+Axes of the arrays are named in the docstrings: S sets, C columns (uncalibrated, then the models), M models, W windows,
+L runs, Q seeds. All velocities in m/s, angles in rad, nan where a model cannot run on that data (a model that needs
+attitude on a run without).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..calibration.frames import Array
+
+UNCALIBRATED = "uncalibrated"
+
+
+@dataclass(frozen=True)
+class CalibrationSet:
+    """A set of the procedure: calibrate on the first window_s (None: all) of a run, evaluate on all other runs."""
+
+    name: str
+    calibration_run: str
+    window_s: float | None
+
+
+@dataclass(frozen=True)
+class CalibrationRun:
+    """A stretch of a trajectory that is calibrated on, s from its start. heading_spread: circular std, rad."""
+
+    trajectory: str
+    from_s: float
+    to_s: float
+    heading_spread: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of errors (estimate - truth) that lie within the 68 % and 95 % intervals the model's σ claims.
+
+    model: name. state_names: the n error states (nuisance states have no truth). within_68, within_95: (n,) per state.
+    pooled_68, pooled_95: over all states. n_errors: errors per state. mean_error, rms_error, mean_std: (n,).
+    """
+
+    model: str
+    state_names: tuple[str, ...]
+    within_68: Array
+    within_95: Array
+    pooled_68: float
+    pooled_95: float
+    n_errors: int
+    mean_error: Array
+    rms_error: Array
+    mean_std: Array
+
+
+@dataclass(frozen=True)
+class ErrorsInVariables:
+    """How noise in the reference pulls the scale estimate.
+
+    models: the G models with GNSS that estimate scale. gnss_std: (V,) m/s. predicted, measured: (G, V) pull of the
+    model's first scale state, dimensionless; measured is a mean over combinations and seeds, standard_error (G, V) its
+    standard error. noisy_axes: (G,) axes of the reference whose noise is in that state's regressor. formula: in words.
+    """
+
+    models: tuple[str, ...]
+    gnss_std: Array
+    predicted: Array
+    measured: Array
+    standard_error: Array
+    noisy_axes: Array
+    formula: str
+
+
+@dataclass(frozen=True)
+class EachStudy:
+    """Calibrate on each of L runs with attitude, evaluate on all other trajectories.
+
+    runs: (L,). avg_vrmse: (L, C, Q). yaw_observed: (L, M) share of combinations and seeds in which the model says that
+    it has seen yaw. coverage: per model, over runs, combinations and seeds.
+    """
+
+    runs: tuple[CalibrationRun, ...]
+    avg_vrmse: Array
+    yaw_observed: Array
+    coverage: tuple[Coverage, ...]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Velocity of one evaluated trajectory, for a picture: body frame, forward-left-up, N samples (decimated).
+
+    time: (N,) s. truth, uncorrected: (N, 3). corrected: model -> (N, 3). calibrated_on: a set's name. combination:
+    in words.
+    """
+
+    trajectory: str
+    calibrated_on: str
+    combination: str
+    time: Array
+    truth: Array
+    uncorrected: Array
+    corrected: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Hold-out verdict of one model on one set, for a report: velocity errors (rms, m/s) on blocks held back."""
+
+    set_name: str
+    model: str
+    verdict: str
+    uncorrected: float
+    corrected: float
+    predicted: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The published procedure and the studies around it.
+
+    source: folder or generator, in words. own_generator: True if the trajectories are not recorded ones, so that the
+    published figures do not apply. notes: what the reader must know. columns: `UNCALIBRATED`, then the models.
+    avg_vrmse: (S, C, Q). windows_s: (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column ->
+    m/s. parameters: as used, plain values. version: of the software.
+    """
+
+    source: str
+    own_generator: bool
+    notes: tuple[str, ...]
+    trajectories: tuple[str, ...]
+    models: tuple[str, ...]
+    sets: tuple[CalibrationSet, ...]
+    seeds: tuple[int, ...]
+    n_combinations: int
+    avg_vrmse: Array
+    windows_s: tuple[float | None, ...]
+    avg_vrmse_by_time: Array
+    published: Mapping[str, Mapping[str, float]]
+    coverage: tuple[Coverage, ...]
+    errors_in_variables: ErrorsInVariables | None
+    each: EachStudy | None
+    single_heading: EachStudy | None
+    traces: tuple[Trace, ...]
+    parameters: Mapping[str, Any]
+    version: str
+    held_out: tuple[HeldOut, ...] = ()
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names along C."""
+        return (UNCALIBRATED, *self.models)
+
+    @property
+    def seed_mean(self) -> Array:
+        """(S, C) Avg.VRMSE, mean over the seeds."""
+        return np.asarray(self.avg_vrmse.mean(axis=-1))
+
+    @property
+    def set_mean(self) -> Array:
+        """(C,) mean over the sets of `seed_mean`; nan where a model does not run on every set."""
+        return np.asarray(self.seed_mean.mean(axis=0))
+
+    @property
+    def published_table(self) -> Array:
+        """(S, C) published Avg.VRMSE, nan where there is none."""
+        rows = [[self.published.get(each.name, {}).get(c, np.nan) for c in self.columns] for each in self.sets]
+        return np.array(rows, dtype=float)
+
+    @property
+    def ratio(self) -> Array:
+        """(S, C) here over published."""
+        return self.seed_mean / self.published_table
