@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ..calibration.screening import is_valid_velocity, unit_quaternion
 from .bags import BagReader
 from .errors import InputError
 from .messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from .recorder import Recorder, RunHistory
 from .result_file import estimate_document, load_initial_calibration
 
 BLOCK_SIZE = 512
@@ -47,11 +49,15 @@ def _spelled(name: str, present: dict[str, str]) -> str:
 
 @dataclass(frozen=True)
 class Replayed:
-    """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id."""
+    """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id.
+
+    history: the run over time, if it was asked for.
+    """
 
     result: Result
     notes: tuple[str, ...]
     dvl_frame: str
+    history: RunHistory | None = None
 
 
 def replay(
@@ -59,10 +65,12 @@ def replay(
     parameters: Parameters,
     topics: Topics | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
+    *,
+    with_history: bool = False,
 ) -> Replayed:
     """Calibrate with the bags at `paths`, read as one in order of log time.
 
-    on_progress: told the share (0..1) that is read. Raises InputError if there is no bag or no usable DVL topic.
+    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way. Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
@@ -71,19 +79,26 @@ def replay(
     notes: list[str] = []
     if parameters.prior_source == "initial_window":
         notes.append(INITIAL_WINDOW_WARNING)
+    recorder = Recorder() if with_history else None
     calibrator = Calibrator(
-        parameters, prior_sway_heave=prior, initial=initial, block_size=BLOCK_SIZE, on_event=notes.append
+        parameters,
+        prior_sway_heave=prior,
+        initial=initial,
+        block_size=BLOCK_SIZE,
+        on_event=notes.append,
+        on_block=recorder.observe if recorder else lambda *_: None,
     )
     feed = MessageFeed(calibrator, notes.append)
     with BagReader(paths) as bag:
         present = bag.topics
         chosen = topics.found_in(present)
         _check_topics(bag, paths, chosen, notes)
-        _feed_all(bag, chosen, feed, on_progress)
+        _feed_all(bag, chosen, feed, recorder, on_progress)
         notes = bag.notes + notes
     result = calibrator.result()
     notes += _warnings(result, topics, feed)
-    return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link")
+    history = recorder.history(calibrator) if recorder else None
+    return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link", history)
 
 
 def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
@@ -107,9 +122,12 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
 
 
-def _feed_all(bag: BagReader, topics: Topics, feed: MessageFeed, on_progress: Callable[[float], None]) -> None:
+def _feed_all(
+    bag: BagReader, topics: Topics, feed: MessageFeed, recorder: Recorder | None, on_progress: Callable[[float], None]
+) -> None:
+    feed_dvl = feed.dvl if recorder is None else partial(_feed_and_note, feed, recorder)
     take: dict[str, Callable[[Any, int], Any]] = {
-        topics.imu: feed.imu, topics.gnss: feed.reference, topics.dvl: feed.dvl,
+        topics.imu: feed.imu, topics.gnss: feed.reference, topics.dvl: feed_dvl,
     }  # fmt: skip
     streams = {topics.imu: "imu", topics.gnss: "reference", topics.dvl: "dvl"}
     start_ns, end_ns = bag.span_ns
@@ -122,6 +140,11 @@ def _feed_all(bag: BagReader, topics: Topics, feed: MessageFeed, on_progress: Ca
         if count % PROGRESS_EVERY == 0:
             on_progress((log_ns - start_ns) / span_ns)
     on_progress(1.0)
+
+
+def _feed_and_note(feed: MessageFeed, recorder: Recorder, message: Any, received_ns: int) -> None:
+    if feed.dvl(message, received_ns) is not None:
+        recorder.note(feed.calibrator)
 
 
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
