@@ -70,7 +70,8 @@ def replay(
 ) -> Replayed:
     """Calibrate with the bags at `paths`, read as one in order of log time.
 
-    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way. Raises InputError if there is no bag or no usable DVL topic.
+    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way. Raises
+    InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
