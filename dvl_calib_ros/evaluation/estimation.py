@@ -1,0 +1,166 @@
+"""Many calibrations of one run at once: the same models, priors and filter as live and in replay.
+
+What differs is the layout. Runs here are complete and synchronous, so nothing waits for a partner, and B variants of a
+run (combinations of errors) go through the models and the filter as one array. That this gives the state that replaying
+a bag of the same data gives is proved in test_evaluation.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..calibration import kalman
+from ..calibration.bank import Assembler, GaussianState, prior
+from ..calibration.frames import Array
+from ..calibration.models import MODELS, Model, Needs
+from ..calibration.observations import Assumptions, Observations
+from ..calibration.parameters import Parameters
+from .trajectories import Trajectory
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class SensorData:
+    """What the sensors gave on a run, in B variants. Body frame, forward-left-up; the DVL is mounted straight.
+
+    run: its truth, times and attitude. velocity_dvl: (B, N, 3) m/s. reference: (B, N, 3) m/s.
+    """
+
+    run: Trajectory
+    velocity_dvl: Array
+    reference: Array
+
+
+def estimate(
+    models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
+) -> Mapping[str, GaussianState]:
+    """States of every model that can run on the data, after the first `ends` samples (E ascending numbers).
+
+    Returns x (E, B, n) and P (E, B, n, n) by the model's name. parameters: without process noise, lever arm or
+    mounting.
+    """
+    usable = _usable(data, parameters)
+    found: dict[str, GaussianState] = {}
+    for needs in Needs:
+        group = [MODELS[name] for name in models if MODELS[name].needs is needs]
+        if group and not (needs is Needs.ATTITUDE and data.run.rotation_enu_from_body is None):
+            found |= _estimate_group(group, data, usable, parameters, ends)
+    return {name: found[name] for name in models if name in found}
+
+
+def _estimate_group(
+    group: Sequence[Model], data: SensorData, usable: Mask, parameters: Parameters, ends: Sequence[int]
+) -> Iterable[tuple[str, GaussianState]]:
+    n_variants = len(data.velocity_dvl)
+    assembler = Assembler(group, parameters)
+    sway_heave, prior_known = _prior_sway_heave(data, usable, parameters)
+    seen = _observations(data, group[0].needs, sway_heave, parameters)
+    flat = assembler.measurements(seen, np.ones(usable.size), prior_known.ravel())
+    start = assembler.start([prior(model, parameters) for model in group])
+    measurements = _by_variant(flat, n_variants, usable)
+    x, p = (np.repeat(each, n_variants, axis=0) for each in start)
+    after = _states_after(x, p, measurements, ends)
+    for index, model in enumerate(group):
+        own = slice(index * n_variants, (index + 1) * n_variants)
+        states = [
+            [assembler.state(index, x_one, p_one) for x_one, p_one in zip(at.x[own], at.p[own], strict=True)]
+            for at in after
+        ]
+        x_all = np.array([[state.x for state in row] for row in states])
+        yield model.name, GaussianState(x_all, np.array([[state.p for state in row] for row in states]))
+
+
+def _observations(data: SensorData, needs: Needs, sway_heave: Array, parameters: Parameters) -> Observations:
+    """All variants in a row (B N samples)."""
+    run, (n_variants, n_samples, _) = data.run, data.velocity_dvl.shape
+    attitude = needs is Needs.ATTITUDE
+    aided = needs is Needs.REFERENCE
+    std = parameters.gnss_aided_std if aided else parameters.gnss_free_std
+
+    def repeated(values: Array) -> Array:
+        return np.tile(values, (n_variants,) + (1,) * (values.ndim - 1))
+
+    return Observations(
+        velocity_dvl=data.velocity_dvl.reshape(-1, 3),
+        reference_body=data.reference.reshape(-1, 3) if aided else None,
+        lever_velocity=None,
+        rotation_dvl_from_body=np.eye(3),
+        sway_heave=np.repeat(sway_heave, n_samples, axis=0),
+        noise=std**2 * np.eye(3)[None],
+        rotation_enu_from_body=repeated(run.rotation_enu_from_body) if attitude else None,
+        angular_velocity=repeated(run.angular_velocity) if attitude else None,
+        interval=repeated(np.diff(run.time, prepend=run.time[0])),
+        assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
+    )
+
+
+def _usable(data: SensorData, parameters: Parameters) -> Mask:
+    """Samples (B, N) that are neither too slow nor in too sharp a turn, as the calibrator has it."""
+    usable: Mask = np.sum(data.velocity_dvl**2, axis=-1) >= parameters.min_speed**2
+    if parameters.max_turn_rate > 0.0:
+        rates = data.run.angular_velocity
+        calm = np.zeros(usable.shape[1], bool) if rates is None else _squared(rates) <= parameters.max_turn_rate**2
+        usable = usable & calm
+    return usable
+
+
+def _squared(vectors: Array) -> Array:
+    return np.asarray(np.sum(vectors**2, axis=-1))
+
+
+def _prior_sway_heave(data: SensorData, usable: Mask, parameters: Parameters) -> tuple[Array, Mask]:
+    """Prior sway and heave (B, 2) m/s, and at which samples (B, N) it is known."""
+    n_variants = len(usable)
+    known: Mask = np.ones(usable.shape, dtype=bool)
+    time = data.run.time
+    if parameters.prior_source == "fixed":
+        return np.tile(parameters.prior_sway_heave, (n_variants, 1)), known
+    if parameters.prior_source == "reference":
+        window = data.run.velocity[: data.run.first(parameters.prior_window)]
+        return np.tile(window[:, 1:].mean(axis=0), (n_variants, 1)), known
+    started = time[np.argmax(usable, axis=1)]
+    known = time[None] - started[:, None] >= parameters.prior_window
+    in_window = (usable & ~known)[..., None]
+    mean = np.sum(data.velocity_dvl[..., 1:] * in_window, axis=1) / np.maximum(in_window.sum(axis=1), 1)
+    return mean, known
+
+
+def _by_variant(flat: kalman.Measurements, n_variants: int, usable: Mask) -> kalman.Measurements:
+    """Measurements of K models of B variants in a row -> of K B models."""
+    k = len(flat.z)
+
+    def split(values: Array, axis_2_may_be_one: bool = False) -> Array:
+        if values.shape[1] == 1 and axis_2_may_be_one:
+            return values if len(values) == 1 else np.repeat(values, n_variants, axis=0)
+        rest = values.shape[2:]
+        return np.broadcast_to(values, (k, *values.shape[1:])).reshape(k * n_variants, -1, *rest)
+
+    return kalman.Measurements(
+        z=split(flat.z),
+        h=split(flat.h),
+        r=split(flat.r, axis_2_may_be_one=True),
+        weight=split(flat.weight),
+        usable=split(flat.usable) & np.tile(usable, (k, 1)),
+        gate=np.repeat(flat.gate, n_variants),
+    )
+
+
+def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> list[GaussianState]:
+    """States after the first `ends` samples."""
+    gated = bool(np.isfinite(data.gate).any())
+    states = []
+    for start, end in pairwise((0, *ends)):
+        part = data.part(slice(start, end))
+        if end > start and gated:
+            after = kalman.batch(x, p, part)
+            x, p = after.x, after.p
+        elif end > start:
+            x, p = kalman.least_squares(x, p, part)
+        states.append(GaussianState(x, p))
+    return states

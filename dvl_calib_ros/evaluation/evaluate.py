@@ -1,0 +1,209 @@
+"""The published procedure over many noise seeds, and what its outcomes say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from .. import __version__
+from ..calibration.frames import Array
+from ..calibration.models import MODELS
+from ..calibration.observations import Observations
+from ..calibration.parameters import SCHEMA, Parameters
+from . import protocol
+from .metrics import coverage
+from .parallel import Workers, run_all
+from .procedure import (
+    NOISE_STUDY_STD,
+    Procedure,
+    RunOutcome,
+    SeedOutcome,
+    each_runs,
+    models_in_noise_study,
+    noise_study_run,
+    run_seed,
+    sensor_data,
+    single_headings,
+)
+from .results import CalibrationRun, Coverage, EachStudy, ErrorsInVariables, Evaluation, Trace
+from .trajectories import Trajectory, load_folder, own_trajectories
+
+# What evaluation sets otherwise than a live calibration: the published procedure has no gate, and M5 and M6 come out
+# as published with the prior from the reference velocity.
+DEFAULTS = {"gate_probability": 0.0, "prior_source": "reference"}
+# The unit under test is mounted straight, at the reference point, in step, and its errors are constant.
+FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", "process_std_misalignment",
+         "process_std_scale")  # fmt: skip
+# Trajectories and the combination of the pictures
+TRACED, TRACED_COMBINATION = ("T01", "T07"), 0
+TRACE_SAMPLES = 400
+
+FORMULA = "-a σ²/(E‖h‖² + a σ²), h the noiseless regressor of the scale, a the number of its noisy axes"
+
+
+def evaluate(
+    folder: Path | None,
+    parameters: Parameters,
+    *,
+    models: Sequence[str] = tuple(MODELS),
+    sets: Sequence[str] = tuple(protocol.PUBLISHED),
+    n_seeds: int = 1,
+    partial_folder: bool = False,
+    workers: Workers = Workers(),  # noqa: B008  (frozen)
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Evaluation:
+    """Run the procedure over a folder of trajectories, or without one over the project's own.
+
+    parameters: as for the node, see `DEFAULTS` and `FIXED`. Raises InputError.
+    """
+    if folder is None:
+        runs, notes = own_trajectories(), ("own generator: the published figures are of other trajectories",)
+    else:
+        runs, notes = load_folder(folder, partial_folder)
+    parameters, ignored = _for_procedure(parameters)
+    procedure = Procedure(
+        runs=runs,
+        models=tuple(models),
+        sets=tuple(each for each in protocol.SETS if each.name in sets),
+        parameters=parameters,
+    )
+    seeds = tuple(range(n_seeds))
+    outcomes = run_all(partial(run_seed, procedure), seeds, workers, on_progress)
+    own_generator = folder is None
+    return Evaluation(
+        source="own generator (simulated trajectories)" if own_generator else f"folder {folder}",
+        own_generator=own_generator,
+        notes=(*notes, *ignored),
+        trajectories=tuple(runs),
+        models=procedure.models,
+        sets=procedure.sets,
+        seeds=seeds,
+        n_combinations=len(protocol.COMBINATIONS),
+        avg_vrmse=np.stack([[own.avg_vrmse[0] for own in each.own] for each in outcomes], axis=-1),
+        windows_s=protocol.WINDOWS_S,
+        avg_vrmse_by_time=np.stack([[by_set.avg_vrmse for by_set in each.by_set] for each in outcomes], axis=-1),
+        published=protocol.PUBLISHED,
+        coverage=_coverage(procedure.models, [own for each in outcomes for own in each.own]),
+        errors_in_variables=_errors_in_variables(procedure, outcomes),
+        each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
+        single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),
+        traces=tuple(_traces(procedure, seeds[0], outcomes[0])),
+        parameters=parameters.as_dict(),
+        version=__version__,
+    )
+
+
+def _for_procedure(parameters: Parameters) -> tuple[Parameters, tuple[str, ...]]:
+    """The parameters that the procedure runs with, and a note for every one that it does not take."""
+    defaults = {name: SCHEMA[name].default for name in FIXED}
+    ignored = [name for name, default in defaults.items() if getattr(parameters, name) != default]
+    notes = tuple(f"{name} is not used here: the procedure's unit has none" for name in ignored)
+    return parameters.replace(**defaults), notes
+
+
+def _coverage(models: Sequence[str], outcomes: Sequence[RunOutcome]) -> tuple[Coverage, ...]:
+    found = []
+    for name in models:
+        ran = [each for each in outcomes if name in each.errors]
+        if ran:
+            errors, std = (np.concatenate([getattr(each, what)[name] for each in ran]) for what in ("errors", "std"))
+            model = MODELS[name]
+            found.append(coverage(name, model.state_names[: model.n_errors], errors, std))
+    return tuple(found)
+
+
+def _each_study(
+    procedure: Procedure, runs: tuple[CalibrationRun, ...], outcomes: Sequence[Sequence[RunOutcome]]
+) -> EachStudy | None:
+    """outcomes: per seed, one per run."""
+    if not runs:
+        return None
+    return EachStudy(
+        runs=runs,
+        avg_vrmse=np.stack([[run.avg_vrmse[0] for run in seed] for seed in outcomes], axis=-1),
+        yaw_observed=np.mean([[run.yaw_observed for run in seed] for seed in outcomes], axis=0),
+        coverage=_coverage(procedure.models, [run for seed in outcomes for run in seed]),
+    )
+
+
+def _errors_in_variables(procedure: Procedure, outcomes: Sequence[SeedOutcome]) -> ErrorsInVariables | None:
+    models = models_in_noise_study(procedure.models)
+    if not models:
+        return None
+    pull = np.concatenate([each.pull for each in outcomes], axis=-1)
+    std = np.array(NOISE_STUDY_STD)
+    predicted, axes = zip(*(_predicted_pull(name, noise_study_run(procedure), std) for name in models), strict=True)
+    return ErrorsInVariables(
+        models=models,
+        gnss_std=std,
+        predicted=np.stack(predicted),
+        measured=pull.mean(axis=-1),
+        standard_error=pull.std(axis=-1) / np.sqrt(pull.shape[-1]),
+        noisy_axes=np.array(axes),
+        formula=FORMULA,
+    )
+
+
+def _predicted_pull(name: str, run: Trajectory, std: Array) -> tuple[Array, float]:
+    """Pull of a model's first scale state by noise (V,) m/s in the reference, after `FORMULA`, and its noisy axes.
+
+    Least squares with a noisy regressor h + n finds E‖h‖² / (E‖h‖² + E‖n‖²) of its coefficient (attenuation); here
+    the noise is in z as well, so that what is lost is of 1 + δk, not of δk. Which axes of the reference are in h is
+    asked of the model itself: by how much does h move with a step along each axis?
+    """
+    regressor = _scale_regressor(name, run.velocity, np.zeros(3), run)
+    steps = [_scale_regressor(name, run.velocity, step, run) - regressor for step in np.eye(3)]
+    noisy_axes = float(sum(np.mean(np.sum(step**2, axis=1)) for step in steps))
+    signal, noise = float(np.mean(np.sum(regressor**2, axis=1))), noisy_axes * std**2
+    return -noise / (signal + noise), noisy_axes
+
+
+def _scale_regressor(name: str, velocity: Array, step: Array, run: Trajectory) -> Array:
+    """Column of H of the first scale state (N, m), with a reference that is off by a step (m/s)."""
+    _, h = MODELS[name].linearise(
+        Observations(
+            velocity_dvl=velocity,
+            reference_body=velocity + step,
+            lever_velocity=None,
+            rotation_dvl_from_body=np.eye(3),
+            sway_heave=np.zeros(2),
+            interval=np.diff(run.time, prepend=run.time[0]),
+        )
+    )
+    return h[:, :, 3]
+
+
+def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace]:
+    """Pictures of corrections with what the first set found."""
+    traces = []
+    calibrated_on, corrections = procedure.sets[0], outcome.own[0].corrections[0, 1:, TRACED_COMBINATION]
+    for name in TRACED:
+        if name not in procedure.runs or name == calibrated_on.calibration_run:
+            continue
+        run = procedure.runs[name]
+        measured = sensor_data(run, seed).velocity_dvl[TRACED_COMBINATION]
+        every = slice(None, None, -(-len(run.time) // TRACE_SAMPLES))
+        traces.append(
+            Trace(
+                trajectory=name,
+                calibrated_on=calibrated_on.name,
+                combination=protocol.combination_in_words(TRACED_COMBINATION),
+                time=run.time[every],
+                truth=run.velocity[every],
+                uncorrected=measured[every],
+                corrected=_corrected(procedure.models, corrections, measured[every]),
+            )
+        )
+    return traces
+
+
+def _corrected(models: Sequence[str], corrections: Array, measured: Array) -> Mapping[str, Array]:
+    """Model -> corrected velocities, of those that ran."""
+    return {
+        name: measured @ matrix.T
+        for name, matrix in zip(models, corrections, strict=True)
+        if np.isfinite(matrix).all()
+    }

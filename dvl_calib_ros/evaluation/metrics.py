@@ -1,0 +1,80 @@
+"""How good a calibration is: vector RMSE of corrected velocities, and whether σ tells the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from ..calibration.frames import Array
+from .results import Coverage
+
+# Two-sided intervals of a normal distribution
+WITHIN_68, WITHIN_95 = (float(norm.ppf(0.5 + 0.5 * share)) for share in (0.68, 0.95))
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Second moments of measured velocities v against the truth g of ... runs: all that a VRMSE depends on.
+
+    vv: E[v vᵀ] (..., 3, 3). gv: E[g vᵀ] (..., 3, 3). gg: E[gᵀg] (...,). (m/s)².
+    """
+
+    vv: Array
+    gv: Array
+    gg: Array
+
+    @staticmethod
+    def of(measured: Array, truth: Array) -> Moments:
+        """Moments of measured (..., N, 3) and true (N, 3) velocities, m/s."""
+        n = len(truth)
+        transposed = np.swapaxes(measured, -1, -2)
+        vv, vg = transposed @ measured / n, transposed @ truth / n
+        gg = np.full(measured.shape[:-2], np.sum(truth * truth) / n)
+        return Moments(vv, np.swapaxes(vg, -1, -2), gg)
+
+    @staticmethod
+    def stack(each: Sequence[Moments]) -> Moments:
+        """Moments of several runs along a new first axis."""
+        return Moments(*(np.stack([getattr(one, name) for one in each]) for name in ("vv", "gv", "gg")))
+
+
+def vrmse(moments: Moments, correction: Array) -> Array:
+    """sqrt(E‖g - C v‖²) (...,) m/s of velocities corrected by matrices C (..., 3, 3); shapes broadcast.
+
+    E‖g - C v‖² = E[gᵀg] - 2 tr(C E[g vᵀ]ᵀ) + tr(C E[v vᵀ] Cᵀ), so a correction costs a few products, not a pass
+    over the samples.
+    """
+    linear = 2.0 * moments.gv - correction @ moments.vv
+    mean_square = moments.gg - np.sum(correction * linear, axis=(-2, -1))
+    return np.sqrt(np.maximum(mean_square, 0.0))  # rounding may take a perfect correction below zero
+
+
+def heading_spread(rotation_enu_from_body: Array) -> float:
+    """Circular standard deviation of the heading, rad, of attitudes (N, 3, 3)."""
+    from scipy.stats import circstd
+
+    forward = rotation_enu_from_body[:, :2, 0]
+    return float(circstd(np.arctan2(forward[:, 1], forward[:, 0])))
+
+
+def coverage(model: str, state_names: Sequence[str], errors: Array, std: Array) -> Coverage:
+    """Coverage of errors (N, n), estimate - truth, with their claimed standard deviations (N, n)."""
+    inside_68: NDArray[Any] = np.abs(errors) <= WITHIN_68 * std
+    inside_95: NDArray[Any] = np.abs(errors) <= WITHIN_95 * std
+    return Coverage(
+        model=model,
+        state_names=tuple(state_names),
+        within_68=inside_68.mean(axis=0),
+        within_95=inside_95.mean(axis=0),
+        pooled_68=float(inside_68.mean()),
+        pooled_95=float(inside_95.mean()),
+        n_errors=len(errors),
+        mean_error=errors.mean(axis=0),
+        rms_error=np.sqrt((errors**2).mean(axis=0)),
+        mean_std=std.mean(axis=0),
+    )

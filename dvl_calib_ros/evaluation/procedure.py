@@ -1,0 +1,228 @@
+"""One noise seed of the published procedure and of the studies around it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..calibration.bank import GaussianState
+from ..calibration.error_model import correction_matrix
+from ..calibration.frames import Array
+from ..calibration.models import MODELS, Model
+from ..calibration.observability import observability
+from ..calibration.parameters import Parameters
+from . import protocol
+from .estimation import SensorData, estimate
+from .metrics import Moments, heading_spread, vrmse
+from .results import CalibrationRun, CalibrationSet
+from .trajectories import Trajectory
+
+# A leg is a single heading while it turns by no more than this, and is worth calibrating on from this length
+LEG_HEADING_RANGE = np.deg2rad(25.0)
+LEG_SAMPLES = 60
+# Noise of the reference in the study of errors in variables, m/s per axis, and the set whose run it takes: the one at
+# constant speed, since the formula has one ‖v‖
+NOISE_STUDY_STD = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
+NOISE_STUDY_SET = "E2"
+# Wide, so that what is measured is the pull of the data and not that of the prior; a filter that knows the noise
+NOISE_STUDY_PRIOR_STD_SCALE = 0.1
+NOISE_STUDY_SMALLEST_STD = 0.01
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """What to run. models: names. runs: trajectories by name. studies: False for the published procedure alone."""
+
+    runs: Mapping[str, Trajectory]
+    models: tuple[str, ...]
+    sets: tuple[CalibrationSet, ...]
+    parameters: Parameters
+    studies: bool = True
+
+    @property
+    def n_columns(self) -> int:
+        """Uncalibrated, and the models."""
+        return 1 + len(self.models)
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What calibrating on one run (B combinations) gave.
+
+    avg_vrmse: (E, C) m/s after each window. errors, std: model -> (B, n) estimate - truth of the error states and the
+    σ claimed, after the last window. yaw_observed: (M,) share of combinations. corrections: (E, C, B, 3, 3). nan for
+    models that cannot run on it.
+    """
+
+    avg_vrmse: Array
+    errors: Mapping[str, Array]
+    std: Mapping[str, Array]
+    yaw_observed: Array
+    corrections: Array
+
+
+@dataclass(frozen=True)
+class SeedOutcome:
+    """One seed. by_set: as `Procedure.sets`, every window of `protocol.WINDOWS_S`. own: the same, the set's own window.
+
+    each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) by how much noise in the
+    reference moves the first scale state.
+    """
+
+    by_set: tuple[RunOutcome, ...]
+    own: tuple[RunOutcome, ...]
+    each: tuple[RunOutcome, ...]
+    single_heading: tuple[RunOutcome, ...]
+    pull: Array
+
+
+def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
+    """The whole procedure with the noise of one seed."""
+    data = {name: sensor_data(run, seed) for name, run in procedure.runs.items()}
+    moments = {name: Moments.of(each.velocity_dvl, each.run.velocity) for name, each in data.items()}
+
+    def outcome(part: SensorData, ends: Sequence[int]) -> RunOutcome:
+        others = Moments.stack([each for name, each in moments.items() if name != part.run.name])
+        return _calibrate(part, ends, others, procedure)
+
+    by_set = []
+    own = []
+    for each in procedure.sets:
+        run = data[each.calibration_run]
+        by_set.append(outcome(run, [run.run.first(window) for window in protocol.WINDOWS_S]))
+        own.append(outcome(run, [run.run.first(each.window_s)]))
+    if not procedure.studies:
+        return SeedOutcome(tuple(by_set), tuple(own), (), (), np.empty((0, len(NOISE_STUDY_STD), 0)))
+    with_attitude = runs_with_attitude(procedure.runs)
+    legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
+    return SeedOutcome(
+        by_set=tuple(by_set),
+        own=tuple(own),
+        each=tuple(outcome(data[name], [len(data[name].run.time)]) for name in with_attitude),
+        single_heading=tuple(outcome(part(data[name], start, end), [end - start]) for name, start, end in legs),
+        pull=_noise_study(procedure, data, seed),
+    )
+
+
+def sensor_data(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) -> SensorData:
+    """A run as the sensors see it with every combination of errors."""
+    measured, reference = [], []
+    for index, errors in enumerate(protocol.COMBINATIONS):
+        dvl_noise, gnss_noise = protocol.random_streams(seed, run.name, index)
+        measured.append(protocol.unit_under_test(run.velocity, errors, dvl_noise))
+        reference.append(protocol.reference(run.velocity, gnss_noise, gnss_std))
+    return SensorData(run, np.stack(measured), np.stack(reference))
+
+
+def part(data: SensorData, start: int, end: int) -> SensorData:
+    """Samples start .. end - 1."""
+    return SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
+
+
+def corrections(model: Model, state: GaussianState) -> Array:
+    """Correction matrices (..., 3, 3) of states x (..., n)."""
+    terms = state.x @ model.error_terms_from_state.T
+    return correction_matrix(terms[..., :3], terms[..., 3:], np.eye(3))
+
+
+def true_state(model: Model) -> Array:
+    """(B, n) error states that the model should find; a scale that stands for several axes should find their mean."""
+    from_state = model.error_terms_from_state[:, : model.n_errors]
+    return np.stack([np.linalg.pinv(from_state) @ protocol.truth(errors) for errors in protocol.COMBINATIONS])
+
+
+def _calibrate(data: SensorData, ends: Sequence[int], others: Moments, procedure: Procedure) -> RunOutcome:
+    states = estimate(procedure.models, data, procedure.parameters, ends)
+    n_variants = len(data.velocity_dvl)
+    matrices = np.full((len(ends), procedure.n_columns, n_variants, 3, 3), np.nan)
+    matrices[:, 0] = np.eye(3)
+    yaw_observed = np.full(len(procedure.models), np.nan)
+    errors, std = {}, {}
+    for column, (name, state) in enumerate(((n, states.get(n)) for n in procedure.models), start=1):
+        if state is None:
+            continue
+        model = MODELS[name]
+        matrices[:, column] = corrections(model, state)
+        last = GaussianState(state.x[-1], state.p[-1])
+        errors[name] = last.x[:, : model.n_errors] - true_state(model)
+        std[name] = np.sqrt(np.diagonal(last.p, axis1=1, axis2=2)[:, : model.n_errors])
+        yaw_observed[column - 1] = np.mean(
+            [observability(model, p, procedure.parameters)[2].observed for p in last.p]
+        )
+    scores = vrmse(others, matrices[:, :, None])  # (E, C, others, B)
+    return RunOutcome(scores.mean(axis=(-1, -2)), errors, std, yaw_observed, matrices)
+
+
+# ------------------------------------------------------------------ studies
+
+
+def runs_with_attitude(runs: Mapping[str, Trajectory]) -> list[str]:
+    """Names of the trajectories that have attitude."""
+    return [name for name, run in runs.items() if run.rotation_enu_from_body is not None]
+
+
+def each_runs(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
+    """What `SeedOutcome.each` calibrates on."""
+    return tuple(_described(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
+
+
+def single_headings(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
+    """What `SeedOutcome.single_heading` calibrates on."""
+    legs = [leg for name in runs_with_attitude(runs) for leg in _legs(runs[name])]
+    return tuple(_described(runs[name], start, end) for name, start, end in legs)
+
+
+def _described(run: Trajectory, start: int, end: int) -> CalibrationRun:
+    rotation = run.rotation_enu_from_body
+    assert rotation is not None  # only runs with attitude are asked for
+    from_s, to_s = (float(run.time[at] - run.time[0]) for at in (start, end - 1))
+    return CalibrationRun(run.name, from_s, to_s, heading_spread(rotation[start:end]))
+
+
+def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
+    """Stretches (name, start, end) on one heading, from the start on, as long as they get."""
+    rotation = run.rotation_enu_from_body
+    assert rotation is not None
+    heading = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
+    legs = []
+    start = 0
+    while start + LEG_SAMPLES <= len(heading):
+        stretch = heading[start:]
+        turned = np.maximum.accumulate(stretch) - np.minimum.accumulate(stretch) > LEG_HEADING_RANGE
+        length = int(np.argmax(turned)) if turned.any() else len(stretch)
+        if length >= LEG_SAMPLES:
+            legs.append((run.name, start, start + length))
+            start += length
+        else:
+            start += 1
+    return legs
+
+
+def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
+    """Models with a reference velocity that estimate a scale."""
+    return tuple(name for name in models if MODELS[name].aided and MODELS[name].scale_axes)
+
+
+def _noise_study(procedure: Procedure, data: Mapping[str, SensorData], seed: int) -> Array:
+    """By how much noise of each size in the reference moves the first scale state (G, V, B)."""
+    models = models_in_noise_study(procedure.models)
+    run = noise_study_run(procedure)
+
+    def scales(std: float) -> Array:  # (G, B)
+        parameters = procedure.parameters.replace(
+            gnss_aided_std=max(std, NOISE_STUDY_SMALLEST_STD), initial_std_scale=NOISE_STUDY_PRIOR_STD_SCALE
+        )
+        noisy = replace(data[run.name], reference=sensor_data(run, seed, std).reference)
+        states = estimate(models, noisy, parameters, [len(run.time)])
+        return np.stack([states[name].x[0, :, 3] for name in models])
+
+    without_noise = scales(0.0)
+    return np.stack([scales(std) - without_noise for std in NOISE_STUDY_STD], axis=1)
+
+
+def noise_study_run(procedure: Procedure) -> Trajectory:
+    """The run of the study of errors in variables: constant speed, since the formula has one ‖v‖."""
+    names = {each.name: each.calibration_run for each in protocol.SETS}
+    return procedure.runs[names[NOISE_STUDY_SET]]
