@@ -6,8 +6,9 @@ from setuptools import find_packages, setup
 
 NAME = "dvl_calib_ros"
 ROS_FREE = ["numpy>=1.26", "scipy>=1.11", "pyyaml>=6.0", "rich>=13.7", "rosbags>=0.10", "mcap>=1.2"]
+REPORT = ["matplotlib>=3.6", "jinja2>=3.1"]
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
-TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5"]
+TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40"]
 
 
 def shared(folder: str) -> list:
@@ -22,8 +23,9 @@ setup(
     description="Calibrate a Doppler velocity log (DVL), live on ROS 2 Jazzy and over recorded bags",
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["report/templates/*"]},
     python_requires=">=3.10",
-    install_requires=ROS_FREE,
+    install_requires=[*ROS_FREE, *REPORT],
     extras_require={"ros": ROS, "test": TEST},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from . import common
+from .reporting import add_report_option, report_writer
 
 NAME = "replay"
 HELP = "calibrate with recorded bags"
@@ -18,6 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--models", default="all", help="models to show, such as M3,M7; default: all")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
+    add_report_option(parser)
     common.add_parameter_options(parser)
     common.add_topic_options(parser)
 
@@ -30,19 +32,23 @@ def run(arguments: argparse.Namespace) -> None:
 
     models = _models(arguments.models)
     parameters = common.load(arguments)
-    for target in (arguments.json, arguments.save):
-        if target is not None:
-            check_writable(target)
-    if arguments.json is not None and arguments.json == arguments.save:
-        raise InputError(f"--json and --save: both name {arguments.json}; give them names of their own")
+    outputs = {name: path for name in ("json", "save", "report") if (path := getattr(arguments, name)) is not None}
+    for name, target in outputs.items():
+        check_writable(target)
+        same = [f"--{other}" for other, path in outputs.items() if path == target and other != name]
+        if same:
+            raise InputError(f"--{name} and {same[0]}: both name {target}; give them names of their own")
+    write_report = report_writer("write_replay_report") if arguments.report else None
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
-        replayed = replay(arguments.bags, parameters, topics, on_progress)
+        replayed = replay(arguments.bags, parameters, topics, on_progress, with_history=write_report is not None)
     result = replayed.result
     if arguments.json is not None:
         common.write_json(arguments.json, replay_document(result, models))
     if arguments.save is not None:
         save_text(arguments.save, result_text(result_document(result, replayed.dvl_frame)))
+    if write_report is not None:
+        write_report(arguments.report, replayed, arguments.bags, models)
     _print(replayed.notes, result, models)
 
 

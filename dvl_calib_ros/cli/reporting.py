@@ -1,0 +1,24 @@
+"""--report, for the commands that have one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+
+def add_report_option(parser: argparse.ArgumentParser) -> None:
+    """--report FILE."""
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
+
+
+def report_writer(name: str) -> Callable[..., None]:
+    """A function of the package report. Raises InputError, before any work is done, if it lacks what it needs."""
+    from ..io.errors import InputError
+
+    try:
+        from .. import report
+    except ModuleNotFoundError as error:
+        raise InputError(f"--report needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2") from error
+    write: Callable[..., None] = getattr(report, name)
+    return write

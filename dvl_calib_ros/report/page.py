@@ -1,0 +1,67 @@
+"""From data to a page: the template engine, tables, and the writing of the file.
+
+Everything that comes from a bag or a folder is escaped by the engine, and the page forbids scripts and any access to
+the network by its content security policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from .. import __version__
+from ..io.result_file import save_text
+from .style import MODEL_STYLES
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Text of a table. kind: a class of the style sheet, such as good, off, far, bad."""
+
+    text: str
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """head: names of the columns. rows: cells, each a text or a `Cell`; the first column names the row.
+
+    marked: index of the row that stands out. notes: below the table.
+    """
+
+    head: Sequence[str | Cell]
+    rows: Sequence[Sequence[str | Cell]]
+    title: str = ""
+    marked: int | None = None
+    notes: Sequence[str] = ()
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """A number with its sign, the minus as wide as the plus."""
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("dvl_calib_ros.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def render_page(template: str, context: Mapping[str, Any]) -> str:
+    """HTML of a page."""
+    return _environment().get_template(template).render(version=__version__, styles=MODEL_STYLES, **context)
+
+
+def write_page(path: Path, template: str, context: Mapping[str, Any]) -> None:
+    """Write a page, whole or not at all; raises InputError if it cannot be written."""
+    save_text(path, render_page(template, context))

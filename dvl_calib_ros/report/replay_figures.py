@@ -1,0 +1,207 @@
+"""The figures of a replay: functions from plain arrays to a matplotlib Figure, units on every axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..calibration.frames import Array
+from .style import (
+    FAINT,
+    INK,
+    MODEL_STYLES,
+    REFERENCE_COLOUR,
+    UNCALIBRATED_COLOUR,
+    legend_above,
+    new_figure,
+    plain_log_ticks,
+)
+from .time_axis import TimeAxis
+
+# Points of a line: more cannot be seen at this width
+LINE_POINTS = 300
+# Points over which a residual is averaged
+AVERAGED_POINTS = 31
+GOOD, WARNING, BAD = "#2a7f62", "#e0a030", "#c0392b"
+
+
+class Line(NamedTuple):
+    """One error term of one model over time: value and std (N,), in the unit of the axis."""
+
+    model: str
+    value: Array
+    std: Array
+
+
+def estimate_over_time(time: TimeAxis, stamps_ns: Array, lines: Sequence[Line], selected: str, label: str) -> Figure:
+    """One error term with the ±1σ sleeves of several models; the selected one stands out."""
+    figure, axes = new_figure()
+    kept = _thin(len(stamps_ns))
+    t = time(stamps_ns)[kept]
+    for line, width in zip(lines, _widths([line.model for line in lines], selected), strict=True):
+        colour, dashes = MODEL_STYLES[line.model]
+        value, std = line.value[kept], line.std[kept]
+        strong = line.model == selected
+        axes.fill_between(t, value - std, value + std, color=colour, alpha=0.25 if strong else 0.12, linewidth=0)
+        axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
+    axes.set_ylim(*_settled_range(lines))
+    axes.set_ylabel(label)
+    time.dress(axes)
+    return figure
+
+
+def _widths(models: Sequence[str], selected: str) -> list[float]:
+    """Line widths: the selected model's is the widest, the others get thinner and lie on top.
+
+    So models that agree stay visible, the narrow ones upon the wide ones.
+    """
+    return [4.0 if name == selected else 2.2 - 1.2 * i / len(models) for i, name in enumerate(models)]
+
+
+def _settled_range(lines: Sequence[Line]) -> tuple[float, float]:
+    """Limits that show every estimate from the first tenth on, and its σ at the end; not the prior's width."""
+    settled = [line.value[len(line.value) // 10 :] for line in lines]
+    low = min(min(value.min(), line.value[-1] - line.std[-1]) for value, line in zip(settled, lines, strict=True))
+    high = max(max(value.max(), line.value[-1] + line.std[-1]) for value, line in zip(settled, lines, strict=True))
+    margin = 0.15 * (high - low) or 1.0
+    return float(low - margin), float(high + margin)
+
+
+def velocity_over_time(
+    time: TimeAxis, dvl_ns: Array, before: Array, after: Array, reference_ns: Array, reference: Array, label: str
+) -> Figure:
+    """One body axis of the velocity: DVL before (N,) and after correction (N,), and the reference (M,), m/s."""
+    figure, axes = new_figure()
+    kept = _thin(len(reference_ns))
+    if len(reference_ns):
+        axes.plot(
+            time(reference_ns)[kept], reference[kept], ".", markersize=2.0, color=REFERENCE_COLOUR, label="GNSS",
+            rasterized=True,
+        )  # fmt: skip
+    kept = _thin(len(dvl_ns))
+    t = time(dvl_ns)[kept]
+    axes.plot(t, before[kept], color=BAD, linewidth=1.0, label="DVL as measured")
+    axes.plot(t, after[kept], color="#1f6fb2", linewidth=1.0, label="DVL corrected")
+    axes.set_ylabel(label)
+    time.dress(axes)
+    legend_above(axes)
+    return figure
+
+
+def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: Array, label: str) -> Figure:
+    """DVL minus reference (N,) along one body axis, before and after correction, m/s: points and running mean."""
+    figure, axes = new_figure()
+    t = time(stamps_ns)
+    for residual, colour, name in ((before, BAD, "before"), (after, "#1f6fb2", "after")):
+        rms = float(np.sqrt(np.mean(residual**2)))
+        axes.plot(t, residual, ".", markersize=2.0, alpha=0.35, color=colour, rasterized=True)
+        axes.plot(*_running_mean(t, residual), color=colour, label=f"{name}: RMS {rms:.3f} m/s")
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    spread = 1.2 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.995))
+    axes.set_ylim(-spread or -0.01, spread or 0.01)
+    axes.set_ylabel(label)
+    time.dress(axes)
+    legend_above(axes)
+    return figure
+
+
+def _running_mean(t: Array, values: Array) -> tuple[Array, Array]:
+    """Positions and mean of AVERAGED_POINTS neighbours; of fewer where there are not so many, nan across a gap."""
+    width = min(AVERAGED_POINTS, len(values))
+    window = np.ones(width) / width
+    mean = np.convolve(values, window, "valid")
+    duration = t[width - 1 :] - t[: len(t) - width + 1]
+    mean[duration > 2.0 * np.median(duration)] = np.nan
+    return np.convolve(t, window, "valid"), mean
+
+
+def selection_over_time(
+    time: TimeAxis, segments: Sequence[tuple[str, int, int]], stamps_ns: Array, paired_share: Array
+) -> Figure:
+    """Which model was selected, (name, from, to) in ns, and the share of the samples (N,) that had a reference."""
+    names = list(dict.fromkeys(name for name, _, _ in segments))
+    figure, axes = new_figure(height=1.0 + 0.36 * (len(names) + 1))
+    for name, start, end in segments:
+        left, right = time([start, end])
+        axes.barh(names.index(name) + 1, right - left, left=left, height=0.62, color=MODEL_STYLES[name].color)
+    edges = time(stamps_ns)
+    if len(edges) > 1:
+        share = _filled_from_next(paired_share[1:])[None]
+        axes.pcolormesh(edges, [-0.31, 0.31], share, cmap="Greys", vmin=-0.05, vmax=1.6, rasterized=True)
+    axes.set_yticks(range(len(names) + 1), ["GNSS", *names])
+    axes.set_ylim(len(names) + 0.6, -0.6)
+    axes.grid(False, axis="y")
+    time.dress(axes)
+    return figure
+
+
+def _filled_from_next(values: Array) -> Array:
+    """(N,) with every nan replaced by the next number: a slow receiver decides several samples at once."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        return np.zeros_like(values)
+    following = np.searchsorted(known, np.arange(len(values)))
+    return np.asarray(values[known[np.minimum(following, len(known) - 1)]])
+
+
+def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Array], selected: str) -> Figure:
+    """Mean normalised innovation squared per measurement row (N,) of several models; 1 is what they expect."""
+    figure, axes = new_figure()
+    t = time(stamps_ns)
+    for (name, values), width in zip(nis.items(), _widths(list(nis), selected), strict=True):
+        used = np.isfinite(values) & (values > 0.0)
+        if not used.any():
+            continue
+        colour, dashes = MODEL_STYLES[name]
+        where, mean = _running_mean(t[used], np.log10(values[used]))
+        axes.plot(where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
+    axes.axhline(1.0, color=INK, linewidth=0.8)
+    axes.set_yscale("log")
+    plain_log_ticks(axes.yaxis)
+    axes.set_ylabel("NIS per measured component")
+    time.dress(axes)
+    return figure
+
+
+def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) -> Figure:
+    """Bars of how many DVL samples each model used, gated, or was not given, by reason."""
+    colours = (GOOD, BAD, WARNING, FAINT, "#8d99a6", "#d8dde1")
+    figure, axes = new_figure(height=1.1 + 0.28 * len(models))
+    left = np.zeros(len(models))
+    for (reason, values), colour in zip(counts.items(), colours, strict=False):
+        axes.barh(models, values, left=left, color=colour, height=0.7, label=reason)
+        left += np.asarray(values, dtype=float)
+    axes.invert_yaxis()
+    axes.set_xlabel("DVL samples")
+    axes.grid(False, axis="y")
+    legend_above(axes, columns=4)
+    return figure
+
+
+def held_out_bars(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> Figure:
+    """Velocity error on data held back, m/s rms: for each label one bar per kind (uncorrected, corrected, ...)."""
+    colours = (UNCALIBRATED_COLOUR, "#1f6fb2", FAINT)
+    figure, axes = new_figure(height=1.1 + 0.5 * len(labels))
+    height = 0.8 / len(errors)
+    for i, ((kind, values), colour) in enumerate(zip(errors.items(), colours, strict=False)):
+        at = np.arange(len(labels)) + (i - 0.5 * (len(errors) - 1)) * height
+        numbers = np.array([np.nan if value is None else value for value in values])
+        bars = axes.barh(at, numbers, height=0.92 * height, color=colour, label=kind)
+        texts = ["" if np.isnan(number) else f"{number:.3f}" for number in numbers]
+        axes.bar_label(bars, labels=texts, padding=2, fontsize=7.5)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.invert_yaxis()
+    axes.margins(x=0.14)
+    axes.set_xlabel("velocity error on data held back, m/s rms")
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def _thin(n: int) -> slice:
+    """Every so many-th of n points, and so that the last one is among them."""
+    step = max(1, -(-n // LINE_POINTS))
+    return slice((n - 1) % step if n else 0, None, step)

@@ -1,0 +1,364 @@
+"""The report of a replay: `dvl-calib replay --report out.html`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..calibration.frames import Array
+from ..calibration.models import MODELS, Model
+from ..calibration.parameters import Parameters
+from ..calibration.results import Estimate, Result
+from ..io.recorder import ModelHistory, RunHistory
+from ..io.replay import Replayed
+from ..io.result_file import result_document
+from . import replay_figures as figures
+from .page import Cell, Table, signed, write_page
+from .style import Picture, picture
+from .time_axis import TimeAxis
+from .verdict import NOT_VERIFIED, Verdict
+
+
+class Term(NamedTuple):
+    """An error term as people read it. row: of φ (3) and δk (3). factor: from SI."""
+
+    row: int
+    name: str
+    in_words: str
+    unit: str
+    factor: float
+
+
+_DEGREE = math.degrees(1.0)
+ANGLES = (
+    Term(0, "φx", "Misalignment about x", "°", _DEGREE),
+    Term(1, "φy", "Misalignment about y", "°", _DEGREE),
+    Term(2, "φz", "Misalignment about z", "°", _DEGREE),
+)
+SCALES = (
+    Term(3, "δk x", "Scale error along x", " %", 100.0),
+    Term(4, "δk y", "Scale error along y", " %", 100.0),
+    Term(5, "δk z", "Scale error along z", " %", 100.0),
+)
+_ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
+BODY_AXES = ("ahead", "to port", "up")
+FAMILIES = ((True, "Models with GNSS"), (False, "Models without GNSS"))
+
+
+def write_replay_report(
+    path: Path, replayed: Replayed, bags: Sequence[Path], models: Sequence[str], verdict: Verdict = NOT_VERIFIED
+) -> None:
+    """Write the report of a replay that was run with a history.
+
+    bags: what was replayed. models: names to show; the selected one is always among them. Raises InputError if the
+    file cannot be written.
+    """
+    write_page(path, "replay.html", _context(replayed, bags, models, verdict))
+
+
+def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str], verdict: Verdict) -> dict[str, Any]:
+    result, history = replayed.result, replayed.history
+    if history is None:
+        raise ValueError("the replay has no history; run it with with_history=True")
+    shown = [name for name in MODELS if name in models or name == result.selected]
+    document = result_document(result, replayed.dvl_frame)
+    time = TimeAxis(history.stamps_ns)
+    names = ", ".join(bag.name or str(bag) for bag in bags)
+    return {
+        "title": "DVL calibration",
+        "subtitle": names,
+        "written": document["written"].replace("T", " ").replace("+00:00", " UTC"),
+        "verdict": verdict,
+        "numbers": _numbers(result.estimate),
+        "facts": _facts(result, document["mounting"], bags),
+        "static_transform": document["mounting"]["static_transform_publisher"],
+        "warnings": replayed.notes,
+        "held_out": _held_out(verdict),
+        "estimates": _estimate_table(result, shown),
+        "families": list(_families(result, history, time, shown)),
+        "selected": result.selected,
+        "velocities": _velocities(result, history, time),
+        "velocity_note": _velocity_note(result, history),
+        "streams": _stream_table(result),
+        "data_pictures": _data_pictures(result, history, time, shown),
+        "parameters": {name: _plain(value) for name, value in result.parameters.items()},
+    }
+
+
+# ------------------------------------------------------------------ summary
+
+
+def _error_terms(estimate: Estimate) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """φ (3) and δk (3) with their standard deviations, and which of them the model estimates; each (6,)."""
+    terms = MODELS[estimate.model].error_terms_from_state
+    variance = np.diag(terms @ estimate.covariance @ terms.T)
+    return terms @ estimate.state, np.sqrt(variance), np.asarray(terms.any(axis=1))
+
+
+def _state_of(model: Model, term: Term) -> int:
+    """Index of the state that an error term comes from."""
+    return int(np.argmax(model.error_terms_from_state[term.row]))
+
+
+def _scale_terms(model: Model) -> list[Term]:
+    """The scale terms that are a state of their own: δk if one stands for all axes, else each axis of its own."""
+    terms = [term for term in SCALES if model.error_terms_from_state[term.row].any()]
+    if len(terms) == 3 and len({_state_of(model, term) for term in terms}) == 1:
+        return [_ANY_SCALE._replace(in_words="Scale error, all axes")]
+    return terms
+
+
+def _numbers(estimate: Estimate) -> list[dict[str, str]]:
+    """What the selected model found, large."""
+    model = MODELS[estimate.model]
+    value, std, _ = _error_terms(estimate)
+    numbers = []
+    for term in (*ANGLES, *_scale_terms(model)):
+        observed = estimate.observability[_state_of(model, term)].observed
+        numbers.append(
+            {
+                "name": f"{term.name} – {term.in_words.lower()}",
+                "value": signed(term.factor * value[term.row]) + term.unit,
+                "std": f"± {term.factor * std[term.row]:.2f}{term.unit} (1σ)",
+                "note": "" if observed else "not shown by this data",
+            }
+        )
+    return numbers
+
+
+def _facts(result: Result, mounting: Mapping[str, Any], bags: Sequence[Path]) -> list[tuple[str, str]]:
+    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+    estimate = result.estimate
+    missing = [f"{entry.axis}: needs {entry.missing}" for entry in estimate.observability if entry.missing]
+    return [
+        ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
+        ("Corrected mounting", _rpy(mounting["corrected_rpy"])),
+        ("Nominal mounting", _rpy(mounting["nominal_rpy"])),
+        ("Recorded", _when(result)),
+        ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
+        ("Used by " + result.selected, f"{estimate.used}, {estimate.gated} gated"),
+        *([("Not shown yet", "; ".join(dict.fromkeys(missing)))] if missing else []),
+        ("Bags", ", ".join(map(str, bags))),
+    ]
+
+
+def _rpy(angles: Iterable[float]) -> str:
+    named = zip(("roll", "pitch", "yaw"), angles, strict=True)
+    return ", ".join(f"{name} {signed(math.degrees(angle), 3)}°" for name, angle in named)
+
+
+def _when(result: Result) -> str:
+    if result.first_ns is None or result.last_ns is None:
+        return "nothing"
+    seconds = (result.last_ns - result.first_ns) * 1e-9
+    duration = f"{seconds:.1f} s" if seconds < 600.0 else f"{seconds / 60.0:.1f} min"
+    return f"{_utc(result.first_ns)} to {_utc(result.last_ns)} UTC, {duration}"
+
+
+def _utc(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _held_out(verdict: Verdict) -> dict[str, Any] | None:
+    if not verdict.errors:
+        return None
+    table = Table(
+        ("held-out velocity error, m/s rms", "uncorrected", "corrected", "predicted", "samples"),
+        [
+            (
+                error.label,
+                f"{error.uncorrected:.4f}",
+                f"{error.corrected:.4f}",
+                "-" if error.predicted is None else f"{error.predicted:.4f}",
+                str(error.samples),
+            )
+            for error in verdict.errors
+        ],
+    )
+    kinds = {
+        "uncorrected": [error.uncorrected for error in verdict.errors],
+        "corrected": [error.corrected for error in verdict.errors],
+        "predicted": [error.predicted for error in verdict.errors],
+    }
+    alt = "; ".join(f"{e.label}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for e in verdict.errors)
+    labels = [error.label for error in verdict.errors]
+    return {
+        "table": table,
+        "pictures": [picture("Velocity error on held-out data", alt, figures.held_out_bars, labels, kinds)],
+    }
+
+
+# ------------------------------------------------------------------ estimates
+
+
+def _estimate_table(result: Result, shown: Sequence[str]) -> Table:
+    per_axis = any(len(_scale_terms(MODELS[name])) > 1 for name in shown)
+    terms = (*ANGLES, *(SCALES if per_axis else (_ANY_SCALE,)))
+    rows = []
+    for name in shown:
+        estimate = result.estimates[name]
+        model = MODELS[name]
+        value, std, estimated = _error_terms(estimate)
+        cells = []
+        for term in terms:
+            if not estimated[term.row]:
+                cells.append("–")
+                continue
+            mark = "" if estimate.observability[_state_of(model, term)].observed else " ?"
+            axis = " (x)" if model.scale_axes and term.row == 3 and not (per_axis or estimated[4:].any()) else ""
+            cells.append(f"{signed(term.factor * value[term.row])} ± {term.factor * std[term.row]:.2f}{axis}{mark}")
+        nis = f"{estimate.mean_nis / model.n_measurement:.2f}" if estimate.used else "–"
+        rows.append((name, *cells, str(estimate.used), str(estimate.gated), nis, estimate.convergence.value))
+    return Table(
+        ("model", *(f"{term.name}, {term.unit.strip()}" for term in terms), "used", "gated", "NIS/m", "convergence"),
+        rows,
+        marked=list(shown).index(result.selected),
+        notes=(
+            "± is 1σ as the model believes it; ? marks what this data does not show; – is not estimated. φ and δk are "
+            "in the DVL's frame. NIS/m: mean normalised innovation squared per measured component, about 1 when the "
+            "noise is as assumed, above when σ is too small.",
+        ),
+    )
+
+
+def _families(result: Result, history: RunHistory, time: TimeAxis, shown: Sequence[str]) -> Iterable[dict[str, Any]]:
+    """Estimates over time and innovations, for the models with GNSS and for those without."""
+    for aided, title in FAMILIES:
+        models = [name for name in shown if MODELS[name].aided == aided and result.estimates[name].used]
+        if models:
+            pictures = list(_estimate_pictures(result, history, time, models))
+            yield {"title": title, "models": models, "pictures": pictures}
+
+
+def _estimate_pictures(result: Result, history: RunHistory, time: TimeAxis, models: Sequence[str]) -> Iterable[Picture]:
+    for term in (*ANGLES, *_scales_shown(models)):
+        lines = [
+            _line(name, history.models[name], term)
+            for name in models
+            if MODELS[name].error_terms_from_state[term.row].any()
+        ]
+        if lines:
+            final = ", ".join(f"{line.model} {line.value[-1]:+.2f} ± {line.std[-1]:.2f}" for line in lines)
+            yield picture(
+                f"{term.in_words} ± 1σ", f"{term.name} over time; at the end, in {term.unit.strip()}: {final}",
+                figures.estimate_over_time, time, history.stamps_ns, lines, result.selected,
+                f"{term.name}, {term.unit.strip()}",
+            )  # fmt: skip
+    nis = {name: history.models[name].nis for name in models}
+    yield picture(
+        "Innovations (NIS)", "Mean normalised innovation squared over time; 1 is expected",
+        figures.innovations_over_time, time, history.stamps_ns, nis, result.selected,
+        caption="Running mean. The line at 1 is what the model expects: above it the σ is too small, below too large.",
+    )  # fmt: skip
+
+
+def _scales_shown(models: Sequence[str]) -> list[Term]:
+    """One figure for the scale; one for each axis if a model has more than one scale error."""
+    if any(len(_scale_terms(MODELS[name])) > 1 for name in models):
+        return list(SCALES)
+    return [_ANY_SCALE]
+
+
+def _line(name: str, history: ModelHistory, term: Term) -> figures.Line:
+    index = _state_of(MODELS[name], term)
+    return figures.Line(name, term.factor * history.state[:, index], term.factor * history.std[:, index])
+
+
+# ------------------------------------------------------------------ velocity
+
+
+def _velocities(result: Result, history: RunHistory, time: TimeAxis) -> list[Picture]:
+    """Velocity and, with a reference, residual, per body axis."""
+    t = Parameters.from_mapping(result.parameters).rotation_dvl_from_body
+    correction = result.estimate
+    before, after = history.dvl_velocity @ t, correction.corrected_velocity(history.dvl_velocity, t)
+    pictures = [
+        picture(
+            f"Velocity {where}", f"DVL velocity {where} before and after correction, and the reference, m/s",
+            figures.velocity_over_time, time, history.dvl_ns, before[:, axis], after[:, axis], history.paired_ns,
+            history.reference_velocity[:, axis], f"velocity {where}, m/s",
+        )
+        for axis, where in enumerate(BODY_AXES)
+    ]  # fmt: skip
+    if len(history.paired_ns):
+        residual_before = history.paired_velocity @ t - history.reference_velocity
+        residual_after = correction.corrected_velocity(history.paired_velocity, t) - history.reference_velocity
+        pictures += [
+            picture(
+                f"Residual {where}", f"DVL minus GNSS {where}, before and after correction, m/s",
+                figures.residual_over_time, time, history.paired_ns, residual_before[:, axis],
+                residual_after[:, axis], f"DVL − GNSS {where}, m/s",
+            )
+            for axis, where in enumerate(BODY_AXES)
+        ]  # fmt: skip
+    return pictures
+
+
+def _velocity_note(result: Result, history: RunHistory) -> str:
+    note = f"Body frame, corrected with the final estimate of {result.selected}."
+    if len(history.paired_ns):
+        return (
+            f"{note} The residuals hold the noise of the GNSS as well, and the calibration has used this data: they "
+            "show what was corrected, they do not verify it. Lines are running means."
+        )
+    return f"{note} No DVL sample has a reference velocity, so there is no residual."
+
+
+# ------------------------------------------------------------------ data
+
+
+_STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pairing", "pairing of DVL and GNSS"))
+
+
+def _stream_table(result: Result) -> Table:
+    rows = []
+    for key, name in _STREAMS:
+        counts = result.counts[key]
+        rest = [f"{value} {what.replace('_', ' ')}" for what, value in counts.items() if value and what != "received"]
+        rows.append((name, str(counts.get("received", "–")), Cell(", ".join(rest) or "–", "text")))
+    return Table(("stream", "received", Cell("of which", "text")), rows)
+
+
+def _data_pictures(result: Result, history: RunHistory, time: TimeAxis, shown: Sequence[str]) -> list[Picture]:
+    fates = _fates(result, shown)
+    ends = [*(segment.from_ns for segment in result.segments[1:]), result.last_ns]
+    segments = [(each.model, each.from_ns, end) for each, end in zip(result.segments, ends, strict=False)]
+    switches = ", ".join(dict.fromkeys(name for name, _, _ in segments)) or "none"
+    return [
+        picture(
+            "Samples by model", "How many DVL samples each model used, gated or was not given",
+            figures.samples_by_fate, list(shown), fates,
+            caption="Not given: without a GNSS velocity (models with GNSS), in the window of the prior, or held back.",
+        ),
+        picture(
+            "Selected model and GNSS", f"Which model was selected over time: {switches}; and when GNSS was there",
+            figures.selection_over_time, time, segments, history.stamps_ns, history.paired_share,
+            caption="GNSS: dark where DVL samples had a GNSS velocity beside them.",
+        ),
+    ]  # fmt: skip
+
+
+def _fates(result: Result, shown: Sequence[str]) -> dict[str, list[int]]:
+    dvl = result.counts["dvl"]
+    fates: dict[str, list[int]] = {"used": [], "gated": [], "not given": [], "slow or turning": []}
+    for name in shown:
+        estimate = result.estimates[name]
+        fates["used"].append(estimate.used)
+        fates["gated"].append(estimate.gated)
+        fates["not given"].append(max(0, dvl["usable"] - estimate.used - estimate.gated))
+        fates["slow or turning"].append(dvl["slow"] + dvl["turning"] + dvl["no_turn_rate"])
+    return fates
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return " ".join(_plain(each) for each in value)
+    return str(value) if value != "" else "''"

@@ -1,0 +1,47 @@
+"""Time of a run as figures show it: from its start, in a fitting unit, without the hours between two bags."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
+
+from ..calibration.frames import Array
+
+# A gap is cut out if it is longer than this (s) and than this share of what was recorded in all ...
+CUT_FROM_S, CUT_SHARE = 60.0, 0.2
+# ... and this share of it is left.
+LEFT_SHARE = 0.02
+
+
+class TimeAxis:
+    """Turns stamps into what is plotted.
+
+    breaks: (B, 2) from and to where time was cut out, in the unit of the axis. label: with the unit.
+    """
+
+    def __init__(self, stamps_ns: ArrayLike) -> None:
+        """From the stamps of the run, in order; at least one."""
+        stamps = np.asarray(stamps_ns, dtype=np.int64)
+        self._first_ns = stamps[0]
+        self._seconds = (stamps - self._first_ns) * 1e-9
+        steps = np.diff(self._seconds)
+        recorded = float(steps[steps <= CUT_FROM_S].sum())
+        cut = (steps > CUT_FROM_S) & (steps > CUT_SHARE * recorded)
+        shown = np.concatenate([[0.0], np.cumsum(np.where(cut, LEFT_SHARE * recorded, steps))])
+        unit_s, unit = (1.0, "s") if shown[-1] <= 600.0 else (60.0, "min") if shown[-1] <= 10_800.0 else (3600.0, "h")
+        self._shown = shown / unit_s
+        self.breaks = np.column_stack([self._shown[:-1][cut], self._shown[1:][cut]])
+        self.label = f"time from the start, {unit}" + (" (gaps cut out)" if cut.any() else "")
+
+    def __call__(self, stamps_ns: ArrayLike) -> Array:
+        """Stamps (N,) ns within the run -> positions on the axis (N,)."""
+        seconds = (np.asarray(stamps_ns, dtype=np.int64) - self._first_ns) * 1e-9
+        return np.asarray(np.interp(seconds, self._seconds, self._shown))
+
+    def dress(self, axes: Axes) -> None:
+        """Label the axis and mark what was cut out."""
+        axes.set_xlabel(self.label)
+        axes.set_xlim(self._shown[0], max(self._shown[-1], 1e-3))
+        for start, end in self.breaks:
+            axes.axvspan(start, end, facecolor="white", edgecolor="#c5cbd0", hatch="////", linewidth=0.0, zorder=3)
