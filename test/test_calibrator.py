@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from runs import SECOND, START_NS, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 
@@ -296,9 +296,11 @@ def check_sums(calibrator: Calibrator):
     for name, model in MODELS.items():
         estimate = calibrator.estimate(name)
         given_to = estimate.used + estimate.gated
-        assert given_to <= (pairing["paired"] if model.aided else dvl["usable"])
+        given = {Needs.NOTHING: dvl["usable"], Needs.ATTITUDE: pairing["oriented"], Needs.REFERENCE: pairing["paired"]}
+        assert given_to <= given[model.needs]
         if not model.aided:
-            assert given_to == dvl["usable"]
+            assert given_to == given[model.needs]
+    assert dvl["usable"] == sum(pairing[key] for key in ("oriented", "not_oriented", "awaiting_attitude"))
 
 
 # ---------------------------------------------------------------- restarts

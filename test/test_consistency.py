@@ -27,7 +27,7 @@ def normalised_estimation_error_squared(**options) -> dict[str, np.ndarray]:
             )
             calibrator = calibrate(make_samples(run), parameters, block_size=512)
             for each, model in MODELS.items():
-                if model.aided != aided or any(axes == (0,) for _, axes in model.scale_axes):
+                if model.aided != aided or model.nuisance or any(axes == (0,) for _, axes in model.scale_axes):
                     continue  # M2 and M4 hold a scale along x only, which this truth is not
                 truth = np.array([*phi, scale][: model.n_state])
                 error = calibrator.state(each).x - truth

@@ -14,23 +14,23 @@ from dvl_calib_ros.calibration.kalman import Measurements
 def random_problem(rng, k=3, n_samples=150, n=4, m=3, outliers=0.0, weights=False, gate=np.inf):
     truth = rng.normal(0, 0.05, (k, n))
     h = rng.normal(0, 1.5, (k, n_samples, m, n))
-    factor = rng.normal(0, 0.1, (n_samples, m, m))
-    r = factor @ factor.transpose(0, 2, 1) + 0.01 * np.eye(m)
-    z = np.einsum("knmi,ki->knm", h, truth) + np.einsum(
-        "nij,nj->ni", np.linalg.cholesky(r), rng.normal(size=(n_samples, m))
-    )
+    factor = rng.normal(0, 0.1, (k if weights else 1, n_samples, m, m))
+    r = factor @ factor.transpose(0, 1, 3, 2) + 0.01 * np.eye(m)
+    noise = np.linalg.cholesky(r) @ rng.normal(size=(1, n_samples, m, 1))
+    z = np.einsum("knmi,ki->knm", h, truth) + noise[..., 0]
     z[:, rng.random(n_samples) < outliers] += 3.0
-    weight = rng.uniform(0.1, 1.0, n_samples) if weights else np.ones(n_samples)
+    weight = rng.uniform(0.1, 1.0, (k, n_samples)) if weights else np.ones((1, n_samples))
     usable = rng.random((k, n_samples)) < 0.9
-    data = Measurements(z, h, r[None], weight, usable, np.full(k, gate))
+    data = Measurements(z, h, r, weight, usable, np.full(k, gate))
     return np.zeros((k, n)), np.tile(np.diag([0.05**2] * n), (k, 1, 1)), data
 
 
 def least_squares(x, p, data, k):
     """Prior-regularised weighted least squares, by stacking everything and calling lstsq."""
+    own = min(k, len(data.r) - 1)
     rows, right = [np.linalg.cholesky(np.linalg.inv(p[k])).T], [np.linalg.cholesky(np.linalg.inv(p[k])).T @ x[k]]
     for i in np.flatnonzero(data.usable[k]):
-        root = np.linalg.cholesky(np.linalg.inv(data.r[0, i]) * data.weight[i]).T
+        root = np.linalg.cholesky(np.linalg.inv(data.r[own, i]) * data.weight[own, i]).T
         rows.append(root @ data.h[k, i])
         right.append(root @ data.z[k, i])
     a = np.vstack(rows)
@@ -72,7 +72,12 @@ def test_the_history_is_the_filter_stopped_after_every_sample(rng, outliers, gat
     history = kalman.history(x, p, data)
     for stop in range(1, 41):
         part = Measurements(
-            data.z[:, :stop], data.h[:, :stop], data.r[:, :stop], data.weight[:stop], data.usable[:, :stop], data.gate
+            data.z[:, :stop],
+            data.h[:, :stop],
+            data.r[:, :stop],
+            data.weight[:, :stop],
+            data.usable[:, :stop],
+            data.gate,
         )
         after = kalman.recursion(x, p, part)
         np.testing.assert_allclose(history.x[:, stop - 1], after.x, atol=1e-10)
@@ -95,7 +100,7 @@ def test_the_covariance_stays_symmetric_positive_definite_over_precise_updates(r
         np.zeros((1, 5000, 1)),
         h,
         np.full((1, 1, 1, 1), 1e-12),
-        np.ones(5000),
+        np.ones((1, 5000)),
         np.ones((1, 5000), bool),
         np.array([np.inf]),
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD
-from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.io.replay import replay
 from dvl_calib_ros.io.trajectories import ImportOptions, import_recording, read_columns
@@ -59,8 +59,10 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
         assert dvl["received"] == dvl["accepted"] == written["dvl/twist"] == len(trajectories[name][0])
         assert reference["received"] == written["gnss/twist"]
         assert result.counts["pairing"]["paired"] == dvl["usable"] + dvl["slow"]
-        for estimate in result.estimates.values():
-            assert estimate.used + estimate.gated == dvl["usable"]
+        assert result.counts["pairing"]["not_oriented"] == dvl["usable"]  # no attitude in the bag
+        for name, estimate in result.estimates.items():
+            given = 0 if MODELS[name].needs is Needs.ATTITUDE else dvl["usable"]
+            assert estimate.used + estimate.gated == given
 
 
 def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectories, tmp_path, rng):

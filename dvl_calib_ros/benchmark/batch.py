@@ -10,7 +10,8 @@ import numpy as np
 from ..calibration import kalman
 from ..calibration.bank import prior
 from ..calibration.frames import Array
-from ..calibration.models import MODELS, Observations
+from ..calibration.models import MODELS
+from ..calibration.observations import Observations
 from ..calibration.parameters import Parameters
 from ..io.errors import InputError
 from . import Measurement
@@ -35,7 +36,12 @@ def measure() -> list[Measurement]:
 
     def run_ours() -> Array:
         data = kalman.Measurements(
-            z[None], h[None], noise[None, None], np.ones(N_SAMPLES), np.ones((1, N_SAMPLES), bool), np.array([np.inf])
+            z[None],
+            h[None],
+            noise[None, None],
+            np.ones((1, N_SAMPLES)),
+            np.ones((1, N_SAMPLES), bool),
+            np.array([np.inf]),
         )
         return kalman.history(start.x[None], start.p[None], data).x[0]
 

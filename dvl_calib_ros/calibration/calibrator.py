@@ -1,9 +1,10 @@
 """The calibration of one DVL: feed it samples, read estimates.
 
-    feed_dvl ──► valid? ──► in order? ──► angular velocity ──► speed, turn ──┬─► models without GNSS
-                                          (from IMU track)                   └─► reference (from its track) ──► models
-    feed_reference ─► valid? ─► in order? ─► track                               with GNSS, automatic selection
-    feed_imu ───────► valid? ─► in order? ─► track
+    feed_dvl ──► valid? ──► in order? ──► angular velocity ──► speed, turn ──┬─► models that need nothing else
+                                          (from IMU track)                   ├─► attitude (from IMU track) ──► models
+    feed_reference ─► valid? ─► in order? ─► track                           │   that need it
+    feed_imu ───────► valid? ─► in order? ─► track                           └─► reference (from its track) ──► models
+                                                                                 with GNSS, automatic selection
 
 The node, the replay and the evaluation all use this class; only `block_size` differs, and that changes nothing but the
 speed.
@@ -13,16 +14,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from .bank import GaussianState, ModelBank, nis_bounds
+from .bank import ModelBank, nis_bounds
 from .frames import ENU_FROM_NED, Array, Quaternion, Vector, rotation_from_quaternion, slerp
-from .models import MODELS, Observations
+from .kalman import GaussianState
+from .models import MODELS, Needs
 from .observability import convergence, observability
+from .observations import Assumptions, Observations
 from .parameters import ParameterError, Parameters
 from .results import Estimate, Result
 from .samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -48,6 +51,14 @@ class _Moving(NamedTuple):
     angular_velocity: Vector | None = None
 
 
+class _Oriented(NamedTuple):
+    """A DVL sample with the vehicle's attitude (ENU from body) and angular velocity (rad/s, body)."""
+
+    sample: _Moving
+    orientation: Quaternion
+    angular_velocity: Vector
+
+
 class _Paired(NamedTuple):
     """A DVL sample with its reference velocity, in the body or, with an orientation, in ENU or NED."""
 
@@ -57,6 +68,24 @@ class _Paired(NamedTuple):
     weight: float
     frame: VelocityFrame
     orientation: Quaternion | None
+
+
+class _Block(NamedTuple):
+    """What `ModelBank.update` takes: stamps (N), observations, weight (N,), whether the prior was known (N,)."""
+
+    stamps_ns: list[int]
+    seen: Observations
+    weight: Array
+    prior_known: Array
+
+
+def _block(
+    samples: list[_Moving], seen: Observations, weight: Array | None = None, prior_known: Array | None = None
+) -> _Block:
+    n = len(samples)
+    stamps_ns = [sample.stamp_ns for sample in samples]
+    weight = np.ones(n) if weight is None else weight
+    return _Block(stamps_ns, seen, weight, np.ones(n, dtype=bool) if prior_known is None else prior_known)
 
 
 class Calibrator:
@@ -93,6 +122,7 @@ class Calibrator:
             tuple(parameters.lever_arm) if any(parameters.lever_arm) else None  # type: ignore[assignment]
         )
         self._needs_turn_rate = self._lever_arm is not None or parameters.max_turn_rate > 0.0
+        self._assumptions = Assumptions(*(getattr(parameters, name) for name in Assumptions._fields))
         self._aided_noise = np.eye(3)[None] * parameters.gnss_aided_std**2
         self._unaided_noise = np.eye(3)[None] * parameters.gnss_free_std**2
         self.reset()
@@ -118,12 +148,17 @@ class Calibrator:
 
     def _forget_dvl(self) -> None:
         self.selection = Selection()
-        self._aided = ModelBank([m for m in MODELS.values() if m.aided], self.parameters, self._initial)
-        self._unaided = ModelBank([m for m in MODELS.values() if not m.aided], self.parameters, self._initial)
+        self._banks = {
+            needs: ModelBank([m for m in MODELS.values() if m.needs is needs], self.parameters, self._initial)
+            for needs in Needs
+        }
         self._awaiting_imu: deque[_Moving] = deque()
+        self._awaiting_attitude: deque[_Moving] = deque()
         self._awaiting_reference: deque[_Moving] = deque()
-        self._unaided_block: list[tuple[_Moving, bool]] = []
-        self._aided_block: list[_Paired] = []
+        # what the models with these needs will be given next
+        self._plain: list[tuple[_Moving, bool]] = []
+        self._oriented: list[_Oriented] = []
+        self._paired: list[_Paired] = []
         # what the first waiting DVL samples wait for: samples on these tracks, or any stream's stamp reaching this
         self._blocked_by: tuple[Track[Any], ...] = ()
         self._deadline_ns = NEVER_NS
@@ -253,7 +288,13 @@ class Calibrator:
             if self._needs_turn_rate and not self._is_decided(self._imu, sample.stamp_ns, horizon_ns):
                 break
             self._awaiting_imu.popleft()
-            self._to_unaided(sample)
+            self._take_plain(sample)
+        while self._awaiting_attitude:
+            sample = self._awaiting_attitude[0]
+            if not self._is_decided(self._imu, sample.stamp_ns, horizon_ns):
+                break
+            self._awaiting_attitude.popleft()
+            self._take_oriented(sample)
         while self._awaiting_reference:
             sample = self._awaiting_reference[0]
             if not self._is_decided(self._reference, sample.stamp_ns, horizon_ns):
@@ -264,11 +305,10 @@ class Calibrator:
                 break
             self._awaiting_reference.popleft()
             self._decided_ns = sample.stamp_ns
-            self._to_aided(sample, bracket)
-        if len(self._unaided_block) >= self._block_size:
-            self._update_unaided()
-        if len(self._aided_block) >= self._block_size:
-            self._update_aided()
+            self._take_paired(sample, bracket)
+        for needs in Needs:
+            if self._n_waiting(needs) >= self._block_size:
+                self._update(needs)
 
     def _is_decided(self, track: Track[Any], stamp_ns: int, horizon_ns: int) -> bool:
         """Whether a DVL sample need not wait for a track any more; if it must, note for what and until when."""
@@ -278,7 +318,7 @@ class Calibrator:
         self._deadline_ns = min(self._deadline_ns, track.deadline_ns(stamp_ns))
         return False
 
-    def _to_unaided(self, sample: _Moving) -> None:
+    def _take_plain(self, sample: _Moving) -> None:
         if self._needs_turn_rate:
             sample = sample._replace(angular_velocity=self._angular_velocity(sample.stamp_ns))
         unusable = self._unusable(sample)
@@ -286,7 +326,8 @@ class Calibrator:
             if self._lever_arm is not None and sample.angular_velocity is None:
                 self._tally["dvl"]["lever_arm_uncompensated"] += 1
             prior_known = self._prior.known_at(sample.stamp_ns, sample.velocity)
-            self._unaided_block.append((sample, prior_known))
+            self._plain.append((sample, prior_known))
+            self._awaiting_attitude.append(sample)
         else:
             self._tally["dvl"][unusable] += 1
             sample = sample._replace(usable=False)
@@ -306,12 +347,20 @@ class Calibrator:
                 return "turning"
         return None
 
-    def _to_aided(self, sample: _Moving, bracket: Bracket[ReferenceSample] | None) -> None:
+    def _take_oriented(self, sample: _Moving) -> None:
+        orientation, rate = self._orientation(sample.stamp_ns), self._angular_velocity(sample.stamp_ns)
+        if orientation is None or rate is None:
+            self._tally["pairing"]["not_oriented"] += 1
+            return
+        self._tally["pairing"]["oriented"] += 1
+        self._oriented.append(_Oriented(sample, orientation, rate))
+
+    def _take_paired(self, sample: _Moving, bracket: Bracket[ReferenceSample] | None) -> None:
         paired = None if bracket is None else self._pair(sample, bracket)
         self._tally["pairing"]["paired" if paired else "unpaired"] += 1
         self.selection.update(sample.stamp_ns, paired is not None, self.parameters)
         if paired is not None and sample.usable:
-            self._aided_block.append(paired)
+            self._paired.append(paired)
 
     def _pair(self, sample: _Moving, bracket: Bracket[ReferenceSample]) -> _Paired | None:
         before, after, fraction = bracket
@@ -359,47 +408,69 @@ class Calibrator:
 
     # ------------------------------------------------------------------ models
 
-    def _update_unaided(self) -> None:
-        block, self._unaided_block = self._unaided_block, []
-        if not block:
-            return
-        samples = [sample for sample, _ in block]
-        seen = self._observations(samples, None)
-        known = np.array([known for _, known in block])
-        stamps = [sample.stamp_ns for sample in samples]
-        self._on_block(stamps, seen)
-        self._unaided.update(stamps, seen, self._unaided_noise, np.ones(len(samples)), known)
+    def _n_waiting(self, needs: Needs) -> int:
+        waiting: dict[Needs, Sized] = {
+            Needs.NOTHING: self._plain, Needs.ATTITUDE: self._oriented, Needs.REFERENCE: self._paired,
+        }  # fmt: skip
+        return len(waiting[needs])
 
-    def _update_aided(self) -> None:
-        block, self._aided_block = self._aided_block, []
-        if not block:
+    def _update(self, needs: Needs) -> None:
+        """Give the models with these needs the samples that wait for them."""
+        if not self._n_waiting(needs):
             return
-        samples = [paired.sample for paired in block]
-        velocity = np.array([paired.velocity for paired in block])
+        take = {
+            Needs.NOTHING: self._block_of_plain,
+            Needs.ATTITUDE: self._block_of_oriented,
+            Needs.REFERENCE: self._block_of_paired,
+        }
+        block = take[needs]()
+        self._on_block(block.stamps_ns, block.seen)
+        self._banks[needs].update(*block)
+
+    def _block_of_plain(self) -> _Block:
+        block, self._plain = self._plain, []
+        samples = [sample for sample, _ in block]
+        known = np.array([known for _, known in block])
+        return _block(samples, self._observations(samples), prior_known=known)
+
+    def _block_of_oriented(self) -> _Block:
+        block, self._oriented = self._oriented, []
+        samples = [each.sample for each in block]
+        seen = self._observations(
+            samples,
+            rotation_enu_from_body=rotation_from_quaternion(np.array([each.orientation for each in block])),
+            angular_velocity=np.array([each.angular_velocity for each in block]),
+        )
+        return _block(samples, seen)
+
+    def _block_of_paired(self) -> _Block:
+        block, self._paired = self._paired, []
+        samples = [each.sample for each in block]
+        velocity = np.array([each.velocity for each in block])
         rotation = _body_from_reference(block)
         if rotation is not None:
             velocity = np.einsum("nij,nj->ni", rotation, velocity)
-        seen = self._observations(samples, velocity)
-        weight = np.array([paired.weight for paired in block])
-        noise = self._aided_covariance(block, rotation)
-        stamps = [sample.stamp_ns for sample in samples]
-        self._on_block(stamps, seen)
-        self._aided.update(stamps, seen, noise, weight, np.ones(len(block), dtype=bool))
+        seen = self._observations(samples, reference_body=velocity, noise=self._paired_covariance(block, rotation))
+        return _block(samples, seen, weight=np.array([each.weight for each in block]))
 
-    def _observations(self, samples: list[_Moving], reference_body: Array | None) -> Observations:
+    def _observations(self, samples: list[_Moving], **paired_with: Any) -> Observations:
+        """What models see of these samples; `paired_with`: the fields of `Observations` that come from elsewhere."""
         lever = None
         if self._lever_arm is not None:
             rates = np.array([sample.angular_velocity or (0.0, 0.0, 0.0) for sample in samples])
             lever = np.cross(rates, self._lever_arm)
+        fields: dict[str, Any] = {"reference_body": None, "noise": self._unaided_noise} | paired_with
         return Observations(
             velocity_dvl=np.array([sample.velocity for sample in samples]),
-            reference_body=reference_body,
             lever_velocity=lever,
             rotation_dvl_from_body=self.parameters.rotation_dvl_from_body,
             sway_heave=self._prior.sway_heave,
+            interval=1e-9 * np.array([sample.interval_ns for sample in samples]),
+            assumptions=self._assumptions,
+            **fields,
         )
 
-    def _aided_covariance(self, block: list[_Paired], body_from_reference: Array | None) -> Array:
+    def _paired_covariance(self, block: list[_Paired], body_from_reference: Array | None) -> Array:
         """R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
         given = [paired.covariance is not None for paired in block]
         if not self.parameters.use_message_covariance or not any(given):
@@ -420,8 +491,9 @@ class Calibrator:
 
         dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (wrong_frame) + accepted;
         accepted = slow + turning + no_turn_rate + usable + awaiting_imu. pairing: accepted and decided = paired +
-        unpaired; awaiting_reference is the rest. A model's used + gated (+ samples in its prior window) is what it
-        was given: usable samples, for the models with GNSS those that were paired.
+        unpaired; awaiting_reference is the rest. usable = oriented + not_oriented (no attitude or no angular velocity)
+        + awaiting_attitude. A model's used + gated (+ samples in its prior window) is what it was given: usable
+        samples, for the models with GNSS those that were paired, for those with attitude the oriented ones.
         """
         counts = {name: dict(tally) for name, tally in self._tally.items()}
         for name, order in (("dvl", self._dvl_order), ("reference", self._reference_order), ("imu", self._imu_order)):
@@ -434,13 +506,14 @@ class Calibrator:
             dvl.setdefault(key, 0)
         for key in ("wrong_frame", "late"):
             counts["reference"].setdefault(key, 0)
-        for key in ("paired", "unpaired", "without_attitude"):
+        for key in ("paired", "unpaired", "without_attitude", "oriented", "not_oriented"):
             pairing.setdefault(key, 0)
         not_accepted = ("invalid", "duplicate", "out_of_order", "stray", "held", "wrong_frame")
         dvl["accepted"] = dvl["received"] - sum(dvl[key] for key in not_accepted)
         dvl["awaiting_imu"] = len(self._awaiting_imu)
         dvl["usable"] = dvl["accepted"] - sum(dvl[k] for k in ("slow", "turning", "no_turn_rate", "awaiting_imu"))
         pairing["awaiting_reference"] = len(self._awaiting_reference)
+        pairing["awaiting_attitude"] = len(self._awaiting_attitude)
         counts["calibration"] = {"restarts": self.restarts}
         return counts
 
@@ -457,25 +530,20 @@ class Calibrator:
 
     def n_given(self, name: str) -> int:
         """Number of samples that a model was given so far; it grows when there may be a new estimate."""
-        waiting = self._aided_block if MODELS[name].aided else self._unaided_block
-        return self._bank(name).n_given + len(waiting)
+        needs = MODELS[name].needs
+        return self._banks[needs].n_given + self._n_waiting(needs)
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model."""
-        if MODELS[name].aided:
-            self._update_aided()
-        else:
-            self._update_unaided()
-        return self._bank(name).state(name)
-
-    def _bank(self, name: str) -> ModelBank:
-        return self._aided if MODELS[name].aided else self._unaided
+        needs = MODELS[name].needs
+        self._update(needs)
+        return self._banks[needs].state(name)
 
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
         model = MODELS[name or self.selected]
         state, covariance = self.state(model.name)
-        used, gated, mean_nis = self._bank(model.name).counts(model.name)
+        used, gated, mean_nis = self._banks[model.needs].counts(model.name)
         return Estimate(
             model=model.name,
             state=state,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .bank import GaussianState
+from .kalman import GaussianState
 from .error_model import correction_jacobian, correction_matrix
 from .frames import Array
 from .models import Model

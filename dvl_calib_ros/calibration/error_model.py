@@ -20,8 +20,13 @@ def distort(velocity_body: Array, misalignment: Array, scale: Array, rotation_dv
 
 
 def correction_matrix(misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
-    """(3, 3) matrix that takes the measured DVL velocity to the corrected body velocity: the inverse of `distort`."""
-    return rotation_dvl_from_body.T @ np.linalg.inv(np.eye(3) + skew(misalignment)) @ np.diag(1.0 / (1.0 + scale))
+    """Matrix that takes the measured DVL velocity to the corrected body velocity: the inverse of `distort`.
+
+    (..., 3) rad, (..., 3) -> (..., 3, 3).
+    """
+    unturned = rotation_dvl_from_body.T @ np.linalg.inv(np.eye(3) + skew(misalignment))
+    matrix: Array = unturned / (1.0 + np.asarray(scale))[..., None, :]
+    return matrix
 
 
 def correct(velocity_dvl: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:

@@ -32,12 +32,19 @@ MAX_GATE_PASSES = 12
 HISTORY_PIECE = 4096
 
 
+class GaussianState(NamedTuple):
+    """A state (n,) and its covariance (n, n)."""
+
+    x: Array
+    p: Array
+
+
 @dataclass(frozen=True)
 class Measurements:
     """N measurements for each of K models, padded to m rows and n states.
 
-    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (N,), share
-    of its own information that a sample adds, in 0..1 (below 1 for samples that share one reference sample's noise).
+    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N), share
+    of its own information that a sample adds, in 0..1 (below 1 for samples that share their noise with others).
     usable: (K, N), False where a model must not use a sample. gate: (K,), largest normalised innovation squared that
     is used, inf for no gate.
     """
@@ -52,7 +59,7 @@ class Measurements:
     def part(self, at: slice) -> Measurements:
         """The samples of a slice."""
         r = self.r if self.r.shape[1] == 1 else self.r[:, at]
-        return Measurements(self.z[:, at], self.h[:, at], r, self.weight[at], self.usable[:, at], self.gate)
+        return Measurements(self.z[:, at], self.h[:, at], r, self.weight[:, at], self.usable[:, at], self.gate)
 
 
 @dataclass(frozen=True)
@@ -92,15 +99,15 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
     for i in range(n_samples):
         if process is not None:
             p += process[i]
-        h, r_i, weight = data.h[:, i], data.r[:, 0 if one_r else i], data.weight[i]
+        h, r_i, weight = data.h[:, i], data.r[:, 0 if one_r else i], data.weight[:, i]
         pht = p @ h.transpose(0, 2, 1)
         s = h @ pht + r_i
         s_inverse = np.linalg.inv(s)
         innovation = data.z[:, i, :, None] - h @ x[:, :, None]
         nis_i = (innovation.transpose(0, 2, 1) @ s_inverse @ innovation)[:, 0, 0]
         used_i = data.usable[:, i] & (nis_i <= data.gate)
-        if weight != 1.0:  # the gate asks whether this sample fits; the update, how much news is in it
-            r_i = r_i / weight
+        if (weight != 1.0).any():  # the gate asks whether this sample fits; the update, how much news is in it
+            r_i = r_i / weight[:, None, None]
             s_inverse = np.linalg.inv(h @ pht + r_i)
         gain = (pht @ s_inverse) * used_i[:, None, None]  # a gain of zero leaves x and P exactly as they are
         x += (gain @ innovation)[:, :, 0]
@@ -122,6 +129,21 @@ def batch(x: Array, p: Array, data: Measurements) -> Updated:
     p_after = 0.5 * (p_after + p_after.transpose(0, 2, 1))
     state = np.stack([column[:, -1] for column in solved.information_state], axis=-1)
     return Updated((p_after @ state[:, :, None])[:, :, 0], p_after, solved.used, solved.nis)
+
+
+def least_squares(x: Array, p: Array, data: Measurements) -> tuple[Array, Array]:
+    """x (K, n) and P (K, n, n) after N samples without gate and process noise: prior-regularised least squares.
+
+    Only sums over the samples, no innovations: much faster than `batch`, to the same state.
+    """
+    k, n_samples, m, n = data.h.shape
+    share = (data.weight * data.usable)[..., None, None]
+    weighted = (np.linalg.inv(data.r) @ data.h * share).reshape(k, n_samples * m, n).transpose(0, 2, 1)
+    prior = np.linalg.inv(p)
+    p_after = np.linalg.inv(prior + weighted @ data.h.reshape(k, n_samples * m, n))
+    p_after = 0.5 * (p_after + p_after.transpose(0, 2, 1))
+    state = prior @ x[..., None] + weighted @ data.z.reshape(k, n_samples * m, 1)
+    return (p_after @ state)[..., 0], p_after
 
 
 def history(x: Array, p: Array, data: Measurements) -> History:

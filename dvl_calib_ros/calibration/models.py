@@ -1,119 +1,70 @@
 """The calibration models as data (models.md, "The models").
 
 A model is one entry of `MODELS`; nothing outside its definition branches on its name. Every model is linear in its
-state, ``z = H x + noise``, with the residual misalignment φ (DVL frame, rad) first and its scale-factor errors after.
+state, ``z = H x + noise``, with the residual misalignment φ (DVL frame, rad) first, its scale-factor errors after, and
+last what it must know to see them (nuisance states, such as a current).
 
 Sources: M1-M7 from Yampolsky and Klein, "Information-Aided DVL Calibration" (M1, M2 baselines, M3, M4 IAC-G, M5-M7
-IAC-GF). They hold in any right-handed frame.
+IAC-GF). G1, F1 and A1 are our own; their derivations are in the docstrings of `_g1`, `_f1` and `_a1`. All hold in any
+right-handed frame with x ahead.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from .frames import Array, skew
+from .observations import Observations
 
 MISALIGNMENT_STATES = ("phi_x", "phi_y", "phi_z")
 N_MEASUREMENT = 3  # rows of the largest measurement; models with fewer are padded in the bank
 
 
-@dataclass(frozen=True)
-class Observations:
-    """A block of N synchronised samples, everything a model may use.
-
-    velocity_dvl: (N, 3) m/s measured, DVL frame. reference_body: (N, 3) m/s GNSS velocity of the reference point in
-    the body frame, None where the block has none. lever_velocity: (N, 3) m/s, ω×l of the DVL in the body frame, zero
-    where unknown, None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and
-    heave, body frame.
-
-    What several models derive from these is computed once.
-    """
-
-    velocity_dvl: Array
-    reference_body: Array | None
-    lever_velocity: Array | None
-    rotation_dvl_from_body: Array
-    sway_heave: Array
-
-    @cached_property
-    def reference(self) -> Reference:
-        """The reference velocity as it is."""
-        assert self.reference_body is not None  # the bank gives aided models paired blocks only
-        return self._reference(self.reference_body)
-
-    @cached_property
-    def reference_without_heave(self) -> Reference:
-        """The reference velocity with its heave set to zero.
-
-        In the body frame, before T: it is the vehicle, not the instrument, that does not heave. For a mounting turned
-        about z only this is the paper's r_z := 0; for a tilted one r_z := 0 would undo the known tilt.
-        """
-        assert self.reference_body is not None
-        return self._reference(self.reference_body * _HORIZONTAL)
-
-    def _reference(self, velocity_body: Array) -> Reference:
-        if self.lever_velocity is not None:
-            velocity_body = velocity_body + self.lever_velocity
-        r = velocity_body @ self.rotation_dvl_from_body.T
-        return Reference(r, skew(r))
-
-    @cached_property
-    def velocity_at_reference(self) -> Array:
-        """Measured velocity moved to the reference point (N, 3) m/s, DVL frame."""
-        if self.lever_velocity is None:
-            return self.velocity_dvl
-        return self.velocity_dvl - self.lever_velocity @ self.rotation_dvl_from_body.T
-
-    @cached_property
-    def speed(self) -> Array:
-        """Measured speed at the reference point (N,) m/s."""
-        v = self.velocity_at_reference
-        return np.sqrt((v * v).sum(axis=1))
-
-    @cached_property
-    def speed_and_prior(self) -> Array:
-        """(‖v‖, s, h): measured speed ahead, prior sway and heave (N, 3) m/s, body frame."""
-        expected = np.empty((len(self.speed), 3))
-        expected[:, 0] = self.speed
-        expected[:, 1:] = self.sway_heave
-        return expected
-
-    @cached_property
-    def body_from_measured(self) -> Array:
-        """Tᵀ[v×] (N, 3, 3): how the measured velocity turns in the body frame."""
-        return np.matmul(self.rotation_dvl_from_body.T, skew(self.velocity_at_reference))
-
-
-class Reference(NamedTuple):
-    """r = T (g + ω×l) (N, 3) m/s in the DVL frame, and [r×] (N, 3, 3)."""
-
-    r: Array
-    skew: Array
-
-
-_HORIZONTAL = np.array([1.0, 1.0, 0.0])
-
 Linearised = tuple[Array, Array]
 """z (N, m) m/s and H (N, m, n): what one model makes of a block of observations."""
+
+
+class Needs(Enum):
+    """What a sample must come with, beside the DVL's velocity, for a model to use it."""
+
+    NOTHING = "nothing"
+    REFERENCE = "reference velocity"
+    ATTITUDE = "attitude and angular velocity"
+
+
+class Nuisance(NamedTuple):
+    """A state that is estimated only because it would else be taken for misalignment or scale.
+
+    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it.
+    """
+
+    name: str
+    unit: str
+    std: float | str
 
 
 @dataclass(frozen=True)
 class Model:
     """One calibration model.
 
-    scale_axes: for every scale state its name and the DVL axes it acts on. linearise: observations -> z (N, m),
-    H (N, m, n) with n = 3 + number of scale states. aided: True if it needs a reference velocity. needs_prior: True if
-    it uses prior sway and heave. shown_by: what lets it see roll, pitch, yaw and scale, for the operator. assumes,
-    wrong_when: for the documentation.
+    linearise: observations -> z (N, m), H (N, m, n). shown_by: what lets it see roll, pitch, yaw and scale, for the
+    operator. assumes, wrong_when: for the documentation. scale_axes: for every scale state its name and the DVL axes
+    it acts on. needs_prior: True if it uses prior sway and heave.
+
+    What a model may change of how it is filtered: noise: observations -> its own R (N or 1, 3, 3) (m/s)², of which a
+    model with fewer rows uses the first ones; None: `Observations.noise`. motion_is_noise: its noise is the vehicle's
+    motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first six states
+    are those of the correction, see `correction_parameters`.
     """
 
     name: str
-    aided: bool
+    needs: Needs
     n_measurement: int
     linearise: Callable[[Observations], Linearised]
     shown_by: Mapping[str, str]
@@ -121,16 +72,31 @@ class Model:
     wrong_when: str
     scale_axes: tuple[tuple[str, tuple[int, ...]], ...] = ()
     needs_prior: bool = False
+    nuisance: tuple[Nuisance, ...] = ()
+    noise: Callable[[Observations], Array] | None = None
+    motion_is_noise: bool = False
+    in_correction_parameters: bool = False
+
+    @property
+    def aided(self) -> bool:
+        """Whether it needs a reference velocity (GNSS)."""
+        return self.needs is Needs.REFERENCE
+
+    @property
+    def n_errors(self) -> int:
+        """Number of states that are errors of the DVL: misalignment and scale."""
+        return 3 + len(self.scale_axes)
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states in order: misalignment (rad), then scale-factor errors (dimensionless)."""
-        return MISALIGNMENT_STATES + tuple(name for name, _ in self.scale_axes)
+        """Names of the states in order: misalignment (rad), scale-factor errors (dimensionless), nuisance states."""
+        scales, nuisance = (name for name, _ in self.scale_axes), (each.name for each in self.nuisance)
+        return (*MISALIGNMENT_STATES, *scales, *nuisance)
 
     @property
     def n_state(self) -> int:
         """Number of states n."""
-        return 3 + len(self.scale_axes)
+        return self.n_errors + len(self.nuisance)
 
     @cached_property
     def error_terms_from_state(self) -> Array:
@@ -163,18 +129,122 @@ def _m5(seen: Observations) -> Linearised:
 
 def _m6(seen: Observations) -> Linearised:
     """z = (‖v‖, s, h) - Tᵀv, H = Tᵀ[v×], body frame."""
-    z = seen.speed_and_prior - seen.velocity_at_reference @ seen.rotation_dvl_from_body
+    z = seen.speed_and_prior - seen.velocity_in_body
     return z, seen.body_from_measured
 
 
 def _m7(seen: Observations) -> Linearised:
     """z = ‖v‖ - (Tᵀv)_x, H = first row of Tᵀ[v×]."""
-    z = seen.speed - seen.velocity_at_reference @ seen.rotation_dvl_from_body[:, 0]
+    z = seen.speed - seen.velocity_in_body[:, 0]
     return z[:, None], seen.body_from_measured[:, :1]
+
+
+def _g1(seen: Observations) -> Linearised:
+    """z = Tᵀr' - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), -k] on ψ, κ, h; body frame.
+
+    The models of the paper put the noisy GNSS velocity r into H: noise in a regressor pulls its coefficient, here the
+    scale, down ("errors in variables"). Here the correction itself is estimated,
+
+        T v_b = (I - [ψ×] - diag(κ)) v,
+
+    with the DVL's v, twenty times less noisy, in H; what pull is left is σ_dvl²/‖v‖². It is exactly linear in ψ and
+    κ; `error_state` turns them into φ and δk, exactly as well.
+
+    r' = g - k g_z is the GNSS velocity as known after the heave assumption 0 = g_z - h + noise, weighed with its own
+    variance against the receiver's. The heave h, constant (trim), is a state. In the row of heave κ acts on level motion
+    only: what is assumed to be near zero must not be read as a scale that makes it so.
+    """
+    assert seen.reference_body is not None
+    r = seen.reference_body - seen.heave_gain * seen.reference_body[:, 2:]
+    if seen.lever_velocity is not None:
+        r = r + seen.lever_velocity
+    body_from_dvl = seen.rotation_dvl_from_body.T
+    measured = seen.velocity_dvl @ body_from_dvl.T
+    level = measured * (1.0, 1.0, 0.0) @ body_from_dvl
+    h = np.zeros((len(r), 3, 7))
+    h[:, :, :3] = np.matmul(body_from_dvl, skew(seen.velocity_dvl))
+    h[:, :2, 3:6] = -body_from_dvl[:2] * seen.velocity_dvl[:, None, :]
+    h[:, 2, 3:6] = -body_from_dvl[2] * level
+    h[:, :, 6] = -seen.heave_gain
+    return r - measured, h
+
+
+def _g1_noise(seen: Observations) -> Array:
+    """Covariance of r': (I - k e_zᵀ) R, body frame."""
+    r = seen.noise_in_body
+    noise: Array = r - seen.heave_gain[:, :, None] * r[:, 2:3, :]
+    return noise
+
+
+# Sway of a vehicle that turns unseen, m/s
+UNSEEN_TURN_SWAY_STD = 0.1
+
+
+def _f1(seen: Observations) -> Linearised:
+    """z = (Tᵀv)_yz, H = [-(Tᵀ[v×])_yz, 1] on φ, s, h: sway and heave are unknown constants, not zeros.
+
+    (Tᵀ(v + [v×]φ))_y = s, (...)_z = h. Where M7 compares lengths, which feel a misalignment only to second order and
+    so find half of it, the direction of travel feels all of it; how much of the sway is taken for misalignment and
+    how much for current is what their prior variances say, (σ_φ ‖v‖)² against σ_c².
+    """
+    h = np.zeros((len(seen.velocity_in_body), 2, 5))
+    h[:, :, :3] = -seen.body_from_measured[:, 1:]
+    h[:, 0, 3] = h[:, 1, 4] = 1.0
+    return seen.velocity_in_body[:, 1:], h
+
+
+def _f1_noise(seen: Observations) -> Array:
+    heave = seen.assumptions.motion_std**2
+    return np.diag([heave + UNSEEN_TURN_SWAY_STD**2, heave, 1.0])[None]
+
+
+# Sway and heave that a turn leaves beside what is in proportion to it, s: m/s per (rad/s of turn · m/s of speed).
+# On Snapir, vehicles skid by 1.8 s and leave a third of it unexplained.
+TURN_SWAY_STD_S, TURN_HEAVE_STD_S = 1.0, 0.5
+# A vehicle more than this far from upright does not hold depth by its pitch.
+UPRIGHT = 0.5
+
+
+def _a1(seen: Observations) -> Linearised:
+    """Sway of a current and of turns, heave of a pitch: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h.
+
+    (Tᵀ(v + [v×]φ))_y = (Rᵀc)_y + b ω_z u: a constant current c turns with the heading, a misalignment does not, so
+    flying several headings tells them apart; b is the skid in turns. On one heading c and φ about z are the same to
+    the data and their priors decide, as in F1.
+    (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of a vehicle that holds its depth with this pitch and roll, the
+    vertical axis R's third row being n: n·v_b = 0. d = -1 is one that moves where it points; data with changing
+    pitch tells. R = rotation_enu_from_body, u the measured speed ahead.
+    """
+    rotation, rates, v = seen.rotation_enu_from_body, seen.angular_velocity, seen.velocity_in_body
+    assert rotation is not None and rates is not None
+    up = rotation[:, 2]
+    upright = np.abs(up[:, 2]) > UPRIGHT
+    level_heave = np.where(upright, -(up[:, 0] * v[:, 0] + up[:, 1] * v[:, 1]) / np.where(upright, up[:, 2], 1.0), 0.0)
+    h = np.zeros((len(v), 2, 8))
+    h[:, :, :3] = -seen.body_from_measured[:, 1:]
+    h[:, 0, 3:5] = rotation[:, :2, 1]
+    h[:, 0, 5] = rates[:, 2] * v[:, 0]
+    h[:, 1, 6] = level_heave
+    h[:, 1, 7] = 1.0
+    z = v[:, 1:].copy()
+    z[:, 1] -= level_heave
+    return z, h
+
+
+def _a1_noise(seen: Observations) -> Array:
+    assert seen.angular_velocity is not None
+    turn = seen.angular_velocity[:, 2] * seen.velocity_in_body[:, 0]
+    noise = np.zeros((len(turn), 3, 3))
+    noise[:, 0, 0] = (TURN_SWAY_STD_S * turn) ** 2
+    noise[:, 1, 1] = (TURN_HEAVE_STD_S * turn) ** 2
+    noise += seen.assumptions.motion_std**2 * np.eye(3)
+    return noise
 
 
 _ONE_SCALE = (("delta_k", (0, 1, 2)),)
 _SCALE_X = (("delta_k_x", (0,)),)
+_SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)), ("delta_k_z", (2,)))
+_SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
 _SHOWN_WITH_GNSS = {
     "roll": "motion across the bow: turns, a box or a figure eight",
     "pitch": "motion ahead: a straight leg at 1 m/s or more",
@@ -198,7 +268,7 @@ def _aided(
     wrong_when: str,
 ) -> Model:
     linearise = partial(_gnss_aided, scale_axes, heave_is_zero)
-    return Model(name, True, 3, linearise, _SHOWN_WITH_GNSS, assumes, wrong_when, scale_axes)
+    return Model(name, Needs.REFERENCE, 3, linearise, _SHOWN_WITH_GNSS, assumes, wrong_when, scale_axes)
 
 
 _TABLE = (
@@ -223,19 +293,50 @@ _TABLE = (
         wrong_when=f"heaving in waves or diving; {_NOISY_REGRESSOR} σ²/‖v‖²; with the DVL's x far from the travel",
     ),
     Model(
-        "M5", False, 3, _m5, _SHOWN_WITHOUT, needs_prior=True,
+        "M5", Needs.NOTHING, 3, _m5, _SHOWN_WITHOUT, needs_prior=True,
         assumes="no GNSS; the vehicle moves ahead at the measured speed with known, constant sway and heave",
         wrong_when="a current or turns make sway; prior sway and heave from the DVL itself already hold the error",
     ),
     Model(
-        "M6", False, 3, _m6, _SHOWN_WITHOUT, needs_prior=True,
+        "M6", Needs.NOTHING, 3, _m6, _SHOWN_WITHOUT, needs_prior=True,
         assumes="as M5, compared in the body frame with the measured velocity as regressor",
         wrong_when="as M5",
     ),
     Model(
-        "M7", False, 1, _m7, _SHOWN_WITHOUT,
+        "M7", Needs.NOTHING, 1, _m7, _SHOWN_WITHOUT,
         assumes="no GNSS, nothing else known: all the speed is ahead",
         wrong_when="a current or turns make sway; by construction it finds half the angle, and its σ is too small",
+    ),
+    Model(
+        "G1", Needs.REFERENCE, 3, _g1, _SHOWN_WITH_GNSS,
+        assumes="GNSS velocity, heave near a constant (trim); scale error per axis, where the motion shows it",
+        wrong_when="trimmed by more than heave_offset_std, or heaving in long waves beyond motion_std",
+        scale_axes=_SCALE_PER_AXIS,
+        nuisance=(Nuisance("heave", "m/s", "heave_offset_std"),),
+        noise=_g1_noise,
+        in_correction_parameters=True,
+    ),
+    Model(
+        "F1", Needs.NOTHING, 2, _f1, _SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
+        assumes="no GNSS; sway and heave near unknown constants, as large as current_std and heave_offset_std say",
+        wrong_when="a current stronger than current_std; a run that is mostly turning",
+        nuisance=(Nuisance("sway", "m/s", "current_std"), Nuisance("heave", "m/s", "heave_offset_std")),
+        noise=_f1_noise,
+        motion_is_noise=True,
+    ),
+    Model(
+        "A1", Needs.ATTITUDE, 2, _a1, _SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
+        assumes="attitude, no GNSS; a constant current, skid in proportion to the turn rate, depth held or pitch flown",
+        wrong_when="on one heading (then it is F1: yaw and current are the same); a current that changes along the run",
+        nuisance=(
+            Nuisance("current_east", "m/s", "current_std"),
+            Nuisance("current_north", "m/s", "current_std"),
+            Nuisance("skid", "s", 3.0),
+            Nuisance("dive", "", 0.5),
+            Nuisance("heave", "m/s", "heave_offset_std"),
+        ),
+        noise=_a1_noise,
+        motion_is_noise=True,
     ),
 )  # fmt: skip
 

@@ -42,7 +42,7 @@ class Observability(NamedTuple):
 
 
 def observability(model: Model, covariance: Array, parameters: Parameters) -> tuple[Observability, ...]:
-    """One entry per state of the model, from its covariance (n, n).
+    """One entry per error of the DVL that the model estimates, from its covariance (n, n).
 
     What the data lacks is a motion of the vehicle, so the cause is looked for in the body frame: with a DVL mounted
     at 45 degrees, a straight leg leaves φx and φy uncertain together, and both for want of roll.
@@ -50,7 +50,7 @@ def observability(model: Model, covariance: Array, parameters: Parameters) -> tu
     prior_std = np.sqrt(np.diag(prior(model, parameters).p))
     in_body = body_angle_std(covariance, parameters)
     entries = []
-    for index, name in enumerate(model.state_names):
+    for index, name in enumerate(model.state_names[: model.n_errors]):
         std = math.sqrt(covariance[index, index])
         observed = bool(std <= OBSERVED_SHARE * prior_std[index])
         axis = "scale"
@@ -66,13 +66,25 @@ def body_angle_std(covariance: Array, parameters: Parameters) -> Array:
     return np.sqrt(np.diag(t.T @ covariance[:3, :3] @ t))
 
 
+def scale_std_ahead(model: Model, covariance: Array, parameters: Parameters) -> Array:
+    """Standard deviation of the scale-factor error of motion ahead: one number, or none if the model has no scale.
+
+    A velocity along n (body x in the DVL frame) is measured too long by nᵀ diag(δk) n.
+    """
+    if not model.scale_axes:
+        return np.zeros(0)
+    ahead = parameters.rotation_dvl_from_body[:, 0] ** 2 @ model.error_terms_from_state[3:]
+    return np.sqrt(np.array([ahead @ covariance @ ahead]))
+
+
 def convergence(model: Model, covariance: Array, parameters: Parameters) -> Convergence:
     """How far a model is. fine: an angle is observed, every observed angle and the scale are below their thresholds.
 
-    Angles are those about the body's axes, which are what a motion shows or does not show.
+    Angles are those about the body's axes, which are what a motion shows or does not show. The scale is that of motion
+    ahead: scales of other axes may never be seen.
     """
     angles = body_angle_std(covariance, parameters)
-    scales = np.sqrt(np.diag(covariance)[3:])
+    scales = scale_std_ahead(model, covariance, parameters)
     observed_angles = angles <= OBSERVED_SHARE * parameters.initial_std_misalignment
     observed_scales = scales <= OBSERVED_SHARE * parameters.initial_std_scale
     if not observed_angles.any() and not observed_scales.any():

@@ -18,6 +18,7 @@ import numpy as np
 
 from .frames import Array, rotation_from_rpy
 from .models import MODELS
+from .observations import ASSUMPTIONS
 from .samples import VelocityFrame
 
 AUTO = "auto"
@@ -208,6 +209,35 @@ class Parameters:
         "Standard deviation per axis of R of the GNSS-free models; stands in for a DVL covariance that is not given.",
         unit="m/s",
         low=1e-4,
+        high=10.0,
+    )
+    motion_std: float = _parameter(
+        ASSUMPTIONS.motion_std,
+        "Standard deviation of sway and heave about what is modelled, straight ahead: noise of A1 and F1, heave of G1.",
+        unit="m/s",
+        low=1e-4,
+        high=10.0,
+    )
+    motion_correlation_time: float = _parameter(
+        ASSUMPTIONS.motion_correlation_time,
+        "How long sway and heave stay alike: samples closer together share their news (G1, A1, F1). 0: not at all.",
+        unit="s",
+        low=0.0,
+        high=600.0,
+    )
+    heave_offset_std: float = _parameter(
+        ASSUMPTIONS.heave_offset_std,
+        "Prior standard deviation of a constant heave, such as of trim (G1, A1, F1).",
+        unit="m/s",
+        low=1e-6,
+        high=10.0,
+    )
+    current_std: float = _parameter(
+        ASSUMPTIONS.current_std,
+        "Prior standard deviation of the current per axis (A1, F1). On one heading it decides how much of the sway is "
+        "taken for misalignment: half at speed · initial_std_misalignment.",
+        unit="m/s",
+        low=1e-6,
         high=10.0,
     )
     prior_source: str = _parameter(

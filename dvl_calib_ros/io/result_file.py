@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from .. import __version__
-from ..calibration.bank import GaussianState
+from ..calibration.kalman import GaussianState
 from ..calibration.frames import quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate, Result

@@ -48,13 +48,18 @@ def _faults(dvl_silent_s: float | None, running_s: float) -> list[str]:
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:
     values = {}
-    for name, value, entry in zip(estimate.state_names, estimate.state, estimate.observability, strict=True):
+    model, std = MODELS[estimate.model], estimate.std
+    for value, entry in zip(estimate.state, estimate.observability, strict=False):
+        name = entry.name
         factor, unit = (math.degrees(1.0), "deg") if name.startswith("phi") else (100.0, "%")
         values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
         values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
         values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"
+    for index, nuisance in enumerate(model.nuisance, start=model.n_errors):
+        values[f"{nuisance.name} [{nuisance.unit}]"] = f"{estimate.state[index]:.4f}"
+        values[f"std {nuisance.name} [{nuisance.unit}]"] = f"{std[index]:.4f}"
     low, high = estimate.nis_bounds
-    rows = MODELS[estimate.model].n_measurement
+    rows = model.n_measurement
     values["mean NIS"] = f"{estimate.mean_nis:.3f} of {rows} (99 %: {low:.3f} .. {high:.3f})"
     return values
 

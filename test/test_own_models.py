@@ -1,0 +1,184 @@
+"""The models beyond the paper: what they promise that M1-M7 do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from runs import MatchedRun, calibrate, make_samples, only
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.correction_parameters import correction_from_errors, errors_from_correction
+from dvl_calib_ros.calibration.error_model import correct
+from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy, skew
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
+from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl
+
+SECOND = 1_000_000_000
+errors_at_5_degrees = st.lists(st.floats(-0.09, 0.09), min_size=6, max_size=6).map(np.array)
+
+
+# ---------------------------------------------------------------- correction parameters
+
+
+@given(errors_at_5_degrees)
+def test_correction_parameters_and_errors_are_each_others_inverse(errors):
+    correction = correction_from_errors(errors)
+    np.testing.assert_allclose(errors_from_correction(correction).errors, errors, atol=1e-14)
+
+
+@given(errors_at_5_degrees)
+def test_the_inverse_of_the_correction_is_the_error_model_but_for_its_symmetric_part(correction):
+    errors = errors_from_correction(correction).errors
+    inverse = np.linalg.inv(np.eye(3) - skew(correction[:3]) - np.diag(correction[3:]))
+    model = np.diag(1 + errors[3:]) @ (np.eye(3) + skew(errors[:3]))
+    rest = inverse / (1 + errors[3:, None]) - model / (1 + errors[3:, None])
+    np.testing.assert_allclose(np.diag(rest), 0.0, atol=1e-14)
+    np.testing.assert_allclose(rest, rest.T, atol=1e-14)
+
+
+@given(errors_at_5_degrees)
+def test_the_covariance_is_carried_over_by_the_derivative_of_the_map(correction):
+    jacobian = errors_from_correction(correction).jacobian
+    for column in range(6):
+        step = 1e-6 * np.eye(6)[column]
+        plus, minus = errors_from_correction(correction + step), errors_from_correction(correction - step)
+        np.testing.assert_allclose(jacobian[:, column], (plus.errors - minus.errors) / 2e-6, atol=1e-8)
+
+
+# ---------------------------------------------------------------- G1: with GNSS
+
+
+def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_g1():
+    """Straight ahead at 1.5 m/s with 0.2 m/s of noise: M1 is pulled by -3 σ²/‖v‖² = -5.3 %, G1 is not."""
+    parameters = Parameters(initial_std_scale=0.5, gnss_aided_std=0.2)
+    found = []
+    for seed in range(10):
+        run = MatchedRun("straight", 600.0, gnss_std=0.2, dvl_std=0.01, seed=seed)
+        calibrator = calibrate(make_samples(run), parameters, block_size=512)
+        found.append([calibrator.estimate(name).scale[0] for name in ("M1", "G1")])
+    pulled, free = np.mean(found, axis=0)
+    assert pulled == pytest.approx(-3 * 0.04 / 1.5**2, rel=0.15)
+    assert abs(free) < 0.002
+
+
+def test_g1_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows():
+    samples = make_samples(MatchedRun("box", 600.0))
+    scale = np.array([0.005, -0.01, 0.0])
+    samples = [
+        s._replace(velocity=tuple((np.array(s.velocity) * (1 + scale)).tolist())) if isinstance(s, DvlSample) else s
+        for s in samples
+    ]
+    calibrator = calibrate(samples, Parameters(gnss_aided_std=0.001, initial_std_scale=0.02), block_size=512)
+    np.testing.assert_allclose(calibrator.estimate("G1").scale[:2], scale[:2], atol=2e-4)
+
+
+@pytest.mark.parametrize("degrees", [(5.0, -0.5, 2.5), (-1.0, -2.5, -3.0)])
+def test_g1_is_exact_to_second_order_where_m3_is_not(degrees, rng):
+    """The linear filter of G1 works on the correction itself, so 5 degrees leave no curvature in it."""
+    velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.4, 400), np.zeros(400)])
+    errors = DvlErrors(misalignment_rpy=tuple(np.deg2rad(degrees)), scale=(0.005,) * 3)
+    measured = measure_dvl(velocity, errors, np.eye(3), rng)
+    calibrator = Calibrator(Parameters(initial_std_misalignment=0.5, initial_std_scale=0.5, gnss_aided_std=0.001))
+    for i, (v, g) in enumerate(zip(measured, velocity, strict=True)):
+        calibrator.feed_reference(ReferenceSample(i * SECOND, tuple(g)))
+        calibrator.feed_dvl(DvlSample(i * SECOND, tuple(v)))
+    estimate = calibrator.estimate("G1")
+    misalignment, scale = equivalent_error_terms(errors)
+    np.testing.assert_allclose(estimate.misalignment, misalignment, atol=2.5e-3)
+    np.testing.assert_allclose(estimate.scale[:2], scale[:2], atol=5e-4)
+    residual = np.linalg.norm(estimate.corrected_velocity(measured, np.eye(3)) - velocity, axis=1)
+    assert residual.max() < 0.006  # the symmetric part of the rotation, which φ and δk cannot hold
+
+
+def test_g1_takes_a_saved_state_and_gives_it_back(rng):
+    samples = make_samples(MatchedRun("box", 120.0, phi=(0.05, -0.08, 0.06), scale=0.01, gnss_std=0.05, dvl_std=0.01))
+    state = calibrate(samples).state("G1")
+    again = Calibrator(Parameters(), initial={"G1": state}).state("G1")
+    np.testing.assert_allclose(again.x, state.x, atol=1e-14)
+    np.testing.assert_allclose(again.p, state.p, atol=1e-14)
+
+
+# ---------------------------------------------------------------- A1, F1: without GNSS
+
+
+def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, seconds_each=100):
+    """DVL and IMU samples at 1 Hz of legs at 1.5 m/s through the water, level, pitched by `trim`."""
+    samples = []
+    for i in range(seconds_each * len(headings_deg)):
+        heading = np.deg2rad(headings_deg[i // seconds_each])
+        rotation = rotation_from_rpy((0.0, -trim, heading))
+        through_water = np.array([np.cos(heading), np.sin(heading), 0.0]) * 1.5
+        velocity_body = rotation.T @ (through_water + [*current_enu, 0.0])
+        velocity_body = velocity_body + rng.normal(0, 0.01, 3)
+        measured = velocity_body + np.cross(misalignment, velocity_body)
+        samples.append(ImuSample(i * SECOND, quaternion_from_rotation(rotation), (0.0, 0.0, 0.0)))
+        samples.append(DvlSample(i * SECOND, tuple(measured.tolist())))
+    return samples
+
+
+def test_two_headings_tell_yaw_from_a_current(rng):
+    samples = run_without_gnss((20.0, 200.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
+    calibrator = calibrate(samples, Parameters(current_std=0.3), block_size=512)
+    estimate = calibrator.estimate("A1")
+    assert estimate.misalignment[2] == pytest.approx(0.04, abs=0.004)
+    across = dict(zip(estimate.state_names, estimate.state, strict=True))
+    heading = np.deg2rad(20.0)
+    found = -np.sin(heading) * across["current_east"] + np.cos(heading) * across["current_north"]
+    assert found == pytest.approx(-np.sin(heading) * 0.2 - np.cos(heading) * 0.1, abs=0.01)
+    assert estimate.observability[2].observed
+    assert abs(calibrator.estimate("M7").misalignment[2] - 0.04) > 0.01
+
+
+def test_one_heading_does_not_and_a1_says_so_and_falls_back_to_what_f1_says(rng):
+    samples = run_without_gnss((20.0,), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
+    calibrator = calibrate(samples, block_size=512)
+    a1, f1 = calibrator.estimate("A1"), calibrator.estimate("F1")
+    yaw = a1.observability[2]
+    assert not yaw.observed
+    assert yaw.axis == "yaw"
+    assert "heading" in yaw.missing
+    assert a1.misalignment[2] == pytest.approx(f1.misalignment[2], abs=0.004)
+    assert abs(a1.misalignment[2] - 0.04) < abs(calibrator.estimate("M7").misalignment[2] - 0.04)
+
+
+def test_holding_depth_shows_pitch_however_the_vehicle_is_trimmed(rng):
+    samples = run_without_gnss((20.0, 200.0), (0.0, 0.0), (0.0, 0.03, 0.0), rng, trim=np.deg2rad(-3.0))
+    estimates = calibrate(samples, block_size=512).result().estimates
+    assert estimates["A1"].misalignment[1] == pytest.approx(0.03, abs=0.012)
+    assert abs(estimates["M7"].misalignment[1] - 0.03) > 0.015
+
+
+def test_without_attitude_a1_learns_nothing_and_the_others_are_not_kept_waiting():
+    calibrator = calibrate(only(make_samples(MatchedRun()), DvlSample))
+    assert calibrator.estimate("A1").used == 0
+    assert calibrator.estimate("F1").used == len(only(make_samples(MatchedRun()), DvlSample))
+    assert calibrator.counts["pairing"]["not_oriented"] > 0
+
+
+def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
+    samples = run_without_gnss((20.0,), (0.0, 0.0), (0.0, 0.03, -0.04), rng, seconds_each=400)
+    calibrator = calibrate(samples, Parameters(current_std=0.05), block_size=512)
+    truth = np.array([0.0, 0.03, -0.04])
+    errors = {name: np.abs(calibrator.estimate(name).misalignment - truth)[1:] for name in ("M7", "F1")}
+    assert (errors["F1"] < 0.8 * errors["M7"]).all()
+
+
+@pytest.mark.parametrize("name", ["A1", "F1"])
+def test_a_faster_dvl_does_not_make_the_models_of_motion_surer(name):
+    run = MatchedRun("box", 300.0, dvl_std=0.01)
+    slow, fast = (
+        calibrate(make_samples(replace(run, dvl_every=every)), block_size=512).estimate(name) for every in (100, 10)
+    )
+    np.testing.assert_allclose(fast.std[:3], slow.std[:3], rtol=0.2)
+
+
+def test_corrected_velocities_use_the_errors_not_the_nuisance():
+    estimate = calibrate(make_samples(MatchedRun("box", 60.0, phi=(0.0, 0.0, 0.02)))).estimate("A1")
+    velocity = np.array([[1.5, 0.1, 0.0]])
+    expected = correct(velocity, estimate.state[:3], np.zeros(3), np.eye(3))
+    np.testing.assert_array_equal(estimate.corrected_velocity(velocity, np.eye(3)), expected)
