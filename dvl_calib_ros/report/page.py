@@ -21,17 +21,21 @@ from .style import MODEL_STYLES
 
 @dataclass(frozen=True)
 class Cell:
-    """Text of a table. kind: a class of the style sheet, such as good, off, far, bad."""
+    """Text of a table. kind: a class of the style sheet, such as good, off, far, bad.
+
+    below: small, on a second line.
+    """
 
     text: str
     kind: str = ""
+    below: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
     """head: names of the columns. rows: cells, each a text or a `Cell`; the first column names the row.
 
-    marked: index of the row that stands out. notes: below the table.
+    marked: index of the row that stands out. notes: below the table. dense: of many columns.
     """
 
     head: Sequence[str | Cell]
@@ -39,11 +43,25 @@ class Table:
     title: str = ""
     marked: int | None = None
     notes: Sequence[str] = ()
+    dense: bool = False
 
 
 def signed(value: float, digits: int = 2) -> str:
     """A number with its sign, the minus as wide as the plus."""
     return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def parameter_texts(parameters: Mapping[str, Any]) -> dict[str, str]:
+    """Parameters as they are shown, by name."""
+    return {name: _plain(value) for name, value in parameters.items()}
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return " ".join(_plain(each) for each in value)
+    return str(value) if value != "" else "''"
 
 
 @cache

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
+from .series import running_mean, thin
 from .style import (
     FAINT,
     INK,
@@ -16,15 +17,12 @@ from .style import (
     REFERENCE_COLOUR,
     UNCALIBRATED_COLOUR,
     legend_above,
+    line_widths,
     new_figure,
     plain_log_ticks,
 )
 from .time_axis import TimeAxis
 
-# Points of a line: more cannot be seen at this width
-LINE_POINTS = 300
-# Points over which a residual is averaged
-AVERAGED_POINTS = 31
 GOOD, WARNING, BAD = "#2a7f62", "#e0a030", "#c0392b"
 
 
@@ -39,9 +37,9 @@ class Line(NamedTuple):
 def estimate_over_time(time: TimeAxis, stamps_ns: Array, lines: Sequence[Line], selected: str, label: str) -> Figure:
     """One error term with the ±1σ sleeves of several models; the selected one stands out."""
     figure, axes = new_figure()
-    kept = _thin(len(stamps_ns))
+    kept = thin(len(stamps_ns))
     t = time(stamps_ns)[kept]
-    for line, width in zip(lines, _widths([line.model for line in lines], selected), strict=True):
+    for line, width in zip(lines, line_widths([line.model for line in lines], selected), strict=True):
         colour, dashes = MODEL_STYLES[line.model]
         value, std = line.value[kept], line.std[kept]
         strong = line.model == selected
@@ -51,14 +49,6 @@ def estimate_over_time(time: TimeAxis, stamps_ns: Array, lines: Sequence[Line], 
     axes.set_ylabel(label)
     time.dress(axes)
     return figure
-
-
-def _widths(models: Sequence[str], selected: str) -> list[float]:
-    """Line widths: the selected model's is the widest, the others get thinner and lie on top.
-
-    So models that agree stay visible, the narrow ones upon the wide ones.
-    """
-    return [4.0 if name == selected else 2.2 - 1.2 * i / len(models) for i, name in enumerate(models)]
 
 
 def _settled_range(lines: Sequence[Line]) -> tuple[float, float]:
@@ -75,19 +65,19 @@ def velocity_over_time(
 ) -> Figure:
     """One body axis of the velocity: DVL before (N,) and after correction (N,), and the reference (M,), m/s."""
     figure, axes = new_figure()
-    kept = _thin(len(reference_ns))
+    kept = thin(len(reference_ns))
     if len(reference_ns):
         axes.plot(
             time(reference_ns)[kept], reference[kept], ".", markersize=2.0, color=REFERENCE_COLOUR, label="GNSS",
             rasterized=True,
         )  # fmt: skip
-    kept = _thin(len(dvl_ns))
+    kept = thin(len(dvl_ns))
     t = time(dvl_ns)[kept]
     axes.plot(t, before[kept], color=BAD, linewidth=1.0, label="DVL as measured")
     axes.plot(t, after[kept], color="#1f6fb2", linewidth=1.0, label="DVL corrected")
     axes.set_ylabel(label)
     time.dress(axes)
-    legend_above(axes)
+    legend_above(axes, markerscale=3.0)
     return figure
 
 
@@ -98,7 +88,7 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
     for residual, colour, name in ((before, BAD, "before"), (after, "#1f6fb2", "after")):
         rms = float(np.sqrt(np.mean(residual**2)))
         axes.plot(t, residual, ".", markersize=2.0, alpha=0.35, color=colour, rasterized=True)
-        axes.plot(*_running_mean(t, residual), color=colour, label=f"{name}: RMS {rms:.3f} m/s")
+        axes.plot(*running_mean(t, residual), color=colour, label=f"{name}: RMS {rms:.3f} m/s")
     axes.axhline(0.0, color=INK, linewidth=0.7)
     spread = 1.2 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.995))
     axes.set_ylim(-spread or -0.01, spread or 0.01)
@@ -106,16 +96,6 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
     time.dress(axes)
     legend_above(axes)
     return figure
-
-
-def _running_mean(t: Array, values: Array) -> tuple[Array, Array]:
-    """Positions and mean of AVERAGED_POINTS neighbours; of fewer where there are not so many, nan across a gap."""
-    width = min(AVERAGED_POINTS, len(values))
-    window = np.ones(width) / width
-    mean = np.convolve(values, window, "valid")
-    duration = t[width - 1 :] - t[: len(t) - width + 1]
-    mean[duration > 2.0 * np.median(duration)] = np.nan
-    return np.convolve(t, window, "valid"), mean
 
 
 def selection_over_time(
@@ -151,12 +131,12 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
     """Mean normalised innovation squared per measurement row (N,) of several models; 1 is what they expect."""
     figure, axes = new_figure()
     t = time(stamps_ns)
-    for (name, values), width in zip(nis.items(), _widths(list(nis), selected), strict=True):
+    for (name, values), width in zip(nis.items(), line_widths(list(nis), selected), strict=True):
         used = np.isfinite(values) & (values > 0.0)
         if not used.any():
             continue
         colour, dashes = MODEL_STYLES[name]
-        where, mean = _running_mean(t[used], np.log10(values[used]))
+        where, mean = running_mean(t[used], np.log10(values[used]))
         axes.plot(where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
     axes.axhline(1.0, color=INK, linewidth=0.8)
     axes.set_yscale("log")
@@ -199,9 +179,3 @@ def held_out_bars(labels: Sequence[str], errors: Mapping[str, Sequence[float | N
     axes.grid(False, axis="y")
     legend_above(axes)
     return figure
-
-
-def _thin(n: int) -> slice:
-    """Every so many-th of n points, and so that the last one is among them."""
-    step = max(1, -(-n // LINE_POINTS))
-    return slice((n - 1) % step if n else 0, None, step)

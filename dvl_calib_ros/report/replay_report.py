@@ -19,7 +19,7 @@ from ..io.recorder import ModelHistory, RunHistory
 from ..io.replay import Replayed
 from ..io.result_file import result_document
 from . import replay_figures as figures
-from .page import Cell, Table, signed, write_page
+from .page import Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture
 from .time_axis import TimeAxis
 from .verdict import NOT_VERIFIED, Verdict
@@ -87,7 +87,7 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str], ve
         "velocity_note": _velocity_note(result, history),
         "streams": _stream_table(result),
         "data_pictures": _data_pictures(result, history, time, shown),
-        "parameters": {name: _plain(value) for name, value in result.parameters.items()},
+        "parameters": parameter_texts(result.parameters),
     }
 
 
@@ -354,11 +354,3 @@ def _fates(result: Result, shown: Sequence[str]) -> dict[str, list[int]]:
         fates["not given"].append(max(0, dvl["usable"] - estimate.used - estimate.gated))
         fates["slow or turning"].append(dvl["slow"] + dvl["turning"] + dvl["no_turn_rate"])
     return fates
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, list):
-        return " ".join(_plain(each) for each in value)
-    return str(value) if value != "" else "''"

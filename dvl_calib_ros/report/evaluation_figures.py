@@ -1,0 +1,171 @@
+"""The figures of an evaluation: functions from plain arrays to a matplotlib Figure, units on every axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..calibration.frames import Array
+from .series import running_mean
+from .style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
+from .style import plain_log_ticks as log_ticks
+
+# Seconds beyond the longest window at which "all" of a run stands
+ALL_STANDS_S = 40.0
+CLAIMED = ((0.68, (0.60, 0.76)), (0.95, (0.91, 0.98)))
+
+
+def improvement_bars(models: Sequence[str], sets: Sequence[str], improvement: Array, published: Array) -> Figure:
+    """How much of the uncalibrated error each model takes away.
+
+    improvement, published: (S, M) share of Avg.VRMSE that is gone, nan where there is none. Bars are the mean over the
+    sets, points the sets, rings the published figures.
+    """
+    figure, axes = new_figure(height=1.2 + 0.3 * len(models))
+    rows = np.arange(len(models))
+    mean = 100.0 * improvement.mean(axis=0)
+    axes.barh(rows, mean, color=[MODEL_STYLES[name].color for name in models], height=0.62, alpha=0.85)
+    for at, values in zip(rows, 100.0 * improvement.T, strict=True):
+        axes.plot(values, np.full(len(values), at), ".", color=INK, markersize=3.5, label="a set" if at == 0 else None)
+    if np.isfinite(published).any():
+        for at, values in zip(rows, 100.0 * published.T, strict=True):
+            axes.plot(
+                values, np.full(len(values), at + 0.18), "o", color=INK, markersize=3.5, markerfacecolor="none",
+                markeredgewidth=0.8, label="a set, published" if at == 0 else None,
+            )  # fmt: skip
+    axes.axvline(0.0, color=INK, linewidth=0.8)
+    axes.set_yticks(rows, models)
+    axes.invert_yaxis()
+    axes.set_xlabel("Avg.VRMSE taken away from the uncalibrated, %")
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def error_over_calibration_time(
+    models: Sequence[str],
+    windows_s: Sequence[float | None],
+    uncalibrated: float,
+    errors: Array,
+    published_window_s: float | None,
+    published: Array,
+) -> Figure:
+    """Avg.VRMSE (W, M) m/s of models calibrated on the first windows_s (None: all) of a run.
+
+    uncalibrated: m/s. published: (M,) m/s at published_window_s, nan where there is none.
+    """
+    figure, axes = new_figure(height=3.2)
+    finite = [window for window in windows_s if window is not None]
+    all_at = (max(finite) if finite else 0.0) + ALL_STANDS_S
+    at = np.array([all_at if window is None else window for window in windows_s])
+    order = np.argsort(at)
+    axes.axhline(uncalibrated, color=UNCALIBRATED_COLOUR, linewidth=1.0, linestyle=":")
+    axes.annotate(
+        "uncalibrated", (at.min(), uncalibrated), xytext=(0, 2), textcoords="offset points", fontsize=7.5,
+        color=UNCALIBRATED_COLOUR,
+    )  # fmt: skip
+    published_at = all_at if published_window_s is None else published_window_s
+    for name, values, then, width in zip(models, errors.T, published, line_widths(models), strict=True):
+        colour, dashes = MODEL_STYLES[name]
+        axes.plot(at[order], values[order], color=colour, linestyle=dashes, linewidth=width, marker=".", markersize=4.0)
+        axes.plot(
+            [published_at], [then], "o", color=colour, markersize=7.0, markerfacecolor="none", markeredgewidth=1.4
+        )
+    axes.set_yscale("log")
+    log_ticks(axes.yaxis)
+    ticks = [window for window in finite if window % 50.0 == 0.0]
+    axes.set_xticks([*ticks, all_at], [*(f"{tick:g}" for tick in ticks), "all"])
+    axes.set_xlabel("calibration time, s")
+    axes.set_ylabel("Avg.VRMSE, m/s")
+    return figure
+
+
+def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float]]) -> Figure:
+    """Share of the errors inside the intervals that σ claims; claimed share -> one share per model, all in 0..1."""
+    figure, axes = new_figure(height=1.1 + 0.28 * len(models))
+    rows = np.arange(len(models))
+    for (claimed, shares), marker, colour in zip(within.items(), "os", ("#1f6fb2", "#e76300"), strict=True):
+        low, high = dict(CLAIMED)[claimed]
+        axes.axvspan(100.0 * low, 100.0 * high, color=colour, alpha=0.12, linewidth=0)
+        axes.axvline(100.0 * claimed, color=colour, linewidth=0.8)
+        axes.plot(
+            100.0 * np.asarray(shares), rows, marker, color=colour, markersize=5.0, linestyle="none",
+            label=f"inside the {100 * claimed:.0f} % interval",
+        )  # fmt: skip
+    axes.set_yticks(rows, models)
+    axes.set_xlim(0.0, 102.0)
+    axes.set_ylim(len(models) - 0.5, -0.5)
+    axes.set_xlabel("errors inside, %")
+    legend_above(axes)
+    return figure
+
+
+def errors_in_variables(
+    models: Sequence[str], gnss_std: Array, predicted: Array, measured: Array, standard_error: Array
+) -> Figure:
+    """Pull of the scale (G, V), dimensionless, predicted (lines) and measured (points, ±2 standard errors)."""
+    figure, axes = new_figure(height=3.2)
+    order = np.argsort(gnss_std)
+    for i, (name, width) in enumerate(zip(models, line_widths(models), strict=True)):
+        colour, dashes = MODEL_STYLES[name]
+        axes.plot(gnss_std[order], 100.0 * predicted[i][order], color=colour, linestyle=dashes, linewidth=1.5 * width)
+        axes.errorbar(
+            gnss_std, 100.0 * measured[i], yerr=200.0 * standard_error[i], fmt="o", color=colour,
+            markersize=2.5 * width, elinewidth=1.0, capsize=2.0,
+        )  # fmt: skip
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    axes.set_xlabel("GNSS noise σ per axis, m/s")
+    axes.set_ylabel("pull of the scale, %")
+    return figure
+
+
+def error_by_run(runs: Sequence[str], models: Sequence[str], uncalibrated: Array, errors: Array) -> Figure:
+    """Avg.VRMSE m/s of every model (L, M), calibrated on each of L runs; uncalibrated: (L,)."""
+    figure, axes = new_figure(height=1.1 + 0.26 * len(runs))
+    rows = np.arange(len(runs))
+    axes.plot(uncalibrated, rows, "|", color=UNCALIBRATED_COLOUR, markersize=9.0, markeredgewidth=1.6)
+    for name, values in zip(models, errors.T, strict=True):
+        colour, dashes = MODEL_STYLES[name]
+        filled = colour if dashes == "-" else "white"
+        axes.plot(values, rows, "o", color=colour, markersize=4.5, markerfacecolor=filled, markeredgewidth=1.3)
+    axes.set_yticks(rows, runs)
+    axes.set_ylim(len(runs) - 0.5, -0.5)
+    axes.set_xscale("log")
+    log_ticks(axes.xaxis)
+    axes.set_xlabel("Avg.VRMSE on all other runs, m/s")
+    return figure
+
+
+def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected: Array, label: str) -> Figure:
+    """One body axis (N,) m/s of an evaluated trajectory: truth, and the DVL before and after correction."""
+    figure, axes = new_figure()
+    axes.plot(time_s, uncorrected, color="#c0392b", linewidth=0.9, label="DVL as measured")
+    axes.plot(time_s, corrected, color="#1f6fb2", linewidth=0.9, label="DVL corrected")
+    axes.plot(time_s, truth, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), label="truth")
+    axes.set_xlabel("time, s")
+    axes.set_ylabel(label)
+    axes.margins(x=0.01)
+    legend_above(axes)
+    return figure
+
+
+def error_of_trace(time_s: Array, uncorrected: Array, corrected: Mapping[str, Array]) -> Figure:
+    """Running RMS of the velocity error before correction, and after it with several models, from (N,) lengths m/s."""
+    figure, axes = new_figure(height=3.2)
+    axes.plot(*_running_rms(time_s, uncorrected), color=UNCALIBRATED_COLOUR, linestyle=":", linewidth=1.4)
+    for (name, error), width in zip(corrected.items(), line_widths(list(corrected)), strict=True):
+        colour, dashes = MODEL_STYLES[name]
+        axes.plot(*_running_rms(time_s, error), color=colour, linestyle=dashes, linewidth=width)
+    axes.set_yscale("log")
+    log_ticks(axes.yaxis)
+    axes.set_xlabel("time, s")
+    axes.set_ylabel("velocity error, m/s rms")
+    axes.margins(x=0.01)
+    return figure
+
+
+def _running_rms(time_s: Array, error: Array) -> tuple[Array, Array]:
+    at, mean_square = running_mean(time_s, error**2)
+    return at, np.sqrt(mean_square)
