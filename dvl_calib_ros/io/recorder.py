@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import Array
-from ..calibration.models import MODELS, Observations
+from ..calibration.models import MODELS
+from ..calibration.observations import Observations
 
 Stamps = NDArray[np.int64]
 T = TypeVar("T")
@@ -116,6 +117,8 @@ class Recorder:
 
     def observe(self, stamps_ns: Sequence[int], seen: Observations) -> None:
         """Take note of the velocities of a block."""
+        if seen.reference_body is None and seen.rotation_enu_from_body is not None:
+            return  # the same samples once more, now with attitude
         series = self._dvl if seen.reference_body is None else self._paired
         for i, stamp_ns in enumerate(stamps_ns):
             if series.wants_next():
