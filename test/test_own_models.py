@@ -78,8 +78,8 @@ def test_g1_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows():
 
 
 @pytest.mark.parametrize("degrees", [(5.0, -0.5, 2.5), (-1.0, -2.5, -3.0)])
-def test_g1_is_exact_to_second_order_where_m3_is_not(degrees, rng):
-    """The linear filter of G1 works on the correction itself, so 5 degrees leave no curvature in it."""
+def test_g1_finds_5_degrees_but_for_what_the_error_model_cannot_hold(degrees, rng):
+    """At up to 2 m/s; M3 is exact in this noiseless case, too, G1 is so with a noisy reference as well."""
     velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.4, 400), np.zeros(400)])
     errors = DvlErrors(misalignment_rpy=tuple(np.deg2rad(degrees)), scale=(0.005,) * 3)
     measured = measure_dvl(velocity, errors, np.eye(3), rng)
@@ -92,7 +92,7 @@ def test_g1_is_exact_to_second_order_where_m3_is_not(degrees, rng):
     np.testing.assert_allclose(estimate.misalignment, misalignment, atol=2.5e-3)
     np.testing.assert_allclose(estimate.scale[:2], scale[:2], atol=5e-4)
     residual = np.linalg.norm(estimate.corrected_velocity(measured, np.eye(3)) - velocity, axis=1)
-    assert residual.max() < 0.006  # the symmetric part of the rotation, which φ and δk cannot hold
+    assert residual.max() < 0.01  # the symmetric part of a rotation, which neither ψ and κ nor φ and δk hold
 
 
 def test_g1_takes_a_saved_state_and_gives_it_back(rng):
@@ -112,8 +112,8 @@ def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, sec
     for i in range(seconds_each * len(headings_deg)):
         heading = np.deg2rad(headings_deg[i // seconds_each])
         rotation = rotation_from_rpy((0.0, -trim, heading))
-        through_water = np.array([np.cos(heading), np.sin(heading), 0.0]) * 1.5
-        velocity_body = rotation.T @ (through_water + [*current_enu, 0.0])
+        east, north = 1.5 * np.cos(heading) + current_enu[0], 1.5 * np.sin(heading) + current_enu[1]
+        velocity_body = rotation.T @ np.array([east, north, 0.0])
         velocity_body = velocity_body + rng.normal(0, 0.01, 3)
         measured = velocity_body + np.cross(misalignment, velocity_body)
         samples.append(ImuSample(i * SECOND, quaternion_from_rotation(rotation), (0.0, 0.0, 0.0)))

@@ -59,9 +59,10 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
         assert dvl["received"] == dvl["accepted"] == written["dvl/twist"] == len(trajectories[name][0])
         assert reference["received"] == written["gnss/twist"]
         assert result.counts["pairing"]["paired"] == dvl["usable"] + dvl["slow"]
-        assert result.counts["pairing"]["not_oriented"] == dvl["usable"]  # no attitude in the bag
-        for name, estimate in result.estimates.items():
-            given = 0 if MODELS[name].needs is Needs.ATTITUDE else dvl["usable"]
+        pairing = result.counts["pairing"]  # no attitude in the bag
+        assert pairing["not_oriented"] + pairing["awaiting_attitude"] == dvl["usable"]
+        for model, estimate in result.estimates.items():
+            given = 0 if MODELS[model].needs is Needs.ATTITUDE else dvl["usable"]
             assert estimate.used + estimate.gated == given
 
 

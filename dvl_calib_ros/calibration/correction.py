@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from .kalman import GaussianState
 from .error_model import correction_jacobian, correction_matrix
 from .frames import Array
+from .kalman import GaussianState
 from .models import Model
 
 _SCALE_FIRST = [3, 4, 5, 0, 1, 2]

@@ -148,11 +148,11 @@ def _g1(seen: Observations) -> Linearised:
         T v_b = (I - [ψ×] - diag(κ)) v,
 
     with the DVL's v, twenty times less noisy, in H; what pull is left is σ_dvl²/‖v‖². It is exactly linear in ψ and
-    κ; `error_state` turns them into φ and δk, exactly as well.
+    κ; `correction_parameters` turns them into φ and δk.
 
     r' = g - k g_z is the GNSS velocity as known after the heave assumption 0 = g_z - h + noise, weighed with its own
-    variance against the receiver's. The heave h, constant (trim), is a state. In the row of heave κ acts on level motion
-    only: what is assumed to be near zero must not be read as a scale that makes it so.
+    variance against the receiver's. The heave h, constant (trim), is a state. In the row of heave κ acts on level
+    motion only: what is assumed to be near zero must not be read as a scale that makes it so.
     """
     assert seen.reference_body is not None
     r = seen.reference_body - seen.heave_gain * seen.reference_body[:, 2:]
