@@ -17,8 +17,8 @@ from ..calibration.observations import Observations
 Stamps = NDArray[np.int64]
 T = TypeVar("T")
 
-# Rows kept of each series: at most this many, at least half of it (from longer runs). A figure has fewer pixels.
-KEPT_ROWS = 800
+# Rows kept of each series at most: a figure shows no more. States are dear, they make the models work in small blocks.
+KEPT_STATES, KEPT_VELOCITIES = 300, 800
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,16 @@ class RunHistory:
 
 
 class Thinned(Generic[T]):
-    """Keeps evenly spread rows of an endless series: every stride-th, the stride doubles when there are too many."""
+    """Keeps evenly spread rows of an endless series: every stride-th, the stride doubles when there are too many.
 
-    def __init__(self, limit: int = KEPT_ROWS) -> None:
+    limit: rows kept at most. expected: length of the series as far as it is known; with a good guess fewer rows are
+    wanted in vain.
+    """
+
+    def __init__(self, limit: int, expected: int = 0) -> None:
         self.rows: list[T] = []
         self._limit = limit
-        self._stride = 1
+        self._stride = max(1, -(-expected // limit))
         self._seen = 0
 
     def wants_next(self) -> bool:
@@ -108,12 +112,14 @@ class Recorder:
 
     def __init__(self) -> None:
         self._restarts = 0
-        self._forget()
+        self.expect(0)
 
-    def _forget(self) -> None:
-        self._moments: Thinned[_Moment] = Thinned()
-        self._dvl: Thinned[_Velocities] = Thinned()
-        self._paired: Thinned[_Velocities] = Thinned()
+    def expect(self, n_samples: int) -> None:
+        """Start anew, to be told of about this many DVL samples."""
+        self._expected = n_samples
+        self._moments: Thinned[_Moment] = Thinned(KEPT_STATES, n_samples)
+        self._dvl: Thinned[_Velocities] = Thinned(KEPT_VELOCITIES, n_samples)
+        self._paired: Thinned[_Velocities] = Thinned(KEPT_VELOCITIES, n_samples)
 
     def observe(self, stamps_ns: Sequence[int], seen: Observations) -> None:
         """Take note of the velocities of a block."""
@@ -129,7 +135,7 @@ class Recorder:
         """Take note of the models' states."""
         if calibrator.restarts != self._restarts:  # the calibration has started anew, so does its history
             self._restarts = calibrator.restarts
-            self._forget()
+            self.expect(self._expected)
         if self._moments.wants_next():
             self._moments.keep(_moment(calibrator))
 

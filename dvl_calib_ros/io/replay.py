@@ -94,6 +94,8 @@ def replay(
         present = bag.topics
         chosen = topics.found_in(present)
         _check_topics(bag, paths, chosen, notes)
+        if recorder:
+            recorder.expect(bag.message_counts[chosen.dvl])
         _feed_all(bag, chosen, feed, recorder, on_progress)
         notes = bag.notes + notes
     result = calibrator.result()
