@@ -5,10 +5,11 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "dvl_calib_ros"
-ROS_FREE = ["numpy>=1.26", "scipy>=1.11", "pyyaml>=6.0", "rich>=13.7", "rosbags>=0.10", "mcap>=1.2"]
+ROS_FREE = ["numpy>=1.26", "scipy>=1.11", "pyyaml>=6.0", "rich>=13.7", "rosbags>=0.10", "mcap>=1.2", "joblib>=1.3"]
 REPORT = ["matplotlib>=3.6", "jinja2>=3.1"]
+DASK = ["distributed>=2023.9"]
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
-TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40"]
+TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40", *DASK]
 
 
 def shared(folder: str) -> list:
@@ -26,7 +27,7 @@ setup(
     package_data={NAME: ["report/templates/*"]},
     python_requires=">=3.10",
     install_requires=[*ROS_FREE, *REPORT],
-    extras_require={"ros": ROS, "test": TEST},
+    extras_require={"ros": ROS, "dask": DASK, "test": TEST},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -11,26 +11,16 @@ import pytest
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
 from dvl_calib_ros.io.replay import replay
 from dvl_calib_ros.io.trajectories import ImportOptions, import_recording, read_columns
-from dvl_calib_ros.simulation.sensors import DvlErrors, measure_dvl, measure_gnss
-
-# protocol.md
-MISALIGNMENTS_DEG = [(5, -0.5, 2.5), (0.5, 1, -1.5), (-2.5, 1.8, 4), (-1, -2.5, -3), (2, 0.5, 4.2)]
-SCALES_PERCENT = [(0.5, 0.3, 0.7), (0.2, 0.7, 0.6), (0.9, 0.5, 0.1)]
-BEAM_BIAS, BEAM_STD, GNSS_STD = (0.007, 0.001, 0.003, 0.009), 0.005, 0.2
-COMBINATIONS = [
-    DvlErrors(tuple(np.deg2rad(angles)), tuple(0.01 * np.array(scale)), BEAM_BIAS, BEAM_STD)
-    for angles in MISALIGNMENTS_DEG
-    for scale in SCALES_PERCENT
-]
-NAMES = [f"T{number:02d}" for number in range(1, 16)]
+from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss
 
 
 @pytest.fixture(scope="module")
 def trajectories(snapir):
     """Name -> time (N,) s, velocity (N, 3) m/s, forward-right-down."""
-    return {name: read_columns(snapir / f"{name}_dvl.csv", "m/s") for name in NAMES}
+    return {name: read_columns(snapir / f"{name}_dvl.csv", "m/s") for name in TRAJECTORIES}
 
 
 def write_csv(path: Path, time, velocity) -> Path:
@@ -49,7 +39,7 @@ def calibrate_on(folder: Path, time, velocity, errors, rng):
     return replay([folder / "bag"], Parameters()).result, counts
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", TRAJECTORIES)
 def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, tmp_path, rng):
     for number, errors in enumerate(COMBINATIONS[::5]):
         folder = tmp_path / str(number)
@@ -75,7 +65,7 @@ def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectorie
         folder.mkdir()
         result, _ = calibrate_on(folder, time[:200], velocity[:200], errors, rng)
         residuals: dict[str, list[float]] = {name: [] for name in errors_of}
-        for name in set(NAMES) - {"T12"}:
+        for name in set(TRAJECTORIES) - {"T12"}:
             truth = trajectories[name][1] @ FLU_FROM_FRD
             measured = measure_dvl(trajectories[name][1], errors, np.eye(3), rng) @ FLU_FROM_FRD
             residuals["uncalibrated"].append(vector_rmse(measured - truth))

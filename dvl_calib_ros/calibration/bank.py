@@ -19,6 +19,7 @@ from .kalman import GaussianState
 from .models import N_MEASUREMENT, Model
 from .observations import Observations
 from .parameters import Parameters
+from .verification import FOLDS, FoldInformation, folds_of
 
 # From here on the vectorised batch is faster than the recursion.
 BATCH_FROM = 24
@@ -82,7 +83,7 @@ class Assembler:
         start = GaussianState(self.start.x[index, :n], self.start.p[index, :n, :n])
         return with_prior_on_errors(held, start, self._starts[index])
 
-    def measurements(self, seen: Observations, weight: Array, prior_known: Array) -> kalman.Measurements:
+    def measurements(self, seen: Observations, weight: Array, prior_known: kalman.Mask) -> kalman.Measurements:
         """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
         heave were known at the sample; models that need them skip it where not."""
         k, n_samples = len(self.models), len(seen.velocity_dvl)
@@ -115,10 +116,19 @@ class ModelBank:
     """K models updated together."""
 
     def __init__(
-        self, models: Sequence[Model], parameters: Parameters, initial: Mapping[str, GaussianState] | None = None
+        self,
+        models: Sequence[Model],
+        parameters: Parameters,
+        initial: Mapping[str, GaussianState] | None = None,
+        verified: bool = False,
     ) -> None:
-        """Start from the prior, or from `initial` for the models named there (shapes as the models' states)."""
+        """Start from the prior, or from `initial` for the models named there (shapes as the models' states).
+
+        verified: keep what `states_without_folds` needs.
+        """
+        self._parameters = parameters
         self._assembler = Assembler(models, parameters, initial)
+        self._folds = FoldInformation(self._assembler.start) if verified else None
         self.models = self._assembler.models
         self._index = {model.name: k for k, model in enumerate(self.models)}
         self.x, self.p = self._assembler.start
@@ -129,7 +139,7 @@ class ModelBank:
         self._gated = np.zeros(k, dtype=np.int64)
         self._nis_sum = np.zeros(k)
 
-    def update(self, stamps_ns: Sequence[int], seen: Observations, weight: Array, prior_known: Array) -> None:
+    def update(self, stamps_ns: Sequence[int], seen: Observations, weight: Array, prior_known: kalman.Mask) -> None:
         """Update every model with a block of N samples; weight and prior_known as in `Assembler.measurements`."""
         self.n_given += len(stamps_ns)
         data = self._assembler.measurements(seen, weight, prior_known)
@@ -139,6 +149,8 @@ class ModelBank:
         else:
             after = kalman.recursion(self.x, self.p, data, process)
         self.x, self.p = after.x, after.p
+        if self._folds is not None:
+            self._folds.add(folds_of(stamps_ns, self._parameters), data, after.used)
         self._used += after.used.sum(axis=1)
         self._gated += (data.usable & ~after.used).sum(axis=1)
         self._nis_sum += np.where(after.used, after.nis, 0.0).sum(axis=1)
@@ -155,6 +167,13 @@ class ModelBank:
         """State and covariance of one model."""
         index = self._index[name]
         return self._assembler.state(index, self.x[index], self.p[index])
+
+    def states_without_folds(self, name: str) -> list[GaussianState]:
+        """For every fold the state and covariance of one model had it not seen that fold."""
+        assert self._folds is not None  # asked for when the bank was made
+        index = self._index[name]
+        held = (self._folds.without(fold, index) for fold in range(FOLDS))
+        return [self._assembler.state(index, x, p) for x, p in held]
 
     def counts(self, name: str) -> ModelCounts:
         """Samples used and gated by one model, and its mean normalised innovation squared."""

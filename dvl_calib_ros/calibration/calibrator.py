@@ -22,7 +22,7 @@ import numpy as np
 
 from .bank import ModelBank, nis_bounds
 from .frames import ENU_FROM_NED, Array, Quaternion, Vector, rotation_from_quaternion, slerp
-from .kalman import GaussianState
+from .kalman import GaussianState, Mask
 from .models import MODELS, Needs
 from .observability import convergence, observability
 from .observations import Assumptions, Observations
@@ -32,6 +32,7 @@ from .samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from .screening import CovarianceScreen, is_valid_velocity, unit_quaternion
 from .selection import Selection
 from .streams import Bracket, Order, S, Sequencer, Track
+from .verification import Moments, Verification, folds_of, held_out_error, verify
 
 SECOND_NS = 1_000_000_000
 # How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.
@@ -76,11 +77,11 @@ class _Block(NamedTuple):
     stamps_ns: list[int]
     seen: Observations
     weight: Array
-    prior_known: Array
+    prior_known: Mask
 
 
 def _block(
-    samples: list[_Moving], seen: Observations, weight: Array | None = None, prior_known: Array | None = None
+    samples: list[_Moving], seen: Observations, weight: Array | None = None, prior_known: Mask | None = None
 ) -> _Block:
     n = len(samples)
     stamps_ns = [sample.stamp_ns for sample in samples]
@@ -94,7 +95,7 @@ class Calibrator:
     prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
     by model name. block_size: samples that are gathered before the models are updated, if nobody asks for their state
     earlier. on_event: told of restarts in words. on_block: told of every block that the models are given, its stamps
-    (ns) and observations; those with a reference are the paired ones.
+    (ns) and observations; those with a reference are the paired ones. verified: keep what hold-out verification needs.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class Calibrator:
         block_size: int = 1,
         on_event: Callable[[str], None] = lambda _: None,
         on_block: Callable[[Sequence[int], Observations], None] = lambda *_: None,
+        verified: bool = False,
     ) -> None:
         if parameters.prior_source == "reference" and prior_sway_heave is None:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
@@ -115,6 +117,7 @@ class Calibrator:
         self._block_size = block_size
         self._on_event = on_event
         self._on_block = on_block
+        self._verified = verified
         self.restarts = 0
         self._offset_ns = round(parameters.dvl_time_offset * 1e9)
         self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
@@ -149,9 +152,12 @@ class Calibrator:
     def _forget_dvl(self) -> None:
         self.selection = Selection()
         self._banks = {
-            needs: ModelBank([m for m in MODELS.values() if m.needs is needs], self.parameters, self._initial)
+            needs: ModelBank(
+                [m for m in MODELS.values() if m.needs is needs], self.parameters, self._initial, self._verified
+            )
             for needs in Needs
         }
+        self._moments = Moments()
         self._awaiting_imu: deque[_Moving] = deque()
         self._awaiting_attitude: deque[_Moving] = deque()
         self._awaiting_reference: deque[_Moving] = deque()
@@ -426,6 +432,8 @@ class Calibrator:
         block = take[needs]()
         self._on_block(block.stamps_ns, block.seen)
         self._banks[needs].update(*block)
+        if self._verified and needs is Needs.REFERENCE:
+            self._moments.add(folds_of(block.stamps_ns, self.parameters), block.seen)
 
     def _block_of_plain(self) -> _Block:
         block, self._plain = self._plain, []
@@ -556,6 +564,19 @@ class Calibrator:
             observability=observability(model, covariance, self.parameters),
         )
 
+    def verification(self, name: str) -> Verification:
+        """The verdict on one model's calibration, by hold-out; for a calibrator made with ``verified``."""
+        estimate = self.estimate(name)
+        model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
+        self._update(Needs.REFERENCE)
+        held_out = held_out_error(
+            model,
+            self._banks[model.needs].states_without_folds(name),
+            self._moments,
+            self.parameters.rotation_dvl_from_body,
+        )
+        return verify(model, state, estimate.convergence, held_out, self.parameters)
+
     def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:
         """Newest angular velocity (rad/s, body), if not older than imu_timeout: for output without delay."""
         newest = self._imu.newest
@@ -574,6 +595,7 @@ class Calibrator:
             first_ns=self._first_ns,
             last_ns=self.last_ns,
             parameters=self.parameters.as_dict(),
+            verifications={name: self.verification(name) for name in MODELS} if self._verified else {},
         )
 
 

@@ -1,9 +1,10 @@
 """Speed and memory as ratios against a peer in the same run; about six minutes for all. Linux.
 
-batch   the batch path against filterpy
-replay  an hour's bag against reading and deserialising it with rosbags
-node    the node's CPU against a subscriber that only republishes
-rate    the node at 1000 Hz for a minute
+batch     the batch path against filterpy
+evaluate  the published procedure against a loop with filterpy (set DVL_CALIB_SNAPIR to a folder of trajectories)
+replay    an hour's bag against reading and deserialising it with rosbags
+node      the node's CPU against a subscriber that only republishes
+rate      the node at 1000 Hz for a minute
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from . import common
 NAME = "benchmark"
 HELP = "speed and memory, as ratios against a peer in the same run"
 EXAMPLE = "dvl-calib benchmark batch replay"
-WHAT = ("batch", "replay", "node", "rate")
+WHAT = ("batch", "evaluate", "replay", "node", "rate")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,6 +54,10 @@ def run(arguments: argparse.Namespace) -> None:
 def _measure(name: str):  # type: ignore[no-untyped-def]
     if name == "batch":
         from ..benchmark.batch import measure
+
+        return measure()
+    if name == "evaluate":
+        from ..benchmark.evaluate import measure
 
         return measure()
     if name == "replay":

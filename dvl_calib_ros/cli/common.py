@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,11 +44,42 @@ def add_storage_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def load(arguments: argparse.Namespace) -> Parameters:
-    """Parameters from --params and -p."""
+def load(arguments: argparse.Namespace, defaults: Mapping[str, Any] | None = None) -> Parameters:
+    """Parameters from --params and -p; defaults: values, other than the schema's own, of what neither sets."""
     from ..io.parameter_files import load_parameters
 
-    return load_parameters(arguments.params, arguments.overrides)
+    return load_parameters(arguments.params, arguments.overrides, defaults)
+
+
+def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
+    """What an option such as ``M3,M7`` or ``all`` names, each once. Raises InputError for what is not in names."""
+    from ..io.errors import InputError
+
+    if text == "all":
+        return list(names)
+    given = [name.strip() for name in text.split(",") if name.strip()]
+    for name in given:
+        if name not in names:
+            raise InputError(f"{option}: {name!r} is none of {', '.join(names)}, or all")
+    if not given:
+        raise InputError(f"{option}: name at least one of {', '.join(names)}, or all")
+    return list(dict.fromkeys(given))
+
+
+def check_outputs(arguments: argparse.Namespace, *options: str) -> None:
+    """Raise InputError if the file that an option names could not be written, before work is done for it."""
+    from ..io.errors import InputError
+    from ..io.result_file import check_writable
+
+    named: dict[Path, str] = {}
+    for option in options:
+        path = getattr(arguments, option)
+        if path is None:
+            continue
+        check_writable(path)
+        if path in named:
+            raise InputError(f"--{named[path]} and --{option}: both name {path}; give them names of their own")
+        named[path] = option
 
 
 def console(stderr: bool = False) -> Console:

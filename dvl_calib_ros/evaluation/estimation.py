@@ -10,19 +10,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration import kalman
-from ..calibration.bank import Assembler, GaussianState, prior
+from ..calibration.bank import Assembler
 from ..calibration.frames import Array
+from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.observations import Assumptions, Observations
 from ..calibration.parameters import Parameters
 from .trajectories import Trajectory
 
 Mask = NDArray[np.bool_]
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ def estimate(
     Returns x (E, B, n) and P (E, B, n, n) by the model's name. parameters: without process noise, lever arm or
     mounting.
     """
-    usable = _usable(data, parameters)
+    usable = usable_samples(data, parameters)
     found: dict[str, GaussianState] = {}
     for needs in Needs:
         group = [MODELS[name] for name in models if MODELS[name].needs is needs]
@@ -59,12 +62,11 @@ def _estimate_group(
 ) -> Iterable[tuple[str, GaussianState]]:
     n_variants = len(data.velocity_dvl)
     assembler = Assembler(group, parameters)
-    sway_heave, prior_known = _prior_sway_heave(data, usable, parameters)
-    seen = _observations(data, group[0].needs, sway_heave, parameters)
+    sway_heave, prior_known = prior_sway_heave(data, usable, parameters)
+    seen = observations(data, group[0].needs, sway_heave, parameters)
     flat = assembler.measurements(seen, np.ones(usable.size), prior_known.ravel())
-    start = assembler.start([prior(model, parameters) for model in group])
     measurements = _by_variant(flat, n_variants, usable)
-    x, p = (np.repeat(each, n_variants, axis=0) for each in start)
+    x, p = (np.repeat(each, n_variants, axis=0) for each in assembler.start)
     after = _states_after(x, p, measurements, ends)
     for index, model in enumerate(group):
         own = slice(index * n_variants, (index + 1) * n_variants)
@@ -76,15 +78,15 @@ def _estimate_group(
         yield model.name, GaussianState(x_all, np.array([[state.p for state in row] for row in states]))
 
 
-def _observations(data: SensorData, needs: Needs, sway_heave: Array, parameters: Parameters) -> Observations:
+def observations(data: SensorData, needs: Needs, sway_heave: Array, parameters: Parameters) -> Observations:
     """All variants in a row (B N samples)."""
     run, (n_variants, n_samples, _) = data.run, data.velocity_dvl.shape
     attitude = needs is Needs.ATTITUDE
     aided = needs is Needs.REFERENCE
     std = parameters.gnss_aided_std if aided else parameters.gnss_free_std
 
-    def repeated(values: Array) -> Array:
-        return np.tile(values, (n_variants,) + (1,) * (values.ndim - 1))
+    def repeated(values: Array | None) -> Array | None:
+        return None if values is None else np.tile(values, (n_variants,) + (1,) * (values.ndim - 1))
 
     return Observations(
         velocity_dvl=data.velocity_dvl.reshape(-1, 3),
@@ -100,7 +102,7 @@ def _observations(data: SensorData, needs: Needs, sway_heave: Array, parameters:
     )
 
 
-def _usable(data: SensorData, parameters: Parameters) -> Mask:
+def usable_samples(data: SensorData, parameters: Parameters) -> Mask:
     """Samples (B, N) that are neither too slow nor in too sharp a turn, as the calibrator has it."""
     usable: Mask = np.sum(data.velocity_dvl**2, axis=-1) >= parameters.min_speed**2
     if parameters.max_turn_rate > 0.0:
@@ -114,7 +116,7 @@ def _squared(vectors: Array) -> Array:
     return np.asarray(np.sum(vectors**2, axis=-1))
 
 
-def _prior_sway_heave(data: SensorData, usable: Mask, parameters: Parameters) -> tuple[Array, Mask]:
+def prior_sway_heave(data: SensorData, usable: Mask, parameters: Parameters) -> tuple[Array, Mask]:
     """Prior sway and heave (B, 2) m/s, and at which samples (B, N) it is known."""
     n_variants = len(usable)
     known: Mask = np.ones(usable.shape, dtype=bool)
@@ -135,16 +137,15 @@ def _by_variant(flat: kalman.Measurements, n_variants: int, usable: Mask) -> kal
     """Measurements of K models of B variants in a row -> of K B models."""
     k = len(flat.z)
 
-    def split(values: Array, axis_2_may_be_one: bool = False) -> Array:
-        if values.shape[1] == 1 and axis_2_may_be_one:
+    def split(values: NDArray[T]) -> NDArray[T]:
+        if values.shape[1] == 1:  # the same for all samples
             return values if len(values) == 1 else np.repeat(values, n_variants, axis=0)
-        rest = values.shape[2:]
-        return np.broadcast_to(values, (k, *values.shape[1:])).reshape(k * n_variants, -1, *rest)
+        return np.broadcast_to(values, (k, *values.shape[1:])).reshape(k * n_variants, -1, *values.shape[2:])
 
     return kalman.Measurements(
         z=split(flat.z),
         h=split(flat.h),
-        r=split(flat.r, axis_2_may_be_one=True),
+        r=split(flat.r),
         weight=split(flat.weight),
         usable=split(flat.usable) & np.tile(usable, (k, 1)),
         gate=np.repeat(flat.gate, n_variants),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from .trajectories import Trajectory, load_folder, own_trajectories
 
 # What evaluation sets otherwise than a live calibration: the published procedure has no gate, and M5 and M6 come out
 # as published with the prior from the reference velocity.
-DEFAULTS = {"gate_probability": 0.0, "prior_source": "reference"}
+DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "reference"}
 # The unit under test is mounted straight, at the reference point, in step, and its errors are constant.
 FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", "process_std_misalignment",
          "process_std_scale")  # fmt: skip
@@ -41,6 +42,7 @@ FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", 
 TRACED, TRACED_COMBINATION = ("T01", "T07"), 0
 TRACE_SAMPLES = 400
 
+OWN_NOTES: tuple[str, ...] = ("simulated trajectories: the published figures are of others, so there is no ratio",)
 FORMULA = "-a σ²/(E‖h‖² + a σ²), h the noiseless regressor of the scale, a the number of its noisy axes"
 
 
@@ -59,10 +61,7 @@ def evaluate(
 
     parameters: as for the node, see `DEFAULTS` and `FIXED`. Raises InputError.
     """
-    if folder is None:
-        runs, notes = own_trajectories(), ("own generator: the published figures are of other trajectories",)
-    else:
-        runs, notes = load_folder(folder, partial_folder)
+    runs, notes = (own_trajectories(), OWN_NOTES) if folder is None else load_folder(folder, partial_folder)
     parameters, ignored = _for_procedure(parameters)
     procedure = Procedure(
         runs=runs,
@@ -82,11 +81,11 @@ def evaluate(
         sets=procedure.sets,
         seeds=seeds,
         n_combinations=len(protocol.COMBINATIONS),
-        avg_vrmse=np.stack([[own.avg_vrmse[0] for own in each.own] for each in outcomes], axis=-1),
+        avg_vrmse=np.stack([[run.avg_vrmse for run in each.by_set] for each in outcomes], axis=-1),
         windows_s=protocol.WINDOWS_S,
-        avg_vrmse_by_time=np.stack([[by_set.avg_vrmse for by_set in each.by_set] for each in outcomes], axis=-1),
+        avg_vrmse_by_time=np.stack([[run.by_time for run in each.by_set] for each in outcomes], axis=-1),
         published=protocol.PUBLISHED,
-        coverage=_coverage(procedure.models, [own for each in outcomes for own in each.own]),
+        coverage=_coverage(procedure.models, [run for each in outcomes for run in each.by_set]),
         errors_in_variables=_errors_in_variables(procedure, outcomes),
         each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
         single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),
@@ -123,7 +122,7 @@ def _each_study(
         return None
     return EachStudy(
         runs=runs,
-        avg_vrmse=np.stack([[run.avg_vrmse[0] for run in seed] for seed in outcomes], axis=-1),
+        avg_vrmse=np.stack([[run.avg_vrmse for run in seed] for seed in outcomes], axis=-1),
         yaw_observed=np.mean([[run.yaw_observed for run in seed] for seed in outcomes], axis=0),
         coverage=_coverage(procedure.models, [run for seed in outcomes for run in seed]),
     )
@@ -179,7 +178,7 @@ def _scale_regressor(name: str, velocity: Array, step: Array, run: Trajectory) -
 def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace]:
     """Pictures of corrections with what the first set found."""
     traces = []
-    calibrated_on, corrections = procedure.sets[0], outcome.own[0].corrections[0, 1:, TRACED_COMBINATION]
+    calibrated_on, corrections = procedure.sets[0], outcome.by_set[0].corrections[1:, TRACED_COMBINATION]
     for name in TRACED:
         if name not in procedure.runs or name == calibrated_on.calibration_run:
             continue
@@ -203,7 +202,5 @@ def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace
 def _corrected(models: Sequence[str], corrections: Array, measured: Array) -> Mapping[str, Array]:
     """Model -> corrected velocities, of those that ran."""
     return {
-        name: measured @ matrix.T
-        for name, matrix in zip(models, corrections, strict=True)
-        if np.isfinite(matrix).all()
+        name: measured @ matrix.T for name, matrix in zip(models, corrections, strict=True) if np.isfinite(matrix).all()
     }

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.bank import GaussianState
 from ..calibration.error_model import correction_matrix
 from ..calibration.frames import Array
+from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
-from ..calibration.observability import observability
+from ..calibration.observability import OBSERVED_SHARE
 from ..calibration.parameters import Parameters
 from . import protocol
 from .estimation import SensorData, estimate
@@ -49,13 +49,14 @@ class Procedure:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What calibrating on one run (B combinations) gave.
+    """What calibrating on one run (B combinations) gave; nan for models that cannot run on it.
 
-    avg_vrmse: (E, C) m/s after each window. errors, std: model -> (B, n) estimate - truth of the error states and the
-    σ claimed, after the last window. yaw_observed: (M,) share of combinations. corrections: (E, C, B, 3, 3). nan for
-    models that cannot run on it.
+    by_time: (E, C) Avg.VRMSE m/s after each window. The rest is after the run's own window: avg_vrmse (C,). errors,
+    std: model -> (B, n) estimate - truth of the error states, and the σ claimed. yaw_observed: (M,) share of
+    combinations. corrections: (C, B, 3, 3).
     """
 
+    by_time: Array
     avg_vrmse: Array
     errors: Mapping[str, Array]
     std: Mapping[str, Array]
@@ -65,14 +66,13 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class SeedOutcome:
-    """One seed. by_set: as `Procedure.sets`, every window of `protocol.WINDOWS_S`. own: the same, the set's own window.
+    """One seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
 
     each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) by how much noise in the
     reference moves the first scale state.
     """
 
     by_set: tuple[RunOutcome, ...]
-    own: tuple[RunOutcome, ...]
     each: tuple[RunOutcome, ...]
     single_heading: tuple[RunOutcome, ...]
     pull: Array
@@ -83,25 +83,20 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     data = {name: sensor_data(run, seed) for name, run in procedure.runs.items()}
     moments = {name: Moments.of(each.velocity_dvl, each.run.velocity) for name, each in data.items()}
 
-    def outcome(part: SensorData, ends: Sequence[int]) -> RunOutcome:
-        others = Moments.stack([each for name, each in moments.items() if name != part.run.name])
-        return _calibrate(part, ends, others, procedure)
+    def outcome(stretch: SensorData, windows: Sequence[float | None], own_window: float | None) -> RunOutcome:
+        others = Moments.stack([each for name, each in moments.items() if name != stretch.run.name])
+        ends = [stretch.run.first(window) for window in windows]
+        return _calibrate(stretch, ends, windows.index(own_window), others, procedure)
 
-    by_set = []
-    own = []
-    for each in procedure.sets:
-        run = data[each.calibration_run]
-        by_set.append(outcome(run, [run.run.first(window) for window in protocol.WINDOWS_S]))
-        own.append(outcome(run, [run.run.first(each.window_s)]))
+    by_set = tuple(outcome(data[each.calibration_run], protocol.WINDOWS_S, each.window_s) for each in procedure.sets)
     if not procedure.studies:
-        return SeedOutcome(tuple(by_set), tuple(own), (), (), np.empty((0, len(NOISE_STUDY_STD), 0)))
+        return SeedOutcome(by_set, (), (), np.empty((0, len(NOISE_STUDY_STD), 0)))
     with_attitude = runs_with_attitude(procedure.runs)
     legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
     return SeedOutcome(
-        by_set=tuple(by_set),
-        own=tuple(own),
-        each=tuple(outcome(data[name], [len(data[name].run.time)]) for name in with_attitude),
-        single_heading=tuple(outcome(part(data[name], start, end), [end - start]) for name, start, end in legs),
+        by_set=by_set,
+        each=tuple(outcome(data[name], [None], None) for name in with_attitude),
+        single_heading=tuple(outcome(_part(data[name], start, end), [None], None) for name, start, end in legs),
         pull=_noise_study(procedure, data, seed),
     )
 
@@ -116,8 +111,7 @@ def sensor_data(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD)
     return SensorData(run, np.stack(measured), np.stack(reference))
 
 
-def part(data: SensorData, start: int, end: int) -> SensorData:
-    """Samples start .. end - 1."""
+def _part(data: SensorData, start: int, end: int) -> SensorData:
     return SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
 
 
@@ -130,29 +124,28 @@ def corrections(model: Model, state: GaussianState) -> Array:
 def true_state(model: Model) -> Array:
     """(B, n) error states that the model should find; a scale that stands for several axes should find their mean."""
     from_state = model.error_terms_from_state[:, : model.n_errors]
-    return np.stack([np.linalg.pinv(from_state) @ protocol.truth(errors) for errors in protocol.COMBINATIONS])
+    return protocol.truth() @ np.linalg.pinv(from_state).T
 
 
-def _calibrate(data: SensorData, ends: Sequence[int], others: Moments, procedure: Procedure) -> RunOutcome:
+def _calibrate(data: SensorData, ends: Sequence[int], own: int, others: Moments, procedure: Procedure) -> RunOutcome:
+    """own: index of the run's own window."""
     states = estimate(procedure.models, data, procedure.parameters, ends)
     n_variants = len(data.velocity_dvl)
     matrices = np.full((len(ends), procedure.n_columns, n_variants, 3, 3), np.nan)
     matrices[:, 0] = np.eye(3)
     yaw_observed = np.full(len(procedure.models), np.nan)
     errors, std = {}, {}
-    for column, (name, state) in enumerate(((n, states.get(n)) for n in procedure.models), start=1):
-        if state is None:
+    observed_std = OBSERVED_SHARE * procedure.parameters.initial_std_misalignment
+    for index, name in enumerate(procedure.models):
+        if name not in states:
             continue
-        model = MODELS[name]
-        matrices[:, column] = corrections(model, state)
-        last = GaussianState(state.x[-1], state.p[-1])
-        errors[name] = last.x[:, : model.n_errors] - true_state(model)
-        std[name] = np.sqrt(np.diagonal(last.p, axis1=1, axis2=2)[:, : model.n_errors])
-        yaw_observed[column - 1] = np.mean(
-            [observability(model, p, procedure.parameters)[2].observed for p in last.p]
-        )
-    scores = vrmse(others, matrices[:, :, None])  # (E, C, others, B)
-    return RunOutcome(scores.mean(axis=(-1, -2)), errors, std, yaw_observed, matrices)
+        model, state = MODELS[name], states[name]
+        matrices[:, 1 + index] = corrections(model, state)
+        errors[name] = state.x[own, :, : model.n_errors] - true_state(model)
+        std[name] = np.sqrt(np.diagonal(state.p[own], axis1=1, axis2=2)[:, : model.n_errors])
+        yaw_observed[index] = np.mean(std[name][:, 2] <= observed_std)
+    by_time = vrmse(others, matrices[:, :, None]).mean(axis=(-1, -2))  # (E, C, others, B) -> (E, C)
+    return RunOutcome(by_time, by_time[own], errors, std, yaw_observed, matrices[own])
 
 
 # ------------------------------------------------------------------ studies
@@ -208,6 +201,8 @@ def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
 def _noise_study(procedure: Procedure, data: Mapping[str, SensorData], seed: int) -> Array:
     """By how much noise of each size in the reference moves the first scale state (G, V, B)."""
     models = models_in_noise_study(procedure.models)
+    if not models:
+        return np.empty((0, len(NOISE_STUDY_STD), len(protocol.COMBINATIONS)))
     run = noise_study_run(procedure)
 
     def scales(std: float) -> Array:  # (G, B)

@@ -7,6 +7,7 @@ seeds. Errors and beams are those of the recorded frame (forward-right-down); wh
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -28,6 +29,8 @@ SETS = (
     CalibrationSet("E4", "T15", None),
 )
 WINDOWS_S: tuple[float | None, ...] = (50.0, 100.0, 120.0, 140.0, 160.0, 180.0, 200.0, None)
+# Runs that the models with attitude are judged on: manoeuvres, none of them a calibration run of the paper
+MANOEUVRING = tuple(f"T{number:02d}" for number in range(1, 11))
 TRAJECTORIES = tuple(f"T{number:02d}" for number in range(1, 16))
 
 _COLUMNS = (UNCALIBRATED, "M1", "M2", "M3", "M4", "M5", "M6", "M7")
@@ -59,10 +62,14 @@ def combination_in_words(index: int) -> str:
     return f"misalignment {angles} °, scale {percent} %, forward-right-down"
 
 
-def truth(errors: DvlErrors) -> Array:
-    """φ (rad) and δk (6,) that an estimate in forward-left-up should find; beam biases have no state."""
-    misalignment, scale = equivalent_error_terms(errors)
-    return np.concatenate([FLU_FROM_FRD @ misalignment, scale])
+@cache
+def truth() -> Array:
+    """φ (rad) and δk (B, 6) of every combination, as an estimate in forward-left-up should find them.
+
+    The beam biases are in no model's state.
+    """
+    pairs = [equivalent_error_terms(errors) for errors in COMBINATIONS]
+    return np.array([[*FLU_FROM_FRD @ misalignment, *scale] for misalignment, scale in pairs])
 
 
 def unit_under_test(velocity_flu: Array, errors: DvlErrors, rng: np.random.Generator) -> Array:

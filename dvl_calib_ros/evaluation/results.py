@@ -7,7 +7,7 @@ attitude on a run without).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,6 +87,13 @@ class EachStudy:
     avg_vrmse: Array
     yaw_observed: Array
     coverage: tuple[Coverage, ...]
+
+    def median(self, trajectories: Collection[str] | None = None) -> Array:
+        """(C,) median over the runs (of these trajectories) of the mean over the seeds; nan without such runs."""
+        rows = [i for i, run in enumerate(self.runs) if trajectories is None or run.trajectory in trajectories]
+        if not rows:
+            return np.full(self.avg_vrmse.shape[1], np.nan)
+        return np.asarray(np.median(self.avg_vrmse[rows].mean(axis=-1), axis=0))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Layout of a folder, one recording a name ``T01`` .. ``T15``:
 
-    Txx_dvl.csv       time s; velocity over ground m/s in the body frame: surge (forward), sway (starboard), heave (down)
+    Txx_dvl.csv       time s; velocity over ground m/s, body frame: surge (forward), sway (starboard), heave (down)
     Txx_attitude.csv  optional: time s, the same stamps; roll, pitch, yaw rad of that body in north-east-down, Z-Y-X
 
 The recorded velocities are public: T01-T13 in github.com/ansfl/A-KIT (its runs 1-10, 13, 11, 12), T14 and T15 in
@@ -76,7 +76,7 @@ def load_folder(folder: Path, partial: bool = False) -> tuple[dict[str, Trajecto
     the file, and the row where there is one.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give one with T01_dvl.csv .. T15_dvl.csv, or none for simulated runs")
+        raise InputError(f"{folder}: no such folder; give one with T01_dvl.csv .. T15_dvl.csv, or none")
     missing = [name for name in TRAJECTORIES if not (folder / f"{name}_dvl.csv").is_file()]
     _check_missing(folder, missing, partial)
     notes = [f"{', '.join(missing)} missing: averages are over the others, not as published"] if missing else []

@@ -19,9 +19,14 @@ NODE_NAME = "dvl_calibration"
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 
-def load_parameters(path: Path | None, overrides: Sequence[str] = ()) -> Parameters:
-    """Parameters of a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError."""
-    values = {} if path is None else _node_parameters(path)
+def load_parameters(
+    path: Path | None, overrides: Sequence[str] = (), defaults: Mapping[str, Any] | None = None
+) -> Parameters:
+    """Parameters of a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
+
+    defaults: values, other than the schema's own, of what neither sets.
+    """
+    values = dict(defaults or {}) | ({} if path is None else _node_parameters(path))
     try:
         Parameters.from_mapping(values)
     except ParameterError as error:

@@ -15,6 +15,7 @@ from .. import __version__
 from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
+from ..calibration.observations import Observations
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.samples import VelocityFrame
@@ -67,11 +68,12 @@ def replay(
     on_progress: Callable[[float], None] = lambda _: None,
     *,
     with_history: bool = False,
+    on_block: Callable[[Sequence[int], Observations], None] = lambda *_: None,
 ) -> Replayed:
     """Calibrate with the bags at `paths`, read as one in order of log time.
 
-    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way. Raises
-    InputError if there is no bag or no usable DVL topic.
+    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way,
+    else on_block is told as by `Calibrator`. Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
@@ -87,7 +89,7 @@ def replay(
         initial=initial,
         block_size=BLOCK_SIZE,
         on_event=notes.append,
-        on_block=recorder.observe if recorder else lambda *_: None,
+        on_block=recorder.observe if recorder else on_block,
     )
     feed = MessageFeed(calibrator, notes.append)
     with BagReader(paths) as bag:

@@ -1,7 +1,7 @@
 """Trajectories as CSV or NPY: a time column and three of values.
 
-Columns are told by their order and checked by their header's units, where there is a header: ``Time [s]`` and m/s or
-rad.
+Columns are told by their order, and where there is a header checked by its units (``Time [s]`` and m/s or rad) and by
+the axes it names.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from .errors import InputError
 
 N_COLUMNS = 4
 SUFFIXES = ("csv", "npy")
+# Words of a header that tell which of the three values a column holds
+AXIS_NAMES = ({"x", "vx", "surge", "roll"}, {"y", "vy", "sway", "pitch"}, {"z", "vz", "heave", "yaw"})
 
 
 def read_columns(path: Path, unit: str) -> tuple[Array, Array]:
@@ -84,6 +86,10 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
             raise InputError(f"{path}: column {cell!r} is not in {expected}; convert it first")
     if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp"):
         raise InputError(f"{path}: the first column is {header[0]!r}, expected time")
+    for position, cell in enumerate(header[1:]):
+        words = set(re.findall("[a-z]+", re.sub(r"[\[(].*", "", cell.lower())))
+        if any(words & names for axis, names in enumerate(AXIS_NAMES) if axis != position):
+            raise InputError(f"{path}: column {cell!r} is at the place of {'xyz'[position]}; sort them: time, x, y, z")
 
 
 def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:

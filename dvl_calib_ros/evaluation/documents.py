@@ -1,0 +1,146 @@
+"""An evaluation as plain documents: JSON for machines, CSV for spreadsheets."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .protocol import MANOEUVRING
+from .results import Coverage, EachStudy, Evaluation
+
+CSV_COLUMNS = ("study", "set", "calibrated_on", "from_s", "to_s", "model", "seed", "avg_vrmse_mps", "published_mps")
+
+
+def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
+    """`evaluate --json`: velocities in m/s, angles in rad, means over the seeds unless it says per_seed."""
+    e = evaluation
+    names = [each.name for each in e.sets]
+    return {
+        "avg_vrmse": _table(names, e.columns, e.seed_mean),
+        "mean": _row(e.columns, e.set_mean),
+        "published": {name: dict(e.published[name]) for name in names},
+        "ratio": _table(names, e.columns, e.ratio),
+        "avg_vrmse_per_seed": {
+            name: {column: values.tolist() for column, values in zip(e.columns, rows, strict=True)}
+            for name, rows in zip(names, e.avg_vrmse, strict=True)
+        },
+        "avg_vrmse_by_time": {
+            name: {_window(w): _row(e.columns, row) for w, row in zip(e.windows_s, rows, strict=True)}
+            for name, rows in zip(names, e.avg_vrmse_by_time.mean(axis=-1), strict=True)
+        },
+        "coverage": _coverage(e.coverage),
+        "errors_in_variables": _errors_in_variables(e),
+        "each": _each(e.each, e.columns),
+        "single_heading": _each(e.single_heading, e.columns),
+        "held_out": [vars(each) for each in e.held_out],
+        "sets": {each.name: {"calibrated_on": each.calibration_run, "window_s": each.window_s} for each in e.sets},
+        "trajectories": list(e.trajectories),
+        "source": e.source,
+        "notes": list(e.notes),
+        "seeds": list(e.seeds),
+        "combinations": e.n_combinations,
+        "parameters": dict(e.parameters),
+        "version": e.version,
+    }
+
+
+def evaluation_csv(evaluation: Evaluation) -> str:
+    """`evaluate --csv`: one line per Avg.VRMSE of every study, set or run, window, model and seed."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    writer.writerows(_csv_rows(evaluation))
+    return text.getvalue()
+
+
+def _csv_rows(e: Evaluation) -> Iterator[Sequence[Any]]:
+    for each, by_column, published in zip(e.sets, e.avg_vrmse, e.published_table, strict=True):
+        where = ("sets", each.name, each.calibration_run, 0.0, each.window_s)
+        yield from _per_seed(e, where, by_column, published)
+    for each, by_window in zip(e.sets, e.avg_vrmse_by_time, strict=True):
+        for window, by_column in zip(e.windows_s, by_window, strict=True):
+            yield from _per_seed(e, ("time", each.name, each.calibration_run, 0.0, window), by_column)
+    for name, study in (("each", e.each), ("single_heading", e.single_heading)):
+        for run, by_column in zip(study.runs, study.avg_vrmse, strict=True) if study else ():
+            yield from _per_seed(e, (name, "", run.trajectory, run.from_s, run.to_s), by_column)
+
+
+def _per_seed(
+    e: Evaluation, where: Sequence[Any], by_column: Array, published: Array | None = None
+) -> Iterator[Sequence[Any]]:
+    for index, column in enumerate(e.columns):
+        known = "" if published is None or np.isnan(published[index]) else float(published[index])
+        for seed, value in zip(e.seeds, by_column[index].tolist(), strict=True):
+            if np.isfinite(value):
+                yield (*where, column, seed, value, known)
+
+
+def _window(seconds: float | None) -> str:
+    return "all" if seconds is None else f"{seconds:g}"
+
+
+def _row(columns: Sequence[str], values: Array) -> dict[str, float]:
+    return dict(zip(columns, values.tolist(), strict=True))
+
+
+def _table(names: Sequence[str], columns: Sequence[str], values: Array) -> dict[str, dict[str, float]]:
+    return {name: _row(columns, row) for name, row in zip(names, values, strict=True)}
+
+
+def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
+    return {
+        each.model: {
+            "errors": each.n_errors,
+            "within_68": {"pooled": each.pooled_68, **_row(each.state_names, each.within_68)},
+            "within_95": {"pooled": each.pooled_95, **_row(each.state_names, each.within_95)},
+            "mean_error": _row(each.state_names, each.mean_error),
+            "rms_error": _row(each.state_names, each.rms_error),
+            "mean_std": _row(each.state_names, each.mean_std),
+        }
+        for each in coverage
+    }
+
+
+def _errors_in_variables(e: Evaluation) -> dict[str, Any] | None:
+    study = e.errors_in_variables
+    if study is None:
+        return None
+    return {
+        "formula": study.formula,
+        "gnss_std": study.gnss_std.tolist(),
+        "models": {
+            name: {
+                "noisy_axes": float(axes),
+                "predicted": predicted.tolist(),
+                "measured": measured.tolist(),
+                "standard_error": error.tolist(),
+            }
+            for name, axes, predicted, measured, error in zip(
+                study.models, study.noisy_axes, study.predicted, study.measured, study.standard_error, strict=True
+            )
+        },
+    }
+
+
+def _each(study: EachStudy | None, columns: Sequence[str]) -> dict[str, Any] | None:
+    if study is None:
+        return None
+    runs = [
+        {
+            **vars(run),
+            "avg_vrmse": _row(columns, scores),
+            "yaw_observed": _row(columns[1:], observed),
+        }
+        for run, scores, observed in zip(study.runs, study.avg_vrmse.mean(axis=-1), study.yaw_observed, strict=True)
+    ]
+    return {
+        "runs": runs,
+        "median": _row(columns, study.median()),
+        "median_manoeuvring": _row(columns, study.median(MANOEUVRING)),
+        "coverage": _coverage(study.coverage),
+    }
