@@ -119,7 +119,8 @@ def document(bag, tmp_path_factory) -> dict:
 
 
 def test_replay_json_has_the_documented_structure(document, bag):
-    assert set(document) == {"models", "selected", "counts", "parameters", "version"}
+    assert set(document) == {"models", "verification", "selected", "counts", "parameters", "version"}
+    assert set(document["verification"]) == set(MODELS)
     assert list(document["models"]) == list(MODELS)
     for name, model in MODELS.items():
         entry = document["models"][name]

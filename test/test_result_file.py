@@ -262,7 +262,11 @@ def test_a_run_continued_from_a_file_ends_as_if_both_had_been_one(tmp_path):
     second = write_bag(tmp_path / "second", samples[400:])
     continued = estimates(second, initial_calibration=str(tmp_path / "first.yaml"))
     for name, expected in whole.items():
-        assert continued[name] == pytest.approx(expected, rel=1e-9, abs=1e-12)
+        # G1's prior is on errors that its linear filter does not hold, so a cut costs it the second order; the motion's
+        # news is shared with the sample before, which the first of a run has not (F1, A1)
+        exact = not (MODELS[name].in_correction_parameters or MODELS[name].motion_is_noise)
+        tolerance = {"rel": 1e-9, "abs": 1e-12} if exact else {"rel": 5e-3, "abs": 3e-4}
+        assert continued[name] == pytest.approx(expected, **tolerance)
     assert estimates(second)["M3"] != pytest.approx(whole["M3"], rel=1e-3)
 
 

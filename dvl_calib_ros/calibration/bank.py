@@ -14,12 +14,12 @@ from scipy.special import chdtr, gammaincinv, ndtri
 
 from . import kalman
 from .correction_parameters import to_correction, to_errors, with_prior_on_errors
+from .folds import FOLDS, FoldInformation, folds_of
 from .frames import Array
 from .kalman import GaussianState
 from .models import N_MEASUREMENT, Model
 from .observations import Observations
 from .parameters import Parameters
-from .verification import FOLDS, FoldInformation, folds_of
 
 # From here on the vectorised batch is faster than the recursion.
 BATCH_FROM = 24
@@ -72,10 +72,10 @@ class Assembler:
         return rate if rate.any() else None
 
     def state(self, index: int, x: Array, p: Array) -> GaussianState:
-        """One model's state and covariance out of the filter's x (n,) and P (n, n)."""
+        """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
         model = self.models[index]
         n = model.n_state
-        held = GaussianState(x[:n].copy(), p[:n, :n].copy())
+        held = GaussianState(x[..., :n].copy(), p[..., :n, :n].copy())
         if not model.in_correction_parameters:
             return held
         if self.process_rate is not None:  # what the prior still weighs is then not known

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from .bank import ModelBank, nis_bounds
+from .folds import Moments, folds_of
 from .frames import ENU_FROM_NED, Array, Quaternion, Vector, rotation_from_quaternion, slerp
 from .kalman import GaussianState, Mask
 from .models import MODELS, Needs
@@ -32,7 +33,7 @@ from .samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from .screening import CovarianceScreen, is_valid_velocity, unit_quaternion
 from .selection import Selection
 from .streams import Bracket, Order, S, Sequencer, Track
-from .verification import Moments, Verification, folds_of, held_out_error, verify
+from .verification import Verification, held_out_error, verify
 
 SECOND_NS = 1_000_000_000
 # How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.

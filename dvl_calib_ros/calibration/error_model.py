@@ -34,8 +34,10 @@ def correct(velocity_dvl: Array, misalignment: Array, scale: Array, rotation_dvl
     return velocity_dvl @ correction_matrix(misalignment, scale, rotation_dvl_from_body).T
 
 
-# [v×] and -diag(v) side by side are linear in v: their elements, row by row, are v @ _JACOBIAN.
-_JACOBIAN: Array = np.concatenate([skew(np.eye(3)), [-np.diag(axis) for axis in np.eye(3)]], axis=2).reshape(3, 18)
+# [v×] and -diag(v) side by side (3, 6) are linear in v: their elements, row by row, are v @ CORRECTION_JACOBIAN.
+CORRECTION_JACOBIAN: Array = np.concatenate([skew(np.eye(3)), [-np.diag(axis) for axis in np.eye(3)]], axis=2).reshape(
+    3, 18
+)
 
 
 def correction_jacobian(velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
@@ -43,7 +45,7 @@ def correction_jacobian(velocity_dvl: Array, rotation_dvl_from_body: Array) -> A
 
     From the first-order inverse ``v_b = Tᵀ (v - φ×v - δk∘v)``: columns ``Tᵀ[v×]`` and ``-Tᵀ diag(v)``.
     """
-    return rotation_dvl_from_body.T @ (velocity_dvl @ _JACOBIAN).reshape(3, 6)
+    return rotation_dvl_from_body.T @ (velocity_dvl @ CORRECTION_JACOBIAN).reshape(3, 6)
 
 
 def corrected_mounting(misalignment: Array, rotation_dvl_from_body: Array) -> Array:

@@ -326,6 +326,39 @@ class Parameters:
         high=0.5,
         read_only=False,
     )
+    verification_block: float = _parameter(
+        10.0,
+        "Length of the blocks that hold-out verification deals out to its folds.",
+        unit="s",
+        low=0.1,
+        high=3600.0,
+    )
+    accept_misalignment: float = _parameter(
+        math.radians(2.0),
+        "A calibration with a misalignment below this (2°) may be accepted; above it is marginal ...",
+        unit="rad",
+        low=0.0,
+        high=math.pi,
+    )
+    reject_misalignment: float = _parameter(
+        math.radians(5.0),
+        "... and from this (5°) on rejected.",
+        unit="rad",
+        low=0.0,
+        high=math.pi,
+    )
+    max_scale_error: float = _parameter(
+        0.05,
+        "A calibration with a scale-factor error above this is rejected.",
+        low=0.0,
+        high=1.0,
+    )
+    max_error_ratio: float = _parameter(
+        1.0,
+        "A held-out velocity error above so many times the predicted one (and beyond chance) makes it marginal.",
+        low=0.1,
+        high=100.0,
+    )
     result_file: str = _parameter(
         "",
         "Result file (YAML) written by ~/save and at shutdown. Empty: none.",

@@ -13,6 +13,7 @@ from .frames import Array
 from .models import MODELS
 from .observability import Convergence, Observability
 from .selection import Segment
+from .verification import Verification
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class Result:
 
     first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
     `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values.
+    verifications: by model, empty if the calibrator was not to verify.
     """
 
     selected: str
@@ -78,6 +80,7 @@ class Result:
     first_ns: int | None
     last_ns: int | None
     parameters: Mapping[str, Any]
+    verifications: Mapping[str, Verification]
 
     @property
     def estimate(self) -> Estimate:

@@ -10,6 +10,7 @@ from .reporting import add_report_option, report_writer
 
 NAME = "replay"
 HELP = "calibrate with recorded bags"
+VERDICT_COLOURS = {"accept": "green", "marginal": "yellow", "reject": "red"}
 EXAMPLE = "dvl-calib replay my_bag --models all --params calibration.yaml --save calibration_result.yaml"
 
 
@@ -86,3 +87,8 @@ def _print(notes, result, models) -> None:  # type: ignore[no-untyped-def]
     for entry in result.estimate.observability:
         if entry.missing:
             out.print(f"{result.selected} has not seen {entry.name} ({entry.axis}) yet; it needs {entry.missing}")
+    verification = result.verifications[result.selected]
+    word = verification.verdict.value
+    out.print(
+        f"verdict on {result.selected}: [bold {VERDICT_COLOURS[word]}]{word}[/]: {'; '.join(verification.reasons)}"
+    )

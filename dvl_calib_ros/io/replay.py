@@ -20,6 +20,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
+from ..calibration.verification import verification_document
 from .bags import BagReader
 from .errors import InputError
 from .messages import IMU_TYPE, TWIST_TYPE, MessageFeed
@@ -90,6 +91,7 @@ def replay(
         block_size=BLOCK_SIZE,
         on_event=notes.append,
         on_block=recorder.observe if recorder else on_block,
+        verified=True,
     )
     feed = MessageFeed(calibrator, notes.append)
     with BagReader(paths) as bag:
@@ -228,6 +230,7 @@ def replay_document(result: Result, models: Sequence[str]) -> dict[str, Any]:
         ]
     return {
         "models": {name: estimate_document(result.estimates[name]) for name in models},
+        "verification": {name: verification_document(result.verifications[name]) for name in models},
         "selected": segments,
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
         "parameters": dict(result.parameters),

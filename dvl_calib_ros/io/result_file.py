@@ -18,10 +18,11 @@ import numpy as np
 import yaml
 
 from .. import __version__
-from ..calibration.kalman import GaussianState
 from ..calibration.frames import quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate, Result
+from ..calibration.verification import verification_document
 from .errors import InputError
 from .yaml_files import load_yaml
 
@@ -47,17 +48,15 @@ def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, An
     nominal = rotation_from_rpy(parameters["mounting_rpy"])
     corrected = estimate.rotation_body_from_dvl(nominal.T)
     rpy, quaternion = rpy_from_rotation(corrected), quaternion_from_rotation(corrected)
-    names = dict(zip(estimate.state_names, estimate.std.tolist(), strict=True))
+    verification = result.verifications.get(result.selected)
     return {
         "format": FORMAT,
         "software": f"dvl_calib_ros {__version__}",
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "model": result.selected,
         **estimate_document(estimate),
-        "std": {
-            name: f"{math.degrees(std):.4f} deg" if name.startswith("phi") else f"{100 * std:.4f} %"
-            for name, std in names.items()
-        },
+        "std": _std_in_words(estimate),
+        **({} if verification is None else {"verification": verification_document(verification)}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
         "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],
         "mounting": {
@@ -73,6 +72,16 @@ def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, An
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
         "parameters": dict(parameters),
     }
+
+
+def _std_in_words(estimate: Estimate) -> dict[str, str]:
+    units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
+    known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
+    words = {}
+    for name, std in zip(estimate.state_names, estimate.std.tolist(), strict=True):
+        factor, unit = known.get(name) or units[name.partition("_")[0]]
+        words[name] = f"{factor * std:.4f} {unit}".rstrip()
+    return words
 
 
 def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str:

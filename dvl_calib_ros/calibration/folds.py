@@ -1,0 +1,93 @@
+"""Cutting a run into folds, and what is kept of each to solve without it and to judge on it.
+
+A run is cut into blocks of `verification_block`, dealt out in turn to `FOLDS` folds: neighbouring blocks go to
+different ones, so all folds see every part of a run. With Φ = I the information that samples bring is a sum
+(kalman.py), so what a fold brought is kept as one matrix per model, and solving without it leaves that matrix out. No
+second pass, constant memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .frames import Array
+from .kalman import GaussianState, Measurements
+from .observations import Observations
+from .parameters import Parameters
+
+FOLDS = 5
+
+
+def folds_of(stamps_ns: Sequence[int], parameters: Parameters) -> NDArray[np.int64]:
+    """Fold (N,) of each sample, by its stamp alone."""
+    return np.asarray(stamps_ns, dtype=np.int64) // round(parameters.verification_block * 1e9) % FOLDS
+
+
+class FoldInformation:
+    """What each fold told K models: its part of Λ (FOLDS, K, n, n) and of Λx (FOLDS, K, n)."""
+
+    def __init__(self, start: GaussianState) -> None:
+        """start: x (K, n), P (K, n, n) of the filter."""
+        k, n = start.x.shape
+        self._prior = np.linalg.inv(start.p)
+        self._prior_state = (self._prior @ start.x[:, :, None])[:, :, 0]
+        self._information = np.zeros((FOLDS, k, n, n))
+        self._information_state = np.zeros((FOLDS, k, n))
+
+    def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
+        """Add N samples, as far as models used them (K, N)."""
+        h = data.h.swapaxes(2, 3)  # (K, N, n, m)
+        wh = h @ np.linalg.inv(data.r) * (data.weight * used)[:, :, None, None]
+        for fold in np.unique(folds):
+            at = folds == fold
+            wh_fold = _rows(wh[:, at])
+            self._information[fold] += wh_fold.swapaxes(1, 2) @ _rows(h[:, at])
+            self._information_state[fold] += (wh_fold.swapaxes(1, 2) @ data.z[:, at].reshape(len(wh), -1, 1))[:, :, 0]
+
+    def without(self, fold: int, index: int) -> GaussianState:
+        """The filter's x (n,) and P (n, n) of one model, had it not seen a fold."""
+        others = np.arange(FOLDS) != fold
+        p = np.linalg.inv(self._prior[index] + self._information[others, index].sum(axis=0))
+        return GaussianState(p @ (self._prior_state[index] + self._information_state[others, index].sum(axis=0)), p)
+
+
+def _rows(h: Array) -> Array:
+    """(K, N, n, m) -> (K, N m, n)."""
+    k, n_samples, n, m = h.shape
+    return h.swapaxes(2, 3).reshape(k, n_samples * m, n)
+
+
+class Moments:
+    """All that is kept of samples with a reference to judge any correction by.
+
+    For each fold the number of samples and the sums of v vᵀ, g vᵀ, gᵀg and of the trace of R, with v (3,) m/s
+    measured, DVL frame, at the reference point, and g (3,) m/s the reference velocity, body frame.
+    """
+
+    def __init__(self) -> None:
+        self.count = np.zeros(FOLDS, dtype=np.int64)
+        self.vv = np.zeros((FOLDS, 3, 3))
+        self.gv = np.zeros((FOLDS, 3, 3))
+        self.gg = np.zeros(FOLDS)
+        self.noise = np.zeros(FOLDS)
+
+    def add(self, folds: NDArray[np.int64], seen: Observations) -> None:
+        """Add N samples."""
+        assert seen.reference_body is not None
+        v, g = seen.velocity_at_reference, seen.reference_body
+        trace = np.broadcast_to(np.trace(seen.noise, axis1=1, axis2=2), folds.shape)
+        for fold in np.unique(folds):
+            at = folds == fold
+            self.count[fold] += at.sum()
+            self.vv[fold] += v[at].T @ v[at]
+            self.gv[fold] += g[at].T @ v[at]
+            self.gg[fold] += np.sum(g[at] ** 2)
+            self.noise[fold] += trace[at].sum()
+
+    def squared_error(self, fold: int, body_from_measured: Array) -> float:
+        """Sum over a fold of |g - C v|² (m/s)², C (3, 3)."""
+        c = body_from_measured
+        return float(self.gg[fold] - 2.0 * np.sum(c * self.gv[fold]) + np.sum(c @ self.vv[fold] * c))

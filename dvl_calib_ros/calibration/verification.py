@@ -1,0 +1,169 @@
+"""Hold-out verification: a calibration is judged on samples that it did not use.
+
+For each fold of a run (folds.py) the models are solved again without it, and their correction is tried on it against
+the reference velocity, so that every sample with a reference is judged once, by an estimate that has not seen it. Two
+things are those of the whole run: which samples the gate lets pass, and the random walk, which is taken as none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from .error_model import CORRECTION_JACOBIAN, correction_matrix
+from .folds import Moments
+from .frames import Array
+from .kalman import GaussianState
+from .models import Model
+from .observability import Convergence
+from .parameters import Parameters
+
+# Fewer samples with a reference prove nothing.
+ENOUGH_SAMPLES = 20
+# Share of runs whose held-out error may by chance exceed what a true covariance predicts.
+CHANCE = 0.01
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """Velocity error against the reference on held-out samples, m/s rms over the vector.
+
+    uncorrected: with the nominal mounting. corrected: with the estimate. predicted: what R of the reference and the
+    covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference.
+    """
+
+    samples: int
+    uncorrected: float
+    corrected: float
+    predicted: float
+
+
+def held_out_error(
+    model: Model, without: Sequence[GaussianState], moments: Moments, rotation_dvl_from_body: Array
+) -> HeldOutError | None:
+    """Error of a model on every fold, with the state that has not seen it; None if there is too little to judge by.
+
+    without: one state for each fold.
+    """
+    samples = int(moments.count.sum())
+    if samples < ENOUGH_SAMPLES or np.count_nonzero(moments.count) < 2:
+        return None
+    nominal = rotation_dvl_from_body.T
+    uncorrected = corrected = predicted = 0.0
+    for fold, state in enumerate(without):
+        errors = model.error_terms_from_state @ state.x
+        covariance = model.error_terms_from_state @ state.p @ model.error_terms_from_state.T
+        uncorrected += moments.squared_error(fold, nominal)
+        corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
+        predicted += moments.noise[fold] + _calibration_variance(covariance, moments.vv[fold])
+    uncorrected, corrected, predicted = (
+        math.sqrt(max(total, 0.0) / samples) for total in (uncorrected, corrected, predicted)
+    )
+    return HeldOutError(samples, uncorrected, corrected, predicted)
+
+
+def _calibration_variance(covariance: Array, vv: Array) -> float:
+    """Sum of trace(J P Jᵀ) (m/s)² over samples of which only Σ v vᵀ is known: J is linear in v."""
+    return float(np.einsum("kai,lbi,ab,kl->", _JACOBIAN_BY_ERROR, _JACOBIAN_BY_ERROR, covariance, vv))
+
+
+# d(velocity)/d(error a) for a velocity along k, axis i: [k, a, i]
+_JACOBIAN_BY_ERROR: Array = CORRECTION_JACOBIAN.reshape(3, 3, 6).swapaxes(1, 2)
+
+
+class Word(Enum):
+    """What to do with a calibration."""
+
+    ACCEPT = "accept"
+    MARGINAL = "marginal"
+    REJECT = "reject"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The verdict on one model's calibration, with reasons (sentences, the decisive ones first)."""
+
+    model: str
+    held_out: HeldOutError | None
+    verdict: Word
+    reasons: tuple[str, ...]
+
+
+def verify(
+    model: Model, state: GaussianState, convergence: Convergence, held_out: HeldOutError | None, parameters: Parameters
+) -> Verification:
+    """Judge an estimate of all the data (state) by its size and by what it did on held-out samples."""
+    findings = [
+        *_size_findings(model, state, parameters),
+        *_convergence_findings(convergence),
+        _error_finding(held_out, parameters),
+    ]
+    findings.sort(key=lambda finding: _SEVERITY.index(finding[0]))
+    return Verification(model.name, held_out, findings[0][0], tuple(sentence for _, sentence in findings))
+
+
+Finding = tuple[Word, str]
+_SEVERITY = (Word.REJECT, Word.MARGINAL, Word.ACCEPT)
+
+
+def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Finding]:
+    errors = model.error_terms_from_state @ state.x
+    angle = math.degrees(math.atan(float(np.linalg.norm(errors[:3]))))
+    accept, reject = math.degrees(parameters.accept_misalignment), math.degrees(parameters.reject_misalignment)
+    findings = []
+    if angle >= reject:
+        remedy = "is mounting_rpy right, and are the frames?"
+        findings.append((Word.REJECT, f"the misalignment is {angle:.1f}°, {reject:.1f}° or more: {remedy}"))
+    elif angle >= accept:
+        findings.append((Word.MARGINAL, f"the misalignment is {angle:.1f}°, {accept:.1f}° or more"))
+    scale = float(np.abs(errors[3:]).max())
+    if scale > parameters.max_scale_error:
+        limit = 100.0 * parameters.max_scale_error
+        findings.append((Word.REJECT, f"a scale is {100.0 * scale:.1f} % off, more than {limit:.1f} %"))
+    return findings
+
+
+def _error_finding(held_out: HeldOutError | None, parameters: Parameters) -> Finding:
+    if held_out is None:
+        return Word.MARGINAL, "too few samples with a reference velocity to verify it on held-out data"
+    uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
+    found = (
+        f"on {held_out.samples} samples that it had not seen the velocity error is {uncorrected:.3f} m/s rms without "
+        f"correction, {corrected:.3f} with it, {predicted:.3f} predicted"
+    )
+    if corrected > uncorrected:
+        return Word.REJECT, f"{found}: the calibration makes it worse"
+    dof = 3 * held_out.samples
+    by_chance = math.sqrt(float(chdtri(dof, CHANCE)) / dof)
+    if corrected > predicted * parameters.max_error_ratio * by_chance:
+        return Word.MARGINAL, f"{found}: the reference is noisier than it says, or an effect is missing from the model"
+    return Word.ACCEPT, found
+
+
+def _convergence_findings(convergence: Convergence) -> list[Finding]:
+    if convergence is Convergence.COLLECTING:
+        return [(Word.MARGINAL, "the data has shown none of the angles yet")]
+    return []
+
+
+def verification_document(verification: Verification) -> dict[str, Any]:
+    """Plain data, for JSON and YAML."""
+    held_out = verification.held_out
+    return {
+        "verdict": verification.verdict.value,
+        "reasons": list(verification.reasons),
+        "held_out": None
+        if held_out is None
+        else {
+            "samples": held_out.samples,
+            "uncorrected_mps": held_out.uncorrected,
+            "corrected_mps": held_out.corrected,
+            "predicted_mps": held_out.predicted,
+        },
+    }
