@@ -14,7 +14,7 @@ from ..calibration.frames import Array
 from ..calibration.models import MODELS
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
-from .page import Cell, Table, parameter_texts, signed, write_page
+from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .replay_figures import held_out_bars
 from .style import Picture, picture
 
@@ -346,11 +346,10 @@ def _trace(trace: Trace) -> dict[str, Any]:
 
 
 def _held_out(held_out: Sequence[HeldOut]) -> dict[str, Any]:
-    kinds = {"accept": "good", "marginal": "off", "reject": "bad"}
     rows = [
         (
             f"{each.set_name} {each.model}",
-            Cell(each.verdict, kinds.get(each.verdict, "")),
+            Cell(each.verdict, VERDICT_KINDS[each.verdict]),
             f"{each.uncorrected:.4f}",
             f"{each.corrected:.4f}",
             f"{each.predicted:.4f}",
@@ -358,7 +357,7 @@ def _held_out(held_out: Sequence[HeldOut]) -> dict[str, Any]:
         for each in held_out
     ]
     labels = [f"{each.set_name} {each.model}" for each in held_out]
-    errors: dict[str, list[float | None]] = {
+    errors = {
         "uncorrected": [each.uncorrected for each in held_out],
         "corrected": [each.corrected for each in held_out],
         "predicted": [each.predicted for each in held_out],

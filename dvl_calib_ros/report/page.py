@@ -18,6 +18,9 @@ from .. import __version__
 from ..io.result_file import save_text
 from .style import MODEL_STYLES
 
+# Class of a cell that holds a verdict
+VERDICT_KINDS = {"accept": "good", "marginal": "off", "reject": "bad"}
+
 
 @dataclass(frozen=True)
 class Cell:

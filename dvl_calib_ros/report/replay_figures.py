@@ -161,17 +161,15 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
     return figure
 
 
-def held_out_bars(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> Figure:
+def held_out_bars(labels: Sequence[str], errors: Mapping[str, Sequence[float]]) -> Figure:
     """Velocity error on data held back, m/s rms: for each label one bar per kind (uncorrected, corrected, ...)."""
     colours = (UNCALIBRATED_COLOUR, "#1f6fb2", FAINT)
     figure, axes = new_figure(height=1.1 + 0.5 * len(labels))
     height = 0.8 / len(errors)
     for i, ((kind, values), colour) in enumerate(zip(errors.items(), colours, strict=False)):
         at = np.arange(len(labels)) + (i - 0.5 * (len(errors) - 1)) * height
-        numbers = np.array([np.nan if value is None else value for value in values])
-        bars = axes.barh(at, numbers, height=0.92 * height, color=colour, label=kind)
-        texts = ["" if np.isnan(number) else f"{number:.3f}" for number in numbers]
-        axes.bar_label(bars, labels=texts, padding=2, fontsize=7.5)
+        bars = axes.barh(at, values, height=0.92 * height, color=colour, label=kind)
+        axes.bar_label(bars, fmt="%.3f", padding=2, fontsize=7.0)
     axes.set_yticks(range(len(labels)), labels)
     axes.invert_yaxis()
     axes.margins(x=0.14)

@@ -15,14 +15,14 @@ from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
 from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate, Result
+from ..calibration.verification import HeldOutError, Verification
 from ..io.recorder import ModelHistory, RunHistory
 from ..io.replay import Replayed
 from ..io.result_file import result_document
 from . import replay_figures as figures
-from .page import Cell, Table, parameter_texts, signed, write_page
+from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture
 from .time_axis import TimeAxis
-from .verdict import NOT_VERIFIED, Verdict
 
 
 class Term(NamedTuple):
@@ -51,18 +51,16 @@ BODY_AXES = ("ahead", "to port", "up")
 FAMILIES = ((True, "Models with GNSS"), (False, "Models without GNSS"))
 
 
-def write_replay_report(
-    path: Path, replayed: Replayed, bags: Sequence[Path], models: Sequence[str], verdict: Verdict = NOT_VERIFIED
-) -> None:
+def write_replay_report(path: Path, replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) -> None:
     """Write the report of a replay that was run with a history.
 
     bags: what was replayed. models: names to show; the selected one is always among them. Raises InputError if the
     file cannot be written.
     """
-    write_page(path, "replay.html", _context(replayed, bags, models, verdict))
+    write_page(path, "replay.html", _context(replayed, bags, models))
 
 
-def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str], verdict: Verdict) -> dict[str, Any]:
+def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) -> dict[str, Any]:
     result, history = replayed.result, replayed.history
     if history is None:
         raise ValueError("the replay has no history; run it with with_history=True")
@@ -74,12 +72,12 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str], ve
         "title": "DVL calibration",
         "subtitle": names,
         "written": document["written"].replace("T", " ").replace("+00:00", " UTC"),
-        "verdict": verdict,
+        "verdict": _verdict(result.verifications.get(result.selected)),
         "numbers": _numbers(result.estimate),
         "facts": _facts(result, document["mounting"], bags),
         "static_transform": document["mounting"]["static_transform_publisher"],
         "warnings": replayed.notes,
-        "held_out": _held_out(verdict),
+        "held_out": _held_out(result, shown),
         "estimates": _estimate_table(result, shown),
         "families": list(_families(result, history, time, shown)),
         "selected": result.selected,
@@ -165,33 +163,40 @@ def _utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _held_out(verdict: Verdict) -> dict[str, Any] | None:
-    if not verdict.errors:
+def _verdict(verification: Verification | None) -> dict[str, Any]:
+    """Word and reasons on the selected model, large."""
+    if verification is None:
+        return {"word": "not verified", "reasons": ("nothing was held back to verify the calibration on",)}
+    return {"word": verification.verdict.value, "reasons": verification.reasons}
+
+
+def _held_out(result: Result, shown: Sequence[str]) -> dict[str, Any] | None:
+    """What each model's correction did to data that it had not seen."""
+    verifications = {name: result.verifications[name] for name in shown if name in result.verifications}
+    judged = {name: each.held_out for name, each in verifications.items() if each.held_out is not None}
+    if not judged:
         return None
-    table = Table(
-        ("held-out velocity error, m/s rms", "uncorrected", "corrected", "predicted", "samples"),
-        [
-            (
-                error.label,
-                f"{error.uncorrected:.4f}",
-                f"{error.corrected:.4f}",
-                "-" if error.predicted is None else f"{error.predicted:.4f}",
-                str(error.samples),
-            )
-            for error in verdict.errors
-        ],
-    )
-    kinds = {
-        "uncorrected": [error.uncorrected for error in verdict.errors],
-        "corrected": [error.corrected for error in verdict.errors],
-        "predicted": [error.predicted for error in verdict.errors],
-    }
-    alt = "; ".join(f"{e.label}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for e in verdict.errors)
-    labels = [error.label for error in verdict.errors]
+    rows: list[tuple[str | Cell, ...]] = [
+        (name, *_held_out_cells(judged.get(name)), Cell(each.verdict.value, VERDICT_KINDS[each.verdict.value]))
+        for name, each in verifications.items()
+    ]
+    kinds = ("uncorrected", "corrected", "predicted")
+    errors = {kind: [getattr(error, kind) for error in judged.values()] for kind in kinds}
+    alt = "; ".join(f"{name}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for name, e in judged.items())
     return {
-        "table": table,
-        "pictures": [picture("Velocity error on held-out data", alt, figures.held_out_bars, labels, kinds)],
+        "table": Table(
+            ("model", *kinds, "samples", "verdict"), rows, marked=list(verifications).index(result.selected)
+        ),
+        "pictures": [
+            picture("Velocity error on held-out data", alt, figures.held_out_bars, list(judged), errors),
+        ],
     }
+
+
+def _held_out_cells(error: HeldOutError | None) -> tuple[str, ...]:
+    if error is None:
+        return ("–", "–", "–", "0")
+    return (f"{error.uncorrected:.4f}", f"{error.corrected:.4f}", f"{error.predicted:.4f}", str(error.samples))
 
 
 # ------------------------------------------------------------------ estimates
@@ -219,6 +224,7 @@ def _estimate_table(result: Result, shown: Sequence[str]) -> Table:
         ("model", *(f"{term.name}, {term.unit.strip()}" for term in terms), "used", "gated", "NIS/m", "convergence"),
         rows,
         marked=list(shown).index(result.selected),
+        dense=True,
         notes=(
             "± is 1σ as the model believes it; ? marks what this data does not show; – is not estimated. φ and δk are "
             "in the DVL's frame. NIS/m: mean normalised innovation squared per measured component, about 1 when the "
@@ -334,7 +340,7 @@ def _data_pictures(result: Result, history: RunHistory, time: TimeAxis, shown: S
         picture(
             "Samples by model", "How many DVL samples each model used, gated or was not given",
             figures.samples_by_fate, list(shown), fates,
-            caption="Not given: without a GNSS velocity (models with GNSS), in the window of the prior, or held back.",
+            caption="Not given: without the GNSS velocity or attitude it needs, or in the window of its prior.",
         ),
         picture(
             "Selected model and GNSS", f"Which model was selected over time: {switches}; and when GNSS was there",

@@ -1,0 +1,135 @@
+"""Reports for the tests: a replay's and an evaluation's, from little data, and how to read them."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from io_fixtures import run, write_bag
+
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.evaluation.results import (
+    UNCALIBRATED,
+    CalibrationRun,
+    CalibrationSet,
+    Coverage,
+    EachStudy,
+    ErrorsInVariables,
+    Evaluation,
+    HeldOut,
+    Trace,
+)
+from dvl_calib_ros.io.replay import Replayed, replay
+from dvl_calib_ros.report.replay_report import write_replay_report
+
+
+class Page(HTMLParser):
+    """What a page consists of: its tags with attributes, its text, and the cells of its tables."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.rows: list[list[str]] = []
+        self._text: list[str] = []
+        self._in_cell = self._in_style = False
+        self.feed(path.read_text())
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self._text).split())
+
+    def row(self, name: str) -> list[str]:
+        """The first row of a table that starts with this name."""
+        return next(row for row in self.rows if row and row[0] == name)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._in_style = tag == "style"
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+            self._in_cell = True
+
+    def handle_endtag(self, tag):
+        self._in_style = self._in_style and tag != "style"
+        self._in_cell = self._in_cell and tag not in ("td", "th")
+
+    def handle_data(self, data):
+        if self._in_style:
+            return
+        self._text.append(data)
+        if self._in_cell:
+            self.rows[-1][-1] = f"{self.rows[-1][-1]} {data}".strip()
+
+    def images(self) -> list[dict[str, str | None]]:
+        return [attributes for tag, attributes in self.tags if tag == "img"]
+
+
+def recorded(bag: Path, **parameters: Any) -> Replayed:
+    return replay([bag], Parameters(**parameters), with_history=True)
+
+
+def replay_page(folder: Path, samples=None, **bag_options: Any) -> tuple[Path, Replayed]:
+    """A report of a small bag, and what was replayed."""
+    bag = write_bag(folder / "bag", run() if samples is None else samples, **bag_options)
+    replayed = recorded(bag)
+    path = folder / "report.html"
+    write_replay_report(path, replayed, [bag], list(MODELS))
+    return path, replayed
+
+
+def evaluation(**changes: Any) -> Evaluation:
+    """An evaluation with made-up numbers that have the shapes of real ones. Models that need attitude are nan on E2."""
+    rng = np.random.default_rng(1)
+    models = tuple(MODELS)
+    sets = (CalibrationSet("E1", "T12", 200.0), CalibrationSet("E2", "T$1$<b>", None))
+    windows = (50.0, 100.0, 200.0, None)
+    level = np.array([0.12, *np.linspace(0.03, 0.09, len(models))])
+    avg_vrmse = np.tile(level[None, :, None], (2, 1, 2))
+    avg_vrmse[1, -1] = np.nan
+    time = np.linspace(0.0, 100.0, 900)
+    truth = np.stack([1.5 + 0 * time, 0.2 * np.sin(time / 9), 0 * time], axis=1)
+    n_aided = sum(model.aided for model in MODELS.values())
+    runs = (CalibrationRun("T01", 0.0, 400.0, 1.9), CalibrationRun("T$1$<b>", 10.0, 80.0, 0.05))
+    coverage = tuple(
+        Coverage(
+            name, MODELS[name].state_names[:3], np.full(3, 0.7), np.full(3, 0.9), 0.7, 0.5, 30, np.zeros(3), np.ones(3),
+            np.ones(3),
+        )
+        for name in models
+    )  # fmt: skip
+    values: dict[str, Any] = {
+        "source": "folder <b>$x$</b>",
+        "own_generator": False,
+        "notes": ("T99 is <i>missing</i>",),
+        "trajectories": ("T01", "T12", "T$1$<b>"),
+        "models": models,
+        "sets": sets,
+        "seeds": (0, 1),
+        "n_combinations": 15,
+        "avg_vrmse": avg_vrmse,
+        "windows_s": windows,
+        "avg_vrmse_by_time": np.tile(avg_vrmse[:, None], (1, len(windows), 1, 1)),
+        "published": {"E1": {UNCALIBRATED: 0.121, "M1": 0.0301, "M2": 0.10}},
+        "coverage": coverage,
+        "errors_in_variables": ErrorsInVariables(
+            models[:n_aided], np.array([0.05, 0.1, 0.2]), -0.01 * np.ones((n_aided, 3)), -0.011 * np.ones((n_aided, 3)),
+            0.001 * np.ones((n_aided, 3)), np.ones(n_aided), "-a σ²/‖v‖²",
+        ),
+        "each": EachStudy(runs, np.tile(level[None, :, None], (2, 1, 2)), np.ones((2, len(models))), coverage),
+        "single_heading": None,
+        "traces": (
+            Trace(
+                "T$1$<b>", "E1", "misalignment of 1°", time, truth, 1.02 * truth,
+                {name: truth + 0.01 * rng.normal(size=truth.shape) for name in models},
+            ),
+        ),
+        "parameters": Parameters().as_dict(),
+        "version": "0",
+        "held_out": (HeldOut("E1", "M3", "accept", 0.12, 0.03, 0.031),),
+    }  # fmt: skip
+    return Evaluation(**{**values, **changes})

@@ -1,0 +1,110 @@
+"""Reports in a real browser: no error, nothing loaded, every figure there, nothing wider than the screen."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from report_fixtures import evaluation, replay_page
+
+from dvl_calib_ros.report import write_evaluation_report
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PHONE, DESKTOP = (375, 740), (1280, 900)
+A4_WIDTH = 695  # without margins, at 96 dpi
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    executable = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if executable is None:
+        pytest.skip(f"no browser: none of {', '.join(BROWSERS)} is installed")
+    with sync_api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("reports")
+    hostile = folder / "<img src=x onerror=alert(1)>"
+    hostile.mkdir()
+    made = {"replay": replay_page(hostile)[0], "evaluation": folder / "evaluation.html"}
+    write_evaluation_report(made["evaluation"], evaluation())
+    return made
+
+
+@pytest.fixture(params=["replay", "evaluation"])
+def report(request, reports) -> Path:
+    return reports[request.param]
+
+
+def opened(browser, report: Path, size: tuple[int, int]):
+    """The page in the browser, and whatever went wrong or was loaded from elsewhere."""
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    problems: list[str] = []
+    page.on("console", lambda message: problems.append(f"{message.type}: {message.text}"))
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("dialog", lambda dialog: (problems.append(dialog.message), dialog.dismiss()))
+    page.on("request", lambda request: problems.append(request.url) if request.url != report.as_uri() else None)
+    page.goto(report.as_uri())
+    page.wait_for_load_state("load")
+    problems = [problem for problem in problems if not problem.startswith("data:")]
+    return page, problems
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_a_report_opens_without_an_error_and_shows_every_figure(browser, report, size):
+    page, problems = opened(browser, report, size)
+    assert problems == []
+    images = page.evaluate(
+        """() => [...document.images].map(i => {
+             const box = i.getBoundingClientRect();
+             return [i.complete, i.naturalWidth, box.width, box.height, box.right, i.alt.length]; })"""
+    )
+    assert len(images) == report.read_text().count("<figure>") > 10
+    for complete, natural_width, width, height, right, alt in images:
+        assert complete and natural_width > 100 and alt > 10
+        assert width > 250 and height > 60 and right <= size[0]
+    page.close()
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_no_page_is_wider_than_the_screen(browser, report, size):
+    page, _ = opened(browser, report, size)
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    page.close()
+
+
+def test_the_summary_is_on_the_first_screen_of_a_phone(browser, report):
+    page, _ = opened(browser, report, PHONE)
+    box = page.locator(".verdict").bounding_box()
+    assert box["y"] + box["height"] < PHONE[1]
+    page.close()
+
+
+def test_a_wide_table_can_be_read_on_a_phone_by_scrolling_it(browser, reports):
+    page, _ = opened(browser, reports["replay"], PHONE)
+    scrolled = page.evaluate(
+        """() => { const wide = [...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth);
+             wide.forEach(e => e.scrollLeft = 1e6);
+             return wide.map(e => [e.scrollLeft, e.querySelector('tbody th').getBoundingClientRect().left]); }"""
+    )
+    assert scrolled
+    for scroll_left, row_name_left in scrolled:
+        assert scroll_left > 0 and row_name_left >= 0  # the row's name stays in sight
+    page.close()
+
+
+def test_nothing_is_cut_off_when_a_report_is_printed(browser, report):
+    page, _ = opened(browser, report, DESKTOP)
+    assert page.pdf(format="A4").startswith(b"%PDF")
+    page.emulate_media(media="print")
+    page.set_viewport_size({"width": A4_WIDTH, "height": 1000})
+    right = page.evaluate("[...document.querySelectorAll('table, img, pre')].map(e => e.getBoundingClientRect().right)")
+    assert len(right) > 10 and max(right) <= A4_WIDTH
+    page.close()
