@@ -3,6 +3,8 @@
 `T v_b = (I - [ψ×] - diag(κ)) v` is linear in what corrects (ψ, κ), `v = (I + diag(δk)) (I + [φ×]) T v_b` is how the
 errors are defined (models.md). With B = (I - [ψ×] - diag(κ))⁻¹: δk_i = B_ii - 1, and φ is the skew part of
 diag(1 + δk)⁻¹ B. To first order φ = ψ and δk = κ; at 5 degrees the difference is 0.4 per cent of the speed.
+
+Scales are those of x and y. A DVL looks down and a vehicle hardly heaves, so no motion shows that of z; κ_z is zero.
 """
 
 from __future__ import annotations
@@ -14,32 +16,32 @@ import numpy as np
 from .frames import Array, skew
 from .kalman import GaussianState
 
-# d([ψ×] + diag(κ)) / d(ψ, κ): (6, 3, 3)
-_GENERATORS: Array = np.concatenate([skew(np.eye(3)), [np.diag(axis) for axis in np.eye(3)]])
+_N = 5  # three angles, two scales
+# d([ψ×] + diag(κ)) / d(ψ, κ): (5, 3, 3)
+_GENERATORS: Array = np.concatenate([skew(np.eye(3)), [np.diag(axis) for axis in np.eye(3)]])[:_N]
 _NEWTON_STEPS = 20
-_N = 6
 
 
 class Mapped(NamedTuple):
-    """φ (3) rad and δk (3) as one vector (..., 6), and its derivative by ψ and κ (..., 6, 6)."""
+    """φ (3) rad and δk (2) as one vector (..., 5), and its derivative by ψ and κ (..., 5, 5)."""
 
     errors: Array
     jacobian: Array
 
 
 def errors_from_correction(correction: Array) -> Mapped:
-    """ψ (3) and κ (3) as one vector (..., 6) -> φ, δk with their derivatives."""
+    """ψ (3) and κ (2) as one vector (..., 5) -> φ, δk with their derivatives."""
     b = np.linalg.inv(np.eye(3) - np.tensordot(correction, _GENERATORS, 1))
-    db = b[..., None, :, :] @ _GENERATORS @ b[..., None, :, :]  # (..., 6, 3, 3), by each of ψ and κ
+    db = b[..., None, :, :] @ _GENERATORS @ b[..., None, :, :]  # (..., 5, 3, 3), by each of ψ and κ
     scale, dscale = np.diagonal(b, axis1=-2, axis2=-1), np.diagonal(db, axis1=-2, axis2=-1)
     c = b / scale[..., None]
     dc = (db - dscale[..., None] * c[..., None, :, :]) / scale[..., None, :, None]
-    derivative = np.concatenate([_skew_part(dc), dscale], axis=-1)
-    return Mapped(np.concatenate([_skew_part(c), scale - 1.0], axis=-1), np.swapaxes(derivative, -1, -2))
+    derivative = np.concatenate([_skew_part(dc), dscale], axis=-1)[..., :_N]
+    return Mapped(np.concatenate([_skew_part(c), scale - 1.0], axis=-1)[..., :_N], np.swapaxes(derivative, -1, -2))
 
 
 def correction_from_errors(errors: Array) -> Array:
-    """φ, δk (..., 6) -> ψ, κ, by Newton's method from the first-order solution."""
+    """φ, δk (..., 5) -> ψ, κ, by Newton's method from the first-order solution."""
     correction = np.array(errors, dtype=float)
     for _ in range(_NEWTON_STEPS):
         mapped = errors_from_correction(correction)
@@ -51,7 +53,7 @@ def correction_from_errors(errors: Array) -> Array:
 
 
 def to_errors(held: GaussianState) -> GaussianState:
-    """States (..., n) whose first six are ψ and κ -> the same with φ and δk."""
+    """States (..., n) whose first five are ψ and κ -> the same with φ and δk."""
     mapped = errors_from_correction(held.x[..., :_N])
     jacobian = _extended(mapped.jacobian, held.x.shape[-1])
     x = np.concatenate([mapped.errors, held.x[..., _N:]], axis=-1)
@@ -88,7 +90,7 @@ def with_prior_on_errors(held: GaussianState, start: GaussianState, prior: Gauss
         wanted = gained_state + _product(weighted, _product(jacobian, x) + prior.x - errors)
         step = _solve(information, wanted) - x
         x = x + step
-        if np.abs(step).max() < 1e-15:
+        if np.abs(step).max() < 1e-13:  # what is left is smaller by orders of magnitude: below rounding
             break
     return to_errors(GaussianState(x, np.linalg.inv(information)))
 
@@ -100,7 +102,7 @@ def _information(state: GaussianState) -> tuple[Array, Array]:
 
 
 def _extended(jacobian: Array, n: int) -> Array:
-    """(..., 6, 6) -> (..., n, n): further states are as they are."""
+    """(..., 5, 5) -> (..., n, n): further states are as they are."""
     extended = np.tile(np.eye(n), (*jacobian.shape[:-2], 1, 1))
     extended[..., :_N, :_N] = jacobian
     return extended

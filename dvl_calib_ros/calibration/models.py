@@ -59,7 +59,7 @@ class Model:
 
     What a model may change of how it is filtered: noise: observations -> its own R (N or 1, 3, 3) (m/s)², of which a
     model with fewer rows uses the first ones; None: `Observations.noise`. motion_is_noise: its noise is the vehicle's
-    motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first six states
+    motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first five states
     are those of the correction, see `correction_parameters`.
     """
 
@@ -161,11 +161,11 @@ def _g1(seen: Observations) -> Linearised:
     body_from_dvl = seen.rotation_dvl_from_body.T
     measured = seen.velocity_dvl @ body_from_dvl.T
     level = measured * (1.0, 1.0, 0.0) @ body_from_dvl
-    h = np.zeros((len(r), 3, 7))
+    h = np.zeros((len(r), 3, 6))
     h[:, :, :3] = np.matmul(body_from_dvl, skew(seen.velocity_dvl))
-    h[:, :2, 3:6] = -body_from_dvl[:2] * seen.velocity_dvl[:, None, :]
-    h[:, 2, 3:6] = -body_from_dvl[2] * level
-    h[:, :, 6] = -seen.heave_gain
+    h[:, :2, 3:5] = -(body_from_dvl[:2] * seen.velocity_dvl[:, None, :])[:, :, :2]
+    h[:, 2, 3:5] = -(body_from_dvl[2] * level)[:, :2]
+    h[:, :, 5] = -seen.heave_gain
     return r - measured, h
 
 
@@ -185,10 +185,13 @@ def _f1(seen: Observations) -> Linearised:
 
     (Tᵀ(v + [v×]φ))_y = s, (...)_z = h. Where M7 compares lengths, which feel a misalignment only to second order and
     so find half of it, the direction of travel feels all of it; how much of the sway is taken for misalignment and
-    how much for current is what their prior variances say, (σ_φ ‖v‖)² against σ_c².
+    how much for current is what their prior variances say, (σ_φ ‖v‖)² against σ_c². Roll would show where sway and
+    heave vary together, but in turns they do so by themselves: of [v×] only the motion ahead is used.
     """
-    h = np.zeros((len(seen.velocity_in_body), 2, 5))
-    h[:, :, :3] = -seen.body_from_measured[:, 1:]
+    ahead = np.zeros_like(seen.velocity_in_body)
+    ahead[:, 0] = seen.velocity_in_body[:, 0]
+    h = np.zeros((len(ahead), 2, 5))
+    h[:, :, :3] = -(skew(ahead) @ seen.rotation_dvl_from_body.T)[:, 1:]
     h[:, 0, 3] = h[:, 1, 4] = 1.0
     return seen.velocity_in_body[:, 1:], h
 
@@ -243,7 +246,7 @@ def _a1_noise(seen: Observations) -> Array:
 
 _ONE_SCALE = (("delta_k", (0, 1, 2)),)
 _SCALE_X = (("delta_k_x", (0,)),)
-_SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)), ("delta_k_z", (2,)))
+_SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
 _SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
 _SHOWN_WITH_GNSS = {
     "roll": "motion across the bow: turns, a box or a figure eight",
@@ -309,7 +312,7 @@ _TABLE = (
     ),
     Model(
         "G1", Needs.REFERENCE, 3, _g1, _SHOWN_WITH_GNSS,
-        assumes="GNSS velocity, heave near a constant (trim); scale error per axis, where the motion shows it",
+        assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
         wrong_when="trimmed by more than heave_offset_std, or heaving in long waves beyond motion_std",
         scale_axes=_SCALE_PER_AXIS,
         nuisance=(Nuisance("heave", "m/s", "heave_offset_std"),),
