@@ -357,13 +357,10 @@ def _held_out(held_out: Sequence[HeldOut]) -> dict[str, Any]:
         for each in held_out
     ]
     labels = [f"{each.set_name} {each.model}" for each in held_out]
-    errors = {
-        "uncorrected": [each.uncorrected for each in held_out],
-        "corrected": [each.corrected for each in held_out],
-        "predicted": [each.predicted for each in held_out],
-    }
+    kinds = ("uncorrected", "corrected", "predicted")
+    errors = [np.array([getattr(each, kind) for each in held_out]) for kind in kinds]
     alt = ", ".join(f"{label} {each.verdict}" for label, each in zip(labels, held_out, strict=True))
     return {
         "table": Table(("set, model", "verdict", "uncorrected", "corrected", "predicted"), rows, notes=("m/s rms.",)),
-        "pictures": [picture("Velocity error on held-out data", alt, held_out_bars, labels, errors)],
+        "pictures": [picture("Velocity error on held-out data", alt, held_out_bars, labels, *errors)],
     }

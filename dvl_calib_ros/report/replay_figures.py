@@ -15,7 +15,6 @@ from .style import (
     INK,
     MODEL_STYLES,
     REFERENCE_COLOUR,
-    UNCALIBRATED_COLOUR,
     legend_above,
     line_widths,
     new_figure,
@@ -23,7 +22,7 @@ from .style import (
 )
 from .time_axis import TimeAxis
 
-GOOD, WARNING, BAD = "#2a7f62", "#e0a030", "#c0392b"
+GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
 
 
 class Line(NamedTuple):
@@ -74,7 +73,7 @@ def velocity_over_time(
     kept = thin(len(dvl_ns))
     t = time(dvl_ns)[kept]
     axes.plot(t, before[kept], color=BAD, linewidth=1.0, label="DVL as measured")
-    axes.plot(t, after[kept], color="#1f6fb2", linewidth=1.0, label="DVL corrected")
+    axes.plot(t, after[kept], color=AFTER, linewidth=1.0, label="DVL corrected")
     axes.set_ylabel(label)
     time.dress(axes)
     legend_above(axes, markerscale=3.0)
@@ -85,7 +84,7 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
     """DVL minus reference (N,) along one body axis, before and after correction, m/s: points and running mean."""
     figure, axes = new_figure()
     t = time(stamps_ns)
-    for residual, colour, name in ((before, BAD, "before"), (after, "#1f6fb2", "after")):
+    for residual, colour, name in ((before, BAD, "before"), (after, AFTER, "after")):
         rms = float(np.sqrt(np.mean(residual**2)))
         axes.plot(t, residual, ".", markersize=2.0, alpha=0.35, color=colour, rasterized=True)
         axes.plot(*running_mean(t, residual), color=colour, label=f"{name}: RMS {rms:.3f} m/s")
@@ -161,19 +160,22 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
     return figure
 
 
-def held_out_bars(labels: Sequence[str], errors: Mapping[str, Sequence[float]]) -> Figure:
-    """Velocity error on data held back, m/s rms: for each label one bar per kind (uncorrected, corrected, ...)."""
-    colours = (UNCALIBRATED_COLOUR, "#1f6fb2", FAINT)
-    figure, axes = new_figure(height=1.1 + 0.5 * len(labels))
-    height = 0.8 / len(errors)
-    for i, ((kind, values), colour) in enumerate(zip(errors.items(), colours, strict=False)):
-        at = np.arange(len(labels)) + (i - 0.5 * (len(errors) - 1)) * height
-        bars = axes.barh(at, values, height=0.92 * height, color=colour, label=kind)
-        axes.bar_label(bars, fmt="%.3f", padding=2, fontsize=7.0)
-    axes.set_yticks(range(len(labels)), labels)
-    axes.invert_yaxis()
-    axes.margins(x=0.14)
-    axes.set_xlabel("velocity error on data held back, m/s rms")
+def held_out_bars(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
+    """Velocity error on data held back (N,), m/s rms: bars with the correction, marks for what they compare with."""
+    figure, axes = new_figure(height=1.2 + 0.27 * len(labels))
+    rows = np.arange(len(labels))
+    axes.barh(rows, corrected, height=0.6, color=AFTER, alpha=0.85, label="corrected")
+    axes.plot(
+        predicted, rows, "D", color=INK, markersize=4.5, markerfacecolor="white", markeredgewidth=1.1,
+        linestyle="none", label="predicted",
+    )  # fmt: skip
+    axes.plot(
+        uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, linestyle="none", label="uncorrected"
+    )
+    axes.set_yticks(rows, labels)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("velocity error on held-out data, m/s rms")
     axes.grid(False, axis="y")
     legend_above(axes)
     return figure

@@ -181,14 +181,14 @@ def _held_out(result: Result, shown: Sequence[str]) -> dict[str, Any] | None:
         for name, each in verifications.items()
     ]
     kinds = ("uncorrected", "corrected", "predicted")
-    errors = {kind: [getattr(error, kind) for error in judged.values()] for kind in kinds}
+    errors = [np.array([getattr(error, kind) for error in judged.values()]) for kind in kinds]
     alt = "; ".join(f"{name}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for name, e in judged.items())
     return {
         "table": Table(
             ("model", *kinds, "samples", "verdict"), rows, marked=list(verifications).index(result.selected)
         ),
         "pictures": [
-            picture("Velocity error on held-out data", alt, figures.held_out_bars, list(judged), errors),
+            picture("Velocity error on held-out data", alt, figures.held_out_bars, list(judged), *errors),
         ],
     }
 
