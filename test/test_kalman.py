@@ -47,6 +47,17 @@ def test_the_filter_equals_weighted_least_squares(rng, weights):
         np.testing.assert_allclose(after.p[k], covariance, atol=1e-12)
 
 
+@pytest.mark.parametrize("weights", [False, True])
+def test_least_squares_over_growing_windows_equals_the_filter_after_each(rng, weights):
+    x, p, data = random_problem(rng, weights=weights)
+    ends = [0, 1, 40, 150]
+    after = kalman.least_squares(x, p, data, ends)
+    for index, end in enumerate(ends):
+        expected = kalman.recursion(x, p, data.part(slice(0, end)))
+        np.testing.assert_allclose(after.x[index], expected.x, atol=1e-12)
+        np.testing.assert_allclose(after.p[index], expected.p, atol=1e-12)
+
+
 @settings(deadline=None, max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),

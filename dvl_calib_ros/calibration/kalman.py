@@ -139,8 +139,11 @@ def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -
     history: the fastest where nobody asks for them.
     """
     k, n_samples, m, n = data.h.shape
-    share = (data.weight * data.usable)[..., None, None]
-    weighted = (_inverse(data.r) @ data.h * share).reshape(k, n_samples * m, n).transpose(0, 2, 1)
+    weighted = _inverse(data.r) @ data.h
+    share = data.weight * data.usable
+    if (share != 1.0).any():
+        weighted *= share[..., None, None]
+    weighted = weighted.reshape(k, n_samples * m, n).transpose(0, 2, 1)
     h, z = data.h.reshape(k, n_samples * m, n), data.z.reshape(k, n_samples * m, 1)
     rows = [slice(m * start, m * end) for start, end in pairwise((0, *ends))]
     prior = np.linalg.inv(p)

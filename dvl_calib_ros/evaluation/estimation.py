@@ -7,7 +7,7 @@ a bag of the same data gives is proved in test_evaluation.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
@@ -49,33 +49,26 @@ def estimate(
     mounting.
     """
     usable = usable_samples(data, parameters)
+    sway_heave, prior_known = prior_sway_heave(data, usable, parameters)
     found: dict[str, GaussianState] = {}
     for needs in Needs:
         group = [MODELS[name] for name in models if MODELS[name].needs is needs]
-        if group and not (needs is Needs.ATTITUDE and data.run.rotation_enu_from_body is None):
-            found |= _estimate_group(group, data, usable, parameters, ends)
+        if not group or (needs is Needs.ATTITUDE and data.run.rotation_enu_from_body is None):
+            continue
+        seen = observations(data, needs, sway_heave, parameters)
+        for model in group:  # each on its own, in its own size: here it is the variants that fill the arrays
+            found[model.name] = _estimate_one(model, seen, usable, prior_known, parameters, ends)
     return {name: found[name] for name in models if name in found}
 
 
-def _estimate_group(
-    group: Sequence[Model], data: SensorData, usable: Mask, parameters: Parameters, ends: Sequence[int]
-) -> Iterable[tuple[str, GaussianState]]:
-    n_variants = len(data.velocity_dvl)
-    assembler = Assembler(group, parameters)
-    sway_heave, prior_known = prior_sway_heave(data, usable, parameters)
-    seen = observations(data, group[0].needs, sway_heave, parameters)
+def _estimate_one(
+    model: Model, seen: Observations, usable: Mask, prior_known: Mask, parameters: Parameters, ends: Sequence[int]
+) -> GaussianState:
+    assembler = Assembler([model], parameters)
     flat = assembler.measurements(seen, np.ones(usable.size), prior_known.ravel())
-    measurements = _by_variant(flat, n_variants, usable)
-    x, p = (np.repeat(each, n_variants, axis=0) for each in assembler.start)
-    after = _states_after(x, p, measurements, ends)
-    for index, model in enumerate(group):
-        own = slice(index * n_variants, (index + 1) * n_variants)
-        states = [
-            [assembler.state(index, x_one, p_one) for x_one, p_one in zip(at.x[own], at.p[own], strict=True)]
-            for at in after
-        ]
-        x_all = np.array([[state.x for state in row] for row in states])
-        yield model.name, GaussianState(x_all, np.array([[state.p for state in row] for row in states]))
+    x, p = (np.repeat(each, len(usable), axis=0) for each in assembler.start)
+    after = _states_after(x, p, _by_variant(flat, usable), ends)
+    return assembler.state(0, after.x, after.p)
 
 
 def observations(data: SensorData, needs: Needs, sway_heave: Array, parameters: Parameters) -> Observations:
@@ -133,35 +126,31 @@ def prior_sway_heave(data: SensorData, usable: Mask, parameters: Parameters) -> 
     return mean, known
 
 
-def _by_variant(flat: kalman.Measurements, n_variants: int, usable: Mask) -> kalman.Measurements:
-    """Measurements of K models of B variants in a row -> of K B models."""
-    k = len(flat.z)
+def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
+    """Measurements of one model, B variants in a row (1, B N, ...) -> of B models (B, N, ...)."""
 
     def split(values: NDArray[T]) -> NDArray[T]:
-        if values.shape[1] == 1:  # the same for all samples
-            return values if len(values) == 1 else np.repeat(values, n_variants, axis=0)
-        return np.broadcast_to(values, (k, *values.shape[1:])).reshape(k * n_variants, -1, *values.shape[2:])
+        same_for_all = values.shape[1] == 1
+        return values if same_for_all else values.reshape(*usable.shape, *values.shape[2:])
 
     return kalman.Measurements(
         z=split(flat.z),
         h=split(flat.h),
         r=split(flat.r),
         weight=split(flat.weight),
-        usable=split(flat.usable) & np.tile(usable, (k, 1)),
-        gate=np.repeat(flat.gate, n_variants),
+        usable=split(flat.usable) & usable,
+        gate=np.repeat(flat.gate, len(usable)),
     )
 
 
-def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> list[GaussianState]:
-    """States after the first `ends` samples."""
-    gated = bool(np.isfinite(data.gate).any())
+def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> GaussianState:
+    """x (E, K, n) and P (E, K, n, n) after the first `ends` samples."""
+    if not np.isfinite(data.gate).any():
+        return kalman.least_squares(x, p, data, ends)
     states = []
     for start, end in pairwise((0, *ends)):
-        part = data.part(slice(start, end))
-        if end > start and gated:
-            after = kalman.batch(x, p, part)
+        if end > start:
+            after = kalman.batch(x, p, data.part(slice(start, end)))
             x, p = after.x, after.p
-        elif end > start:
-            x, p = kalman.least_squares(x, p, part)
-        states.append(GaussianState(x, p))
-    return states
+        states.append((x, p))
+    return GaussianState(*map(np.array, zip(*states, strict=True)))

@@ -80,35 +80,53 @@ class SeedOutcome:
 
 def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     """The whole procedure with the noise of one seed."""
-    data = {name: sensor_data(run, seed) for name, run in procedure.runs.items()}
-    moments = {name: Moments.of(each.velocity_dvl, each.run.velocity) for name, each in data.items()}
+    measured = {name: dvl_velocities(run, seed) for name, run in procedure.runs.items()}
+    moments = {name: Moments.of(measured[name], run.velocity) for name, run in procedure.runs.items()}
+
+    def data(name: str) -> SensorData:
+        return SensorData(procedure.runs[name], measured[name], references(procedure.runs[name], seed))
 
     def outcome(stretch: SensorData, windows: Sequence[float | None], own_window: float | None) -> RunOutcome:
         others = Moments.stack([each for name, each in moments.items() if name != stretch.run.name])
         ends = [stretch.run.first(window) for window in windows]
         return _calibrate(stretch, ends, windows.index(own_window), others, procedure)
 
-    by_set = tuple(outcome(data[each.calibration_run], protocol.WINDOWS_S, each.window_s) for each in procedure.sets)
+    by_set = tuple(outcome(data(each.calibration_run), protocol.WINDOWS_S, each.window_s) for each in procedure.sets)
     if not procedure.studies:
         return SeedOutcome(by_set, (), (), np.empty((0, len(NOISE_STUDY_STD), 0)))
     with_attitude = runs_with_attitude(procedure.runs)
     legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
     return SeedOutcome(
         by_set=by_set,
-        each=tuple(outcome(data[name], [None], None) for name in with_attitude),
-        single_heading=tuple(outcome(_part(data[name], start, end), [None], None) for name, start, end in legs),
-        pull=_noise_study(procedure, data, seed),
+        each=tuple(outcome(data(name), [None], None) for name in with_attitude),
+        single_heading=tuple(outcome(_part(data(name), start, end), [None], None) for name, start, end in legs),
+        pull=_noise_study(procedure, data(noise_study_run(procedure).name), seed),
     )
 
 
-def sensor_data(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) -> SensorData:
+def sensor_data(run: Trajectory, seed: int) -> SensorData:
     """A run as the sensors see it with every combination of errors."""
-    measured, reference = [], []
-    for index, errors in enumerate(protocol.COMBINATIONS):
-        dvl_noise, gnss_noise = protocol.random_streams(seed, run.name, index)
-        measured.append(protocol.unit_under_test(run.velocity, errors, dvl_noise))
-        reference.append(protocol.reference(run.velocity, gnss_noise, gnss_std))
-    return SensorData(run, np.stack(measured), np.stack(reference))
+    return SensorData(run, dvl_velocities(run, seed), references(run, seed))
+
+
+def dvl_velocities(run: Trajectory, seed: int) -> Array:
+    """What the DVL measures (B, N, 3) m/s with every combination of errors."""
+    return np.stack(
+        [
+            protocol.unit_under_test(run.velocity, errors, protocol.random_stream("dvl", seed, run.name, index))
+            for index, errors in enumerate(protocol.COMBINATIONS)
+        ]
+    )
+
+
+def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) -> Array:
+    """What GNSS measures (B, N, 3) m/s, with other noise in every combination."""
+    return np.stack(
+        [
+            protocol.reference(run.velocity, protocol.random_stream("gnss", seed, run.name, index), gnss_std)
+            for index in range(len(protocol.COMBINATIONS))
+        ]
+    )
 
 
 def _part(data: SensorData, start: int, end: int) -> SensorData:
@@ -198,19 +216,18 @@ def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in models if MODELS[name].aided and MODELS[name].scale_axes)
 
 
-def _noise_study(procedure: Procedure, data: Mapping[str, SensorData], seed: int) -> Array:
+def _noise_study(procedure: Procedure, data: SensorData, seed: int) -> Array:
     """By how much noise of each size in the reference moves the first scale state (G, V, B)."""
     models = models_in_noise_study(procedure.models)
     if not models:
         return np.empty((0, len(NOISE_STUDY_STD), len(protocol.COMBINATIONS)))
-    run = noise_study_run(procedure)
 
     def scales(std: float) -> Array:  # (G, B)
         parameters = procedure.parameters.replace(
             gnss_aided_std=max(std, NOISE_STUDY_SMALLEST_STD), initial_std_scale=NOISE_STUDY_PRIOR_STD_SCALE
         )
-        noisy = replace(data[run.name], reference=sensor_data(run, seed, std).reference)
-        states = estimate(models, noisy, parameters, [len(run.time)])
+        noisy = replace(data, reference=references(data.run, seed, std))
+        states = estimate(models, noisy, parameters, [len(data.run.time)])
         return np.stack([states[name].x[0, :, 3] for name in models])
 
     without_noise = scales(0.0)

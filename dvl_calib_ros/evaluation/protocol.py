@@ -82,11 +82,9 @@ def reference(velocity_flu: Array, rng: np.random.Generator, gnss_std: float = G
     return measure_gnss(velocity_flu, gnss_std, rng)
 
 
-def random_streams(seed: int, trajectory: str, combination: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Generators of the DVL's and of the GNSS's noise.
+def random_stream(sensor: str, seed: int, trajectory: str, combination: int) -> np.random.Generator:
+    """Generator of one sensor's noise.
 
-    Keyed by what they are for, so that no result depends on the order or the number of workers.
+    Keyed by what it is for, so that no result depends on the order or the number of workers.
     """
-    key = np.random.SeedSequence([seed, combination, *trajectory.encode()])
-    dvl, gnss = key.spawn(2)
-    return np.random.default_rng(dvl), np.random.default_rng(gnss)
+    return np.random.default_rng([seed, combination, *f"{sensor} {trajectory}".encode()])
