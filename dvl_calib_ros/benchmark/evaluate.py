@@ -93,7 +93,10 @@ def _variant(data: SensorData, index: int) -> SensorData:
 
 
 def _calibrate(model: Model, data: SensorData, parameters: Parameters, ends: Sequence[int]) -> Iterator[Array]:
-    """Correction matrices (3, 3) after the first `ends` samples."""
+    """Correction matrices (3, 3) after the first `ends` samples.
+
+    Predict and update for every sample, as users of filterpy write it; z, H and R come for nothing from the models.
+    """
     from filterpy.kalman import KalmanFilter
 
     n, m = model.n_state, model.n_measurement
@@ -105,9 +108,11 @@ def _calibrate(model: Model, data: SensorData, parameters: Parameters, ends: Seq
     used = given.usable[0] & usable[0]
     r = np.broadcast_to(given.r[0], (usable.size, 3, 3))[:, :m, :m] / given.weight[0][:, None, None]
     peer = KalmanFilter(dim_x=n, dim_z=m)
+    peer.F, peer.Q = np.eye(n), np.zeros((n, n))
     peer.x, peer.P = assembler.start.x[0, :, None].copy(), assembler.start.p[0].copy()
     for start, end in pairwise((0, *ends)):
         for i in range(start, end):
+            peer.predict()
             if used[i]:
                 peer.update(given.z[0, i, :m, None], R=r[i], H=given.h[0, i, :m])
         yield corrections(model, assembler.state(0, peer.x[:, 0], peer.P))

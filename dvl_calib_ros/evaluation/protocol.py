@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from itertools import product
+from zlib import crc32
 
 import numpy as np
 
@@ -87,4 +88,4 @@ def random_stream(sensor: str, seed: int, trajectory: str, combination: int) -> 
 
     Keyed by what it is for, so that no result depends on the order or the number of workers.
     """
-    return np.random.default_rng([seed, combination, *f"{sensor} {trajectory}".encode()])
+    return np.random.default_rng([seed, combination, crc32(f"{sensor} {trajectory}".encode())])
