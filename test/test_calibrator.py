@@ -149,7 +149,7 @@ def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and
         if not (isinstance(s, ReferenceSample) and 40 <= (s.stamp_ns - START_NS) / SECOND < 60)
     ]
     segments = calibrate(outage).selection.segments
-    assert [segment.model for segment in segments] == ["M7", "M3", "M7", "M3"]
+    assert [segment.model for segment in segments] == ["F1", "G1", "F1", "G1"]
     at = [(segment.from_ns - START_NS) / SECOND for segment in segments]
     # lost 2 s after 39.8 s (the first sample beyond is at 42.0), then 3 s of hysteresis; back 3 s after 60 s
     np.testing.assert_allclose(at, [0.0, 3.0, 45.0, 63.0], atol=1e-6)
@@ -190,7 +190,7 @@ def test_an_earth_frame_reference_without_attitude_is_not_used_and_counted():
     assert counts["pairing"]["paired"] == 0
     assert counts["pairing"]["without_attitude"] > 280
     assert calibrator.estimate("M3").used == 0
-    assert calibrator.selected == "M7"
+    assert calibrator.selected == "F1"
 
 
 def test_a_fast_dvl_does_not_make_more_of_a_slow_reference_than_there_is():

@@ -132,12 +132,12 @@ def test_replay_json_has_the_documented_structure(document, bag):
     assert document["models"]["M3"]["state_names"][3:] == ["delta_k"]
     assert document["models"]["M4"]["state_names"][3:] == ["delta_k_x"]
     assert document["version"] == __version__
-    assert document["parameters"]["gnss_model"] == "M3"
+    assert document["parameters"]["gnss_model"] == "G1"
 
 
 def test_the_selected_segments_follow_each_other_from_the_first_sample_to_the_last(document):
     segments = document["selected"]
-    assert [segment["model"] for segment in segments] == ["M7", "M3"]
+    assert [segment["model"] for segment in segments] == ["F1", "G1"]
     assert segments[0]["from_s"] == 0.0
     assert segments[0]["to_s"] == segments[1]["from_s"] == pytest.approx(3.0, abs=0.5)
     assert segments[-1]["to_s"] == pytest.approx(40.0, abs=0.5)
@@ -164,13 +164,13 @@ def test_a_model_that_is_none_is_named_with_those_there_are(capsys, bag, models,
 
 def test_replay_shows_estimates_and_counts_and_keeps_warnings_apart(capsys, bag):
     out, errors = succeed(capsys, "replay", bag, bag, "-p", "prior_source:=initial_window")
-    assert "200 duplicate" in out and "selected: M3" in out
+    assert "200 duplicate" in out and "selected: G1" in out
     assert errors.startswith("warning: prior_source initial_window")
 
 
 def test_replay_saves_a_result_file_that_replay_starts_from(capsys, bag, tmp_path):
     succeed(capsys, "replay", bag, "--save", tmp_path / "r.yaml")
-    assert yaml.safe_load((tmp_path / "r.yaml").read_text())["model"] == "M3"
+    assert yaml.safe_load((tmp_path / "r.yaml").read_text())["model"] == "G1"
     saved = f"initial_calibration:={tmp_path / 'r.yaml'}"
     succeed(capsys, "replay", bag, "-p", saved, "--json", tmp_path / "o.json")
     again = json.loads((tmp_path / "o.json").read_text())["models"]["M3"]

@@ -126,7 +126,7 @@ def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_
         until(lambda: diagnostics, "the node to run")
     assert process.returncode == 0, process.output
     assert "Traceback" not in process.output
-    assert load_yaml(saved, "result file")["model"] == "M7"
+    assert load_yaml(saved, "result file")["model"] == "F1"
 
 
 def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_lost(world, tmp_path):
@@ -243,7 +243,7 @@ def test_models_are_switched_by_parameter_at_once_and_a_late_subscriber_gets_the
             diagonal = np.diag(got[-1].twist.covariance.reshape(6, 6))
             estimated = model.error_terms_from_state.any(axis=1)[[3, 4, 5, 0, 1, 2]]
             assert ((diagonal == -1.0) == ~estimated).all()
-        assert node._calibrator.selected == "M7"
+        assert node._calibrator.selected == [*MODELS][-1]
 
 
 @pytest.mark.parametrize(
@@ -346,7 +346,7 @@ def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
         assert "gnss_frame" in status.message and "'gps_antenna'" in status.message
         assert "frame_id 'base_link'" in status.message and "dvl_frame" in status.message
         assert diagnosed(diagnostics, "dvl wrong_frame") == diagnosed(diagnostics, "dvl invalid") == "1"
-        assert diagnosed(diagnostics, "model") == "M7"
+        assert diagnosed(diagnostics, "model") == "F1"
         until(lambda: diagnostics[-1].status[0].level == DiagnosticStatus.ERROR, "the DVL to be reported silent")
         assert "no DVL message for" in diagnostics[-1].status[0].message
 

@@ -253,6 +253,7 @@ _SHOWN_WITH_GNSS = {
     "pitch": "motion ahead: a straight leg at 1 m/s or more",
     "yaw": "motion ahead: a straight leg at 1 m/s or more",
     "scale": "speed and time: longer legs, faster",
+    "scale across": "motion across the bow: turns, a box or a figure eight",
 }
 _SHOWN_WITHOUT = {
     "roll": "nothing this model knows: it takes a reference velocity (GNSS)",

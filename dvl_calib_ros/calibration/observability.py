@@ -16,6 +16,8 @@ from .parameters import Parameters
 # A parameter counts as observed once the data has halved its prior standard deviation: it then holds three times the
 # information of the prior.
 OBSERVED_SHARE = 0.5
+# A DVL axis with more than this share of the motion ahead has its scale shown by it.
+SHARE_AHEAD = 0.25
 _BODY_AXES = ("roll", "pitch", "yaw")
 
 
@@ -31,7 +33,7 @@ class Observability(NamedTuple):
     """One parameter of one model.
 
     std: standard deviation (rad, or dimensionless). observed: the data has halved the prior's. axis: the body axis
-    (roll, pitch, yaw) that an angle's uncertainty turns about, or scale. missing: what to fly, '' once observed.
+    (roll, pitch, yaw) that an angle's uncertainty turns about, or scale (across). missing: what to fly, '' once observed.
     """
 
     name: str
@@ -53,9 +55,10 @@ def observability(model: Model, covariance: Array, parameters: Parameters) -> tu
     for index, name in enumerate(model.state_names[: model.n_errors]):
         std = math.sqrt(covariance[index, index])
         observed = bool(std <= OBSERVED_SHARE * prior_std[index])
-        axis = "scale"
         if index < 3:  # row i of T is the i-th DVL axis in the body
             axis = _BODY_AXES[int(np.argmax(np.abs(parameters.rotation_dvl_from_body[index]) * in_body))]
+        else:
+            axis = _scale_axis(model, index, parameters)
         entries.append(Observability(name, std, observed, axis, "" if observed else model.shown_by[axis]))
     return tuple(entries)
 
@@ -64,6 +67,13 @@ def body_angle_std(covariance: Array, parameters: Parameters) -> Array:
     """Standard deviations (3,) rad of the misalignment about the body's axes: roll, pitch, yaw."""
     t = parameters.rotation_dvl_from_body
     return np.sqrt(np.diag(t.T @ covariance[:3, :3] @ t))
+
+
+def _scale_axis(model: Model, index: int, parameters: Parameters) -> str:
+    """Whether a scale state is that of motion ahead or across the bow."""
+    axes = [axis for axis in range(3) if model.error_terms_from_state[3 + axis, index]]
+    ahead = parameters.rotation_dvl_from_body[axes, 0] ** 2
+    return "scale" if ahead.sum() > SHARE_AHEAD else "scale across"
 
 
 def scale_std_ahead(model: Model, covariance: Array, parameters: Parameters) -> Array:

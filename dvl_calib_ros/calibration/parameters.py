@@ -103,13 +103,13 @@ class Parameters:
         read_only=False,
     )
     gnss_model: str = _parameter(
-        "M3",
+        "G1",
         "What auto runs while GNSS is available.",
         choices=_AIDED,
         read_only=False,
     )
     gnss_free_model: str = _parameter(
-        "M7",
+        "F1",
         "What auto runs while GNSS is not available.",
         choices=_UNAIDED,
         read_only=False,
