@@ -76,8 +76,14 @@ def test_the_table_holds_every_models_estimates_in_degrees_and_per_cent(made):
         yaw = f"{np.degrees(estimate.state[2]):+.2f} ± {np.degrees(estimate.std[2]):.2f}".replace("-", "−")
         assert row[3].startswith(yaw)
         assert row[-4:-2] == [str(estimate.used), str(estimate.gated)]
-    selected = replayed.result.estimate
-    assert f"δk – scale error, all axes {100 * selected.state[3]:+.2f} %".replace("-", "−") in page.text
+
+
+def test_the_selected_models_errors_stand_large_on_top(made):
+    page, replayed = made
+    state, std = replayed.result.estimate.state, replayed.result.estimate.std
+    summary = page.text[: page.text.index("Corrected mounting")].replace("−", "-")
+    assert f"φz – misalignment about z {np.degrees(state[2]):+.2f}° ± {np.degrees(std[2]):.2f}°" in summary
+    assert f"{100 * state[3]:+.2f} % ± {100 * std[3]:.2f} %" in summary
 
 
 def test_the_static_transform_can_be_pasted(made):
@@ -257,7 +263,7 @@ def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, capsys):
     assert (tmp_path / "report.html.bak").read_text() == "old"
     page = Page(report)
     shown = {row[0] for row in page.rows if row and row[0] in MODELS}
-    assert shown == {"M7", "M3"}  # what was asked for, and the selected one
+    assert shown == {"M7", Parameters().gnss_model}  # what was asked for, and the selected one
 
 
 def test_a_report_that_cannot_be_written_is_refused_before_the_replay(tmp_path, capsys):

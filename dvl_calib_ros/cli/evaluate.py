@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
+from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -41,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--partial", action="store_true", help="go on although trajectories are missing in the folder")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was found as JSON")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write every Avg.VRMSE as CSV, one per line")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write a page with tables and figures (HTML)")
+    add_report_option(parser)
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="scheduler to work on, such as tcp://host:8786")
     common.add_parameter_options(parser)
@@ -68,6 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
         _cross_check(arguments, models, workers)
         return
     parameters = common.load(arguments, DEFAULTS)
+    write_report = report_writer(arguments, "write_evaluation_report")
     with common.progress("evaluating") as on_progress:
         evaluation = evaluate(
             arguments.paths[0] if arguments.paths else None,
@@ -80,6 +82,8 @@ def run(arguments: argparse.Namespace) -> None:
             on_progress=on_progress,
         )
     _save(arguments, evaluation)
+    if write_report is not None:
+        write_report(arguments.report, evaluation)
     _print(evaluation)
 
 
@@ -107,10 +111,6 @@ def _save(arguments: argparse.Namespace, evaluation: Evaluation) -> None:
         common.write_json(arguments.json, evaluation_document(evaluation))
     if arguments.csv is not None:
         save_text(arguments.csv, evaluation_csv(evaluation))
-    if arguments.report is not None:
-        from ..report import write_evaluation_report
-
-        write_evaluation_report(arguments.report, evaluation)
 
 
 # ------------------------------------------------------------------ tables

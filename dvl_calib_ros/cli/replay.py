@@ -27,19 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Replay, print, save."""
-    from ..io.errors import InputError
+    from ..calibration.models import MODELS
     from ..io.replay import Topics, replay, replay_document
-    from ..io.result_file import check_writable, result_document, result_text, save_text
+    from ..io.result_file import result_document, result_text, save_text
 
-    models = _models(arguments.models)
+    models = common.chosen("--models", arguments.models, tuple(MODELS))
     parameters = common.load(arguments)
-    outputs = {name: path for name in ("json", "save", "report") if (path := getattr(arguments, name)) is not None}
-    for name, target in outputs.items():
-        check_writable(target)
-        same = [f"--{other}" for other, path in outputs.items() if path == target and other != name]
-        if same:
-            raise InputError(f"--{name} and {same[0]}: both name {target}; give them names of their own")
-    write_report = report_writer("write_replay_report") if arguments.report else None
+    common.check_outputs(arguments, "json", "save", "report")
+    write_report = report_writer(arguments, "write_replay_report")
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
         replayed = replay(arguments.bags, parameters, topics, on_progress, with_history=write_report is not None)
@@ -51,21 +46,6 @@ def run(arguments: argparse.Namespace) -> None:
     if write_report is not None:
         write_report(arguments.report, replayed, arguments.bags, models)
     _print(replayed.notes, result, models)
-
-
-def _models(text: str) -> list[str]:
-    from ..calibration.models import MODELS
-    from ..io.errors import InputError
-
-    if text == "all":
-        return list(MODELS)
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    for name in names:
-        if name not in MODELS:
-            raise InputError(f"--models: {name!r} is no model; there are {', '.join(MODELS)}, or all")
-    if not names:
-        raise InputError(f"--models: name at least one of {', '.join(MODELS)}, or all")
-    return list(dict.fromkeys(names))
 
 
 def _print(notes, result, models) -> None:  # type: ignore[no-untyped-def]

@@ -12,8 +12,13 @@ def add_report_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
 
 
-def report_writer(name: str) -> Callable[..., None]:
-    """A function of the package report. Raises InputError, before any work is done, if it lacks what it needs."""
+def report_writer(arguments: argparse.Namespace, name: str) -> Callable[..., None] | None:
+    """A function of the package report, None if no report is asked for.
+
+    Raises InputError, before any work is done, if a library is missing that reports are made with.
+    """
+    if arguments.report is None:
+        return None
     from ..io.errors import InputError
 
     try:
