@@ -139,6 +139,7 @@ def test_coverage_of_errors_as_large_as_claimed_is_68_and_95_per_cent(rng):
     found = metrics.coverage("M1", ("honest", "overconfident"), errors, std)
     assert found.within_68 == pytest.approx([0.680, 0.381], abs=0.012)
     assert found.within_95 == pytest.approx([0.950, 0.673], abs=0.012)
+    assert found.normalised_rms == pytest.approx(np.sqrt(2.5), rel=0.02)
     assert found.n_errors == 20_000
 
 

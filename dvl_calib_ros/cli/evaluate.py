@@ -152,11 +152,11 @@ def _score_table(e: Evaluation) -> Table:
 
     p = e.parameters
     caption = (
-        "Below each: ratio to the published figure. Means over the seeds; the mean over the sets is that of the "
-        "cells above it\n(the paper's own for M3, 0.0323, does not follow from its column, which gives 0.0376). "
-        f"One prior for all: {math.degrees(p['initial_std_misalignment']):.3g}°, "
-        f"{100 * p['initial_std_scale']:.3g} %; R of the models\nwith GNSS ({p['gnss_aided_std']:g} m/s)², of those "
-        f"without ({p['gnss_free_std']:g} m/s)²; prior sway and heave: {p['prior_source']}."
+        "Below each: ratio to the published figure. Means over the seeds; the mean over the sets is that of the cells "
+        "above it (the paper's own for M3, 0.0323, does not follow from its column, which gives 0.0376). One prior "
+        f"for all: {math.degrees(p['initial_std_misalignment']):.3g}°, {100 * p['initial_std_scale']:.3g} %; R of the "
+        f"models with GNSS ({p['gnss_aided_std']:g} m/s)², of those without ({p['gnss_free_std']:g} m/s)²; prior sway "
+        f"and heave: {p['prior_source']}."
     )
     table = Table(title="Avg.VRMSE m/s", title_justify="left", caption=caption, caption_justify="left")
     _set_columns(table, ["set"], e.columns)
@@ -210,15 +210,15 @@ def _each_table(e: Evaluation, study: EachStudy, title: str) -> Table:
 def _coverage_table(coverage: Sequence[Coverage], title: str) -> Table:
     from rich.table import Table
 
-    caption = "per cent of errors within the 68 % / 95 % interval"
+    caption = "per cent of errors within the 68 % / 95 % interval; error / σ: rms, 1 for an honest σ"
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["model"], ("φx", "φy", "φz", "δk", "δk y", "δk z", "pooled", "errors"))
+    states = ("φx", "φy", "φz", "δk", "δk y", "δk z")[: max((len(each.state_names) for each in coverage), default=3)]
+    _set_columns(table, ["model"], (*states, "pooled", "error / σ", "errors"))
     for each in coverage:
         pairs = [f"{100 * a:.0f} / {100 * b:.0f}" for a, b in zip(each.within_68, each.within_95, strict=True)]
-        pairs += ["-"] * (6 - len(pairs))
-        table.add_row(
-            each.model, *pairs, f"{100 * each.pooled_68:.0f} / {100 * each.pooled_95:.0f}", str(each.n_errors)
-        )
+        pairs += ["-"] * (len(states) - len(pairs))
+        pooled = f"{100 * each.pooled_68:.0f} / {100 * each.pooled_95:.0f}"
+        table.add_row(each.model, *pairs, pooled, f"{each.normalised_rms:.2f}", str(each.n_errors))
     return table
 
 

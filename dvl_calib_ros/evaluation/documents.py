@@ -96,6 +96,7 @@ def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
     return {
         each.model: {
             "errors": each.n_errors,
+            "normalised_rms": each.normalised_rms,
             "within_68": {"pooled": each.pooled_68, **_row(each.state_names, each.within_68)},
             "within_95": {"pooled": each.pooled_95, **_row(each.state_names, each.within_95)},
             "mean_error": _row(each.state_names, each.mean_error),

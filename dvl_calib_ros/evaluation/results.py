@@ -43,6 +43,7 @@ class Coverage:
 
     model: name. state_names: the n error states (nuisance states have no truth). within_68, within_95: (n,) per state.
     pooled_68, pooled_95: over all states. n_errors: errors per state. mean_error, rms_error, mean_std: (n,).
+    normalised_rms: rms of error / σ over all states, 1 for an honest σ, by how much it is too small above.
     """
 
     model: str
@@ -55,6 +56,7 @@ class Coverage:
     mean_error: Array
     rms_error: Array
     mean_std: Array
+    normalised_rms: float = float("nan")
 
 
 @dataclass(frozen=True)
