@@ -213,6 +213,11 @@ def test_workers_change_nothing(evaluation):
     assert same(evaluate(None, Parameters(**DEFAULTS), n_seeds=2, workers=Workers(jobs=2)), evaluation)
 
 
+def test_a_worker_process_that_is_killed_is_said():
+    with pytest.raises(InputError, match="a worker process was killed"):
+        run_all(os._exit, [1, 1], Workers(jobs=2))
+
+
 def test_a_dask_worker_killed_on_the_way_loses_nothing():
     """A real scheduler with two worker processes; the one that finished first is killed."""
     distributed = pytest.importorskip("distributed")
