@@ -12,6 +12,7 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.models import MODELS
+from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
@@ -84,8 +85,7 @@ def _summary(e: Evaluation) -> Iterable[str]:
             sentence += f"; best published: {published[0]} with {published[1]:.4f} m/s"
         yield sentence + "."
     if e.each is not None and e.each.runs:
-        median = np.median(e.each.avg_vrmse.mean(axis=-1), axis=0)
-        medians = ((words, _best(median, e.columns, aided)) for aided, words in _KINDS)
+        medians = ((words, _best(e.each.median(), e.columns, aided)) for aided, words in _KINDS)
         found = ", ".join(f"{best[0]} {best[1]:.4f} m/s {words}" for words, best in medians if best is not None)
         yield f"Calibrated on each of {len(e.each.runs)} runs with attitude, best medians: {found}."
     if e.own_generator:
@@ -288,8 +288,11 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any]
             for name, value in zip(e.columns, values, strict=True)
         ]
         rows.append((label, f"{math.degrees(run.heading_spread):.0f}", *cells))
-    median = np.median(errors, axis=0)
-    rows.append(("median", "", *("–" if not math.isfinite(value) else f"{value:.4f}" for value in median.tolist())))
+    median = study.median()
+    rows.append(_median_row("median", median))
+    manoeuvring = study.median(MANOEUVRING)
+    if np.isfinite(manoeuvring).any():
+        rows.append(_median_row(f"of {MANOEUVRING[0]} .. {MANOEUVRING[-1]}", manoeuvring))
     alt = ", ".join(f"{name} {value:.4f}" for name, value in zip(e.columns, median.tolist(), strict=True))
     base = e.columns.index(UNCALIBRATED)
     models = [e.columns.index(name) for name in e.models]
@@ -298,7 +301,7 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any]
         "table": Table(
             ("run", "headings, °", *e.columns),
             rows,
-            marked=len(rows) - 1,
+            marked=len(study.runs),
             dense=True,
             notes=(
                 "Avg.VRMSE on all other trajectories, m/s. Headings: their circular standard deviation. ? marks where "
@@ -313,6 +316,10 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any]
             )
         ],
     }  # fmt: skip
+
+
+def _median_row(name: str, medians: Array) -> tuple[str, ...]:
+    return (name, "", *("–" if not math.isfinite(value) else f"{value:.4f}" for value in medians.tolist()))
 
 
 def _trace(trace: Trace) -> dict[str, Any]:

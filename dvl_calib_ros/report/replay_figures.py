@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from ..calibration.frames import Array
 from .series import running_mean, thin
@@ -135,7 +136,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
         if not used.any():
             continue
         colour, dashes = MODEL_STYLES[name]
-        where, mean = running_mean(t[used], np.log10(values[used]))
+        where, mean = running_mean(t[used], np.log10(values[used]), points=9)
         axes.plot(where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
     axes.axhline(1.0, color=INK, linewidth=0.8)
     axes.set_yscale("log")
@@ -154,6 +155,8 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
         axes.barh(models, values, left=left, color=colour, height=0.7, label=reason)
         left += np.asarray(values, dtype=float)
     axes.invert_yaxis()
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("DVL samples")
     axes.grid(False, axis="y")
     legend_above(axes, columns=4)
