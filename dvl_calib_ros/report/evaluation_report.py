@@ -44,7 +44,7 @@ def _context(e: Evaluation) -> dict[str, Any]:
         "scores": _score_table(e),
         "improvement": [_improvement(e)],
         "times": list(_calibration_times(e)),
-        "has_published": bool(np.isfinite(e.published_table).any()),
+        "has_published": bool(np.isfinite(_published(e)).any()),
         "coverages": list(_coverages(e)),
         "errors_in_variables": None if e.errors_in_variables is None else _pull(e.errors_in_variables),
         "studies": [study for study in (_study(e, e.each, _EACH), _study(e, e.single_heading, _SINGLE)) if study],
@@ -52,6 +52,11 @@ def _context(e: Evaluation) -> dict[str, Any]:
         "held_out": _held_out(e.held_out) if e.held_out else None,
         "parameters": parameter_texts(e.parameters),
     }
+
+
+def _published(e: Evaluation) -> Array:
+    """(S, C) published Avg.VRMSE, nan where there is none: nowhere, if the trajectories are others."""
+    return np.full_like(e.published_table, np.nan) if e.own_generator else e.published_table
 
 
 # ------------------------------------------------------------------ summary
@@ -80,7 +85,7 @@ def _summary(e: Evaluation) -> Iterable[str]:
         name, value = best
         gain = 100.0 * (1.0 - value / uncalibrated)
         sentence = f"Best {words}: {name} with {value:.4f} m/s, {gain:.0f} % less than uncalibrated"
-        published = None if e.own_generator else _best(e.published_table.mean(axis=0), e.columns, aided)
+        published = _best(_published(e).mean(axis=0), e.columns, aided)
         if published is not None:
             sentence += f"; best published: {published[0]} with {published[1]:.4f} m/s"
         yield sentence + "."
@@ -91,7 +96,7 @@ def _summary(e: Evaluation) -> Iterable[str]:
     if e.own_generator:
         yield "The trajectories are simulated: the published figures do not apply to them."
     else:
-        ratio = e.ratio[np.isfinite(e.ratio)]
+        ratio = (e.seed_mean / _published(e))[np.isfinite(_published(e))]
         if len(ratio):
             near = int((np.abs(ratio - 1.0) <= 0.25).sum())
             yield f"{near} of {len(ratio)} published cells are met within 25 %."
@@ -149,16 +154,16 @@ def _score(value: float, published: float) -> str | Cell:
 def _score_table(e: Evaluation) -> Table:
     """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below."""
     rows = []
-    for name, here, published in zip(e.columns, e.seed_mean.T, e.published_table.T, strict=True):
+    for name, here, published in zip(e.columns, e.seed_mean.T, _published(e).T, strict=True):
         means = _score(float(here.mean()), float(published.mean()))
         rows.append((name, *(_score(*pair) for pair in zip(here.tolist(), published.tolist(), strict=True)), means))
     notes = [
         "Avg.VRMSE in m/s: root mean square of the velocity error, mean over trajectories, combinations and seeds."
     ]
-    if np.isfinite(e.published_table).any():
+    if np.isfinite(_published(e)).any():
         notes.append(
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
-            "beyond. Means are those of the cells beside them (the paper's own mean of M3, 0.0323, is not)."
+            "beyond. Means are those of the cells beside them, not the paper's."
         )
     return Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
 
@@ -167,11 +172,11 @@ def _improvement(e: Evaluation) -> Picture:
     base = e.columns.index(UNCALIBRATED)
     models = [e.columns.index(name) for name in e.models]
     gone = 1.0 - e.seed_mean[:, models] / e.seed_mean[:, [base]]
-    published = 1.0 - e.published_table[:, models] / e.published_table[:, [base]]
+    published = 1.0 - _published(e)[:, models] / _published(e)[:, [base]]
     alt = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
     return picture(
         "Improvement over uncalibrated", f"Mean over the sets: {alt}",
-        figures.improvement_bars, e.models, [each.name for each in e.sets], gone, published,
+        figures.improvement_bars, e.models, gone, published,
     )  # fmt: skip
 
 
@@ -184,7 +189,7 @@ def _calibration_times(e: Evaluation) -> Iterable[Picture]:
             f"{each.name}: calibrated on {each.calibration_run}",
             f"Avg.VRMSE against calibration time for set {each.name}, all models",
             figures.error_over_calibration_time, e.models, e.windows_s, float(e.seed_mean[i, base]),
-            by_time[i][:, models], each.window_s, e.published_table[i, models],
+            by_time[i][:, models], each.window_s, _published(e)[i, models],
         )  # fmt: skip
 
 
