@@ -169,6 +169,21 @@ def test_a_set_is_calibrated_on_its_own_window(evaluation):
     np.testing.assert_array_equal(evaluation.avg_vrmse[1:], evaluation.avg_vrmse_by_time[1:, -1])
 
 
+def test_calibrations_are_judged_on_samples_that_they_had_not_seen(evaluation):
+    found = {(each.set_name, each.model): each for each in evaluation.held_out}
+    assert set(found) == {(each.name, model) for each in evaluation.sets for model in MODELS} - {
+        ("E3", "A1"),
+        ("E4", "A1"),
+    }
+    for each in found.values():
+        assert sum(each.verdicts.values()) == len(protocol.MISALIGNMENTS_DEG)
+    g1 = found["E4", "G1"]
+    gnss_noise = 0.2 * np.sqrt(3)
+    assert gnss_noise * 0.95 < g1.corrected < gnss_noise * 1.05
+    assert g1.corrected < g1.uncorrected - 0.005
+    assert g1.corrected == pytest.approx(g1.predicted, rel=0.03)
+
+
 def test_errors_in_variables_pull_the_scale_as_predicted(evaluation):
     study = evaluation.errors_in_variables
     assert dict(zip(study.models, study.noisy_axes, strict=True)) == {"M1": 3, "M2": 1, "M3": 2, "M4": 1, "G1": 0}
@@ -359,7 +374,7 @@ def test_the_command_writes_json_and_csv_and_says_what_it_ran_on(folder, tmp_pat
     ]
     assert main(["evaluate", str(folder), *options, "--json", str(target[0]), "--csv", str(target[1])]) == 0
     output = capsys.readouterr().out
-    assert f"folder {folder}" in output and "mounting_rpy is not used here" in output
+    assert f"folder {folder}" in output and "mounting_rpy is not used by the procedure" in output
     document = json.loads(target[0].read_text())
     assert set(document["avg_vrmse"]) == {"E1", "E3"}
     assert set(document["avg_vrmse"]["E1"]) == set(document["mean"]) == {UNCALIBRATED, "M3", "M7"}

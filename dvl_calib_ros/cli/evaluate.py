@@ -128,6 +128,7 @@ def _print(e: Evaluation) -> None:
         out.print(f"[yellow]note:[/] {escape(note)}")
     out.print(_score_table(e))
     out.print(escape(_settings(e)))
+    out.print(_held_out_table(e))
     out.print(_time_table(e))
     for study, title in (
         (e.each, "Avg.VRMSE m/s, calibrated on each run with attitude"),
@@ -176,6 +177,29 @@ def _settings(e: Evaluation) -> str:
         f"({p['gnss_free_std']:g} m/s)²; prior sway and heave: {p['prior_source']}. Means over the seeds, and over the "
         "cells of a column" + ("." if e.own_generator else " (the paper's own mean of M3, 0.0323, is not that).")
     )
+
+
+def _held_out_table(e: Evaluation) -> Table:
+    import math
+
+    from rich.table import Table
+
+    caption = (
+        "Velocity error against GNSS, whose noise is in it, on samples held back: rms over one combination of every "
+        "misalignment; how many of these would be accepted / found marginal / rejected."
+    )
+    table = Table(title="Hold-out verification, m/s", title_justify="left", caption=caption, caption_justify="left")
+    _set_columns(table, ["set", ""], e.models)
+    for each in e.sets:
+        found = {one.model: one for one in e.held_out if one.set_name == each.name}
+        for kind in ("uncorrected", "corrected", "predicted"):
+            values = (getattr(found[name], kind) if name in found else math.nan for name in e.models)
+            table.add_row(each.name if kind == "uncorrected" else "", kind, *map(_cell, values))
+        counts = [found[name].verdicts if name in found else None for name in e.models]
+        words = ("accept", "marginal", "reject")
+        table.add_row("", "a / m / r", *("/".join(str(c.get(w, 0)) for w in words) if c else "-" for c in counts))
+        table.add_section()
+    return table
 
 
 def _time_table(e: Evaluation) -> Table:
