@@ -186,7 +186,9 @@ def _held_out_table(e: Evaluation) -> Table:
 
     caption = (
         "Velocity error against GNSS, whose noise is in it, on samples held back: rms over one combination of every "
-        "misalignment; how many of these would be accepted / found marginal / rejected."
+        "misalignment; how many of these would be accepted / found marginal / rejected. By its size alone, a "
+        f"misalignment of {math.degrees(e.parameters['accept_misalignment']):.3g}° is marginal, one of "
+        f"{math.degrees(e.parameters['reject_misalignment']):.3g}° rejected."
     )
     table = Table(title="Hold-out verification, m/s", title_justify="left", caption=caption, caption_justify="left")
     _set_columns(table, ["set", ""], e.models)
