@@ -16,7 +16,7 @@ from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
-from .replay_figures import held_out_bars
+from .replay_figures import held_out_errors
 from .style import Picture, picture
 
 BODY_AXES = ("ahead", "to port", "up")
@@ -198,6 +198,7 @@ def _calibration_times(e: Evaluation) -> Iterable[Picture]:
 
 def _coverages(e: Evaluation) -> Iterable[dict[str, Any]]:
     studies = (
+        ("Calibrated on the sets and on each run with attitude", e.coverage_of_all),
         ("Calibrated on the sets", e.coverage),
         ("Calibrated on each run with attitude", e.each.coverage if e.each else ()),
         ("Calibrated on stretches of a single heading", e.single_heading.coverage if e.single_heading else ()),
@@ -358,21 +359,26 @@ def _trace(trace: Trace) -> dict[str, Any]:
 
 
 def _held_out(held_out: Sequence[HeldOut]) -> dict[str, Any]:
-    rows = [
-        (
-            f"{each.set_name} {each.model}",
-            Cell(each.verdict, VERDICT_KINDS[each.verdict]),
-            f"{each.uncorrected:.4f}",
-            f"{each.corrected:.4f}",
-            f"{each.predicted:.4f}",
-        )
-        for each in held_out
+    sets = list(dict.fromkeys(each.set_name for each in held_out))
+    models = list(dict.fromkeys(each.model for each in held_out))
+    found = {(each.model, each.set_name): each for each in held_out}
+    rows = [(model, *(_held_out_cell(found.get((model, name))) for name in sets)) for model in models]
+    notes = ("Velocity error on held-out data, m/s rms; below: uncorrected → predicted, and the verdict.",)
+    pictures = [_held_out_picture(name, [each for each in held_out if each.set_name == name]) for name in sets]
+    return {"table": Table(("model", *sets), rows, notes=notes), "pictures": pictures}
+
+
+def _held_out_cell(each: HeldOut | None) -> str | Cell:
+    if each is None:
+        return "–"
+    below = f"{each.uncorrected:.4f} → {each.predicted:.4f}, {each.verdict}"
+    return Cell(f"{each.corrected:.4f}", VERDICT_KINDS[each.verdict], below)
+
+
+def _held_out_picture(name: str, held_out: Sequence[HeldOut]) -> Picture:
+    errors = [
+        np.array([getattr(each, kind) for each in held_out]) for kind in ("uncorrected", "corrected", "predicted")
     ]
-    labels = [f"{each.set_name} {each.model}" for each in held_out]
-    kinds = ("uncorrected", "corrected", "predicted")
-    errors = [np.array([getattr(each, kind) for each in held_out]) for kind in kinds]
-    alt = ", ".join(f"{label} {each.verdict}" for label, each in zip(labels, held_out, strict=True))
-    return {
-        "table": Table(("set, model", "verdict", "uncorrected", "corrected", "predicted"), rows, notes=("m/s rms.",)),
-        "pictures": [picture("Velocity error on held-out data", alt, held_out_bars, labels, *errors)],
-    }
+    alt = ", ".join(f"{each.model} {each.verdict}" for each in held_out)
+    models = [each.model for each in held_out]
+    return picture(f"{name}: error on held-out data", alt, held_out_errors, models, *errors)

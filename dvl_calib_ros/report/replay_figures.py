@@ -163,22 +163,18 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
     return figure
 
 
-def held_out_bars(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
-    """Velocity error on data held back (N,), m/s rms: bars with the correction, marks for what they compare with."""
+def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
+    """Velocity error on data held back (N,), m/s rms. Points, not bars from zero: the reference's noise is in each."""
     figure, axes = new_figure(height=1.2 + 0.27 * len(labels))
     rows = np.arange(len(labels))
-    axes.barh(rows, corrected, height=0.6, color=AFTER, alpha=0.85, label="corrected")
+    axes.hlines(rows, corrected, uncorrected, color=FAINT, linewidth=1.6)
+    axes.plot(uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, label="uncorrected")
+    axes.plot(corrected, rows, "o", color=AFTER, markersize=6.0, label="corrected")
     axes.plot(
-        predicted, rows, "D", color=INK, markersize=4.5, markerfacecolor="white", markeredgewidth=1.1,
-        linestyle="none", label="predicted",
-    )  # fmt: skip
-    axes.plot(
-        uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, linestyle="none", label="uncorrected"
+        predicted, rows, "D", color=INK, markersize=5.0, markerfacecolor="none", markeredgewidth=1.1, label="predicted"
     )
     axes.set_yticks(rows, labels)
     axes.set_ylim(len(labels) - 0.5, -0.5)
-    axes.set_xlim(left=0.0)
     axes.set_xlabel("velocity error on held-out data, m/s rms")
-    axes.grid(False, axis="y")
     legend_above(axes)
     return figure

@@ -189,7 +189,7 @@ def _held_out(result: Result, shown: Sequence[str]) -> dict[str, Any] | None:
             ("model", *kinds, "samples", "verdict"), rows, marked=list(verifications).index(result.selected)
         ),
         "pictures": [
-            picture("Velocity error on held-out data", alt, figures.held_out_bars, list(judged), *errors),
+            picture("Velocity error on held-out data", alt, figures.held_out_errors, list(judged), *errors),
         ],
     }
 
