@@ -139,6 +139,7 @@ def _print(e: Evaluation) -> None:
     out.print(_coverage_table(e.coverage, "Coverage over the sets: share of errors within the σ claimed"))
     if e.each is not None:
         out.print(_coverage_table(e.each.coverage, "Coverage over the runs with attitude"))
+        out.print(_coverage_table(e.coverage_of_all, "Coverage over all of these"))
     if e.errors_in_variables is not None:
         out.print(_noise_table(e.errors_in_variables))
 

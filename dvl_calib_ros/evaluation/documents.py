@@ -34,6 +34,7 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
             for name, rows in zip(names, e.avg_vrmse_by_time.mean(axis=-1), strict=True)
         },
         "coverage": _coverage(e.coverage),
+        "coverage_of_all": _coverage(e.coverage_of_all),
         "errors_in_variables": _errors_in_variables(e),
         "each": _each(e.each, e.columns),
         "single_heading": _each(e.single_heading, e.columns),

@@ -94,6 +94,7 @@ def evaluate(
         avg_vrmse_by_time=np.stack([[run.by_time for run in each.by_set] for each in outcomes], axis=-1),
         published=protocol.PUBLISHED,
         coverage=_coverage(procedure.models, [run for each in outcomes for run in each.by_set]),
+        coverage_of_all=_coverage(procedure.models, [run for each in outcomes for run in (*each.by_set, *each.each)]),
         errors_in_variables=_errors_in_variables(procedure, outcomes),
         each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
         single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),

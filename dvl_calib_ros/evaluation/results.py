@@ -140,7 +140,8 @@ class Evaluation:
     source: folder or generator, in words. own_generator: True if the trajectories are not recorded ones, so that the
     published figures do not apply. notes: what the reader must know. columns: `UNCALIBRATED`, then the models.
     avg_vrmse: (S, C, Q). windows_s: (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column ->
-    m/s. parameters: as used, plain values. version: of the software.
+    m/s. coverage: over the sets; coverage_of_all: over these and the runs of `each`. parameters: as used, plain
+    values. version: of the software.
     """
 
     source: str
@@ -163,6 +164,7 @@ class Evaluation:
     parameters: Mapping[str, Any]
     version: str
     held_out: tuple[HeldOut, ...] = ()
+    coverage_of_all: tuple[Coverage, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -379,6 +379,6 @@ def _held_out_picture(name: str, held_out: Sequence[HeldOut]) -> Picture:
     errors = [
         np.array([getattr(each, kind) for each in held_out]) for kind in ("uncorrected", "corrected", "predicted")
     ]
-    alt = ", ".join(f"{each.model} {each.verdict}" for each in held_out)
+    alt = "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in held_out)
     models = [each.model for each in held_out]
     return picture(f"{name}: error on held-out data", alt, held_out_errors, models, *errors)
