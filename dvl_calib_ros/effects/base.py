@@ -137,7 +137,12 @@ class AnyEffect:
 
 
 class Effect(AnyEffect, ABC):
-    """A systematic effect: the same motion always gives the same trace."""
+    """A systematic effect: the same motion always gives the same trace.
+
+    manoeuvre: what to fly to see it and to tell it from what it is confounded with.
+    """
+
+    manoeuvre: ClassVar[str]
 
     @property
     def linear(self) -> bool:
