@@ -58,8 +58,7 @@ class HeadingError(Effect):
         rotation = motion.attitude
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         error = values["sin_rad"] * np.sin(yaw) + values["cos_rad"] * np.cos(yaw)
-        east, north, up = np.einsum("nij,nj->in", rotation, motion.velocity_body)
-        turned = np.stack(
-            [np.cos(error) * east + np.sin(error) * north, np.cos(error) * north - np.sin(error) * east, up]
-        )
-        return motion.velocity_body - np.einsum("nji,jn->ni", rotation, turned)
+        east, north, _ = np.einsum("nij,nj->in", rotation, motion.velocity_body)
+        sine, cosine_less_one = np.sin(error), -2.0 * np.sin(0.5 * error) ** 2
+        added = [cosine_less_one * east + sine * north, cosine_less_one * north - sine * east, np.zeros_like(east)]
+        return -np.einsum("nji,jn->ni", rotation, np.array(added))
