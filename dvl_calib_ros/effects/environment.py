@@ -17,7 +17,7 @@ class WaterLock(Effect):
     """The DVL tracks the water, all the time or for some of it, so it misses what the current does."""
 
     name = "water_lock"
-    summary = "an earth-fixed current added while the DVL tracks water instead of ground"
+    summary = "the DVL tracks water: an earth-fixed velocity (minus the current) added from from_s to to_s"
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
         ParameterSpec("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),
@@ -43,7 +43,7 @@ class HeadingError(Effect):
     """
 
     name = "heading_error"
-    summary = "the reference's heading is wrong by sin_rad · sin ψ + cos_rad · cos ψ (ψ: yaw, east to north)"
+    summary = "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
         ParameterSpec("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),

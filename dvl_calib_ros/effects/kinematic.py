@@ -14,7 +14,7 @@ class LeverArm(Effect):
     """ω×l: the DVL is not where the reference velocity is measured, so turning moves it."""
 
     name = "lever_arm"
-    summary = "the DVL sits away from the reference point and moves when the vehicle turns: ω × l"
+    summary = "the DVL sits at l from the reference point and moves when the vehicle turns: ω × l"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
     acts_on = ActsOn.MOTION
@@ -30,7 +30,7 @@ class Sideslip(Effect):
     """Sway in a turn that the DVL sees and the reference does not, as one that is derived from course does not."""
 
     name = "sideslip"
-    summary = "sway in proportion to turn rate times speed that only the DVL sees"
+    summary = "sway that only the DVL sees: coefficient · ω_z · horizontal speed"
     manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
     parameters = (
         ParameterSpec("coefficient_s", "s", 0.1, -10.0, 10.0, "sway per turn rate and speed; negative: outward"),
@@ -49,7 +49,7 @@ class TiltCoupling(Effect):
     """Velocity that leaks in with the tilt of the vehicle."""
 
     name = "tilt_coupling"
-    summary = "an error in proportion to pitch or roll"
+    summary = "an error in proportion to pitch or roll, body frame"
     manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
     parameters = (
         ParameterSpec("x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)"),

@@ -32,7 +32,7 @@ class QuadraticScale(Effect):
     """A scale-factor error that grows with speed."""
 
     name = "quadratic_scale"
-    summary = "an error along the velocity that grows with speed squared"
+    summary = "an error that grows with speed squared: coefficient · ‖v‖ · v"
     manoeuvre = "straight legs at three speeds or more"
     parameters = (ParameterSpec("coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed"),)
     acts_on = ActsOn.DVL
@@ -47,7 +47,7 @@ class ScaleDrift(Effect):
     """A scale-factor error that changes along the run, as the speed of sound does."""
 
     name = "scale_drift"
-    summary = "the scale-factor error changes steadily along the run, as of sound speed"
+    summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
     parameters = (ParameterSpec("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),)
     acts_on = ActsOn.DVL
@@ -62,7 +62,7 @@ class MisalignmentDrift(Effect):
     """The mounting turns slowly along the run."""
 
     name = "misalignment_drift"
-    summary = "the misalignment φ changes steadily along the run"
+    summary = "the misalignment changes along the run: φ = rate · (t - start)"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
     parameters = along_axes("rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour")
     acts_on = ActsOn.DVL
@@ -78,7 +78,7 @@ class MountFlexure(Effect):
     """The mounting gives way to the water: misalignment that depends on speed."""
 
     name = "mount_flexure"
-    summary = "the misalignment φ grows with speed: the mounting bends"
+    summary = "the mounting bends with speed: φ = flexure · ‖v‖"
     manoeuvre = "straight legs at three speeds or more"
     parameters = along_axes("rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed")
     acts_on = ActsOn.DVL
@@ -97,7 +97,7 @@ class AxisNonorthogonality(Effect):
     """
 
     name = "axis_nonorthogonality"
-    summary = "the DVL's axes are not at right angles to each other"
+    summary = "the DVL's axes are not at right angles: symmetric shear S v, DVL frame"
     manoeuvre = "sway and heave beside surge: drift across, dive or go in waves"
     parameters = tuple(
         ParameterSpec(

@@ -16,7 +16,7 @@ class DvlTimeOffset(Effect):
     """The DVL's stamps are late: what is stamped t was measured before."""
 
     name = "dvl_time_offset"
-    summary = "the DVL's stamps are late (negative: early)"
+    summary = "the DVL's stamps are late by τ: v(t - τ) - v(t), body frame"
     manoeuvre = "straight legs that speed up and slow down, in waves or with quick changes of speed"
     parameters = (ParameterSpec("seconds", "s", 0.1, -2.0, 2.0, "how late a stamp is; positive: late", linear=False),)
     acts_on = ActsOn.MOTION
@@ -31,7 +31,7 @@ class ReferenceTimeOffset(Effect):
     """The reference's stamps are late. Recorded in ENU it then is turned by an attitude that is too new."""
 
     name = "reference_time_offset"
-    summary = "the reference's stamps are late (negative: early)"
+    summary = "the reference's stamps are late by τ: -(g(t - τ) - g(t)), in the frame it was recorded in"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = DvlTimeOffset.parameters
     acts_on = ActsOn.REFERENCE
@@ -47,7 +47,7 @@ class ReferenceLag(Effect):
     """The receiver filters its velocity: a first-order low-pass, in the frame in which it was recorded."""
 
     name = "reference_lag"
-    summary = "the reference is low-pass filtered (first order), so it lags"
+    summary = "the reference is low-pass filtered: T dg'/dt = g - g', in the frame it was recorded in"
     manoeuvre = "sharp turns as well as wide ones, and quick changes of speed"
     parameters = (ParameterSpec("time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False),)
     acts_on = ActsOn.REFERENCE
