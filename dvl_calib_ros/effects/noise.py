@@ -19,7 +19,7 @@ class Outliers(NoiseEffect):
     summary = "some DVL samples are far off"
     parameters = (
         ParameterSpec("share", "1", 0.01, 0.0, 1.0, _SHARE),
-        ParameterSpec("std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis"),
+        ParameterSpec("std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis", 0.5),
     )
     acts_on = ActsOn.DVL
 
@@ -77,7 +77,7 @@ class ColouredReferenceNoise(NoiseEffect):
     summary = "the reference's noise is correlated in time"
     parameters = (
         ParameterSpec("std_mps", "m/s", 0.05, 0.0, 10.0, "standard deviation, per axis"),
-        ParameterSpec("correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e"),
+        ParameterSpec("correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e", 5.0),
     )
     acts_on = ActsOn.REFERENCE
 

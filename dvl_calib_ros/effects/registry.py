@@ -62,7 +62,7 @@ class Registry(Mapping[str, E], Generic[E]):
 
     @cached_property
     def _effects(self) -> dict[str, E]:
-        return {effect.name: effect for effect in _all_effects() if isinstance(effect, self._kind)}
+        return {effect.name: effect for effect in all_effects() if isinstance(effect, self._kind)}
 
     def __getitem__(self, name: str) -> E:
         return self._effects[name]
@@ -75,7 +75,8 @@ class Registry(Mapping[str, E], Generic[E]):
 
 
 @lru_cache(maxsize=1)
-def _all_effects() -> tuple[AnyEffect, ...]:
+def all_effects() -> tuple[AnyEffect, ...]:
+    """Systematic effects and those of the noise, own ones first. Raises InputError for a broken plug-in."""
     effects = {kind.name: kind() for kind in OWN}
     for point in entry_points(group=ENTRY_POINTS):
         effect = _plugged_in(point)
