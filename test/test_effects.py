@@ -12,6 +12,7 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 from conftest import ROOT
+from test_parameters import section
 
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.samples import VelocityFrame
@@ -328,7 +329,15 @@ def test_a_broken_plug_in_is_named_in_one_line(monkeypatch, value, said):
     assert "'mine'" in str(caught.value) and said in str(caught.value) and "\n" not in str(caught.value)
 
 
+def own_rows() -> list[str]:
+    """Of the table, without plug-ins that are installed here."""
+    return [row for row in effect_table().splitlines()[2:] if row.split("`")[1] in {**OWN_EFFECTS, **OWN_NOISE}]
+
+
 def test_the_table_of_effects_has_one_row_of_five_cells_for_each():
-    rows = effect_table().splitlines()[2:]
-    assert [row.split("`")[1] for row in rows][:14] == list(OWN_EFFECTS)
-    assert all(row.count("|") == 6 for row in rows)
+    assert [row.split("`")[1] for row in own_rows()] == [*OWN_EFFECTS, *OWN_NOISE]
+    assert all(row.count("|") == 6 for row in own_rows())
+
+
+def test_the_readme_lists_the_effects():
+    assert section("effects").splitlines()[2:] == own_rows(), "take it from: dvl-calib parameters --effects"

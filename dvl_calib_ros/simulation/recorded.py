@@ -69,9 +69,7 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
     if recording.smoothing > 0.0:
         on_grid = gaussian_filter1d(on_grid, recording.smoothing * rate_hz, axis=0, mode="nearest")
     rotation = spline(at)
-    # scipy gives rates in the frame of the result: ENU
-    rates = rotation.inv().apply(spline(at, 1))
-    return Motion(time, on_grid, rotation.as_matrix(), rates)
+    return Motion(time, on_grid, rotation.as_matrix(), spline(at, 1))
 
 
 def _read(recording: Recording) -> _Samples:
