@@ -292,7 +292,9 @@ def test_the_example_of_an_own_effect_is_found_once_its_package_is_installed(tmp
     def run(*arguments):
         return subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True)
 
-    assert "| `thruster_wash` |" in run("parameters", "--effects").stdout
+    assert r"| `thruster_wash` | a surge error in turns to either side: coefficient · \|ω_z\| |" in (
+        run("parameters", "--effects").stdout
+    )
     effect = ["--effect", "thruster_wash:coefficient_m=0.5"]
     done = run("simulate", str(tmp_path / "bag"), "--duration", "20", *effect)
     assert done.returncode == 0 and (tmp_path / "bag").is_dir(), done.stderr

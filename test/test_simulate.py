@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from io_fixtures import raw, storage_file, write_bag
 from mcap.reader import make_reader
 from test_cli import fail, succeed
@@ -27,6 +28,7 @@ from dvl_calib_ros.simulation.sensors import DvlErrors, ImuErrors, equivalent_er
 from dvl_calib_ros.simulation.trajectories import FREE_SPEEDS_MPS, TRAJECTORIES, make_motion
 from dvl_calib_ros.simulation.waves import Waves, add_waves
 
+BAGS = ROOT / "bags"
 QUIET = {"gnss_std": 0.0, "seconds": 60.0, "mounting_rpy": (0.1, -0.2, 0.7), "trajectory": "figure8"}
 OWN_EFFECTS = [kind.name for kind in OWN if issubclass(kind, Effect)]
 
@@ -279,7 +281,10 @@ def without_attitude(samples):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda run: run.gnss, "no topic 'imu/data'; set --motion-topics. The bag has: gnss/twist"),
+        (
+            lambda run: run.gnss,
+            "no topic 'imu/data' of sensor_msgs/msg/Imu; set --motion-topics. The bag has: gnss/twist",
+        ),
         (lambda run: run.imu, "no topic 'gnss/twist'"),
         (lambda run: [*run.gnss, *without_attitude(run.imu)], "imu/data holds 0 usable samples"),
         (lambda run: [*run.gnss[:50], *run.imu], "for 4.9 s without a gap"),
@@ -379,6 +384,10 @@ def test_a_wrong_effect_is_refused_with_what_there_is(capsys, tmp_path, text, sa
         (["--attitude-std", -1], "--attitude-std: -1"),
         (["--motion-of", "missing"], "missing: no such file or folder"),
         (["--motion-of", "missing", "--trajectory", "free"], "not allowed with argument"),
+        (
+            ["--motion-of", BAGS / "harbour_box", "--motion-topics", "imu/data", "gnss/twist"],
+            "no topic 'imu/data' of geom",
+        ),
     ],
 )
 def test_bad_motions_and_sensors_are_refused(capsys, tmp_path, options, said):

@@ -21,8 +21,9 @@ def _row(effect: AnyEffect) -> str:
         f"{_codes(parameter.name for parameter in group)} {unit}"
         for unit, group in groupby(effect.parameters, lambda parameter: parameter.unit)
     ]
+    summary = effect.summary.replace("|", "\\|")  # a bar would end the cell
     needs = ", ".join(sorted(need.value for need in effect.needs))
-    return f"| `{effect.name}` | {effect.summary} | {', '.join(by_unit)} | {needs} | {_codes(effect.confounded_with)} |"
+    return f"| `{effect.name}` | {summary} | {', '.join(by_unit)} | {needs} | {_codes(effect.confounded_with)} |"
 
 
 def _codes(names: Iterable[str]) -> str:

@@ -17,7 +17,8 @@ from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..io.bags import BagReader
 from ..io.errors import InputError
-from ..io.messages import MessageFeed
+from ..io.messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from ..io.replay import Topics
 from .trajectories import Motion
 
 # Across longer gaps nothing is known of the motion
@@ -78,12 +79,12 @@ def _read(recording: Recording) -> _Samples:
     velocities: dict[int, tuple[Vector, VelocityFrame]] = {}
     attitudes: dict[int, Quaternion] = {}
     with BagReader([recording.path]) as bag:
-        topics = bag.topics
-        gnss, imu = (_spelled(recording, name, topics) for name in (recording.gnss_topic, recording.imu_topic))
-        for topic, log_ns, message, undecodable in bag.messages([gnss, imu]):
+        topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
+        _check_topics(recording, topics, bag.topics)
+        for topic, log_ns, message, undecodable in bag.messages([topics.gnss, topics.imu]):
             if undecodable:
                 continue
-            if topic == imu:
+            if topic == topics.imu:
                 attitude = feed.imu(message, log_ns)
                 orientation = unit_quaternion(attitude.orientation)
                 if orientation is not None:
@@ -109,12 +110,13 @@ def _read(recording: Recording) -> _Samples:
     )
 
 
-def _spelled(recording: Recording, name: str, topics: dict[str, str]) -> str:
-    for spelling in (name, f"/{name}", name.lstrip("/")):
-        if spelling in topics:
-            return spelling
-    present = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "none"
-    raise InputError(f"{recording.path}: no topic {name!r}; set --motion-topics. The bag has: {present}")
+def _check_topics(recording: Recording, topics: Topics, present: dict[str, str]) -> None:
+    for name, msgtype in ((topics.gnss, TWIST_TYPE), (topics.imu, IMU_TYPE)):
+        if present.get(name) != msgtype:
+            listing = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(present.items())) or "none"
+            raise InputError(
+                f"{recording.path}: no topic {name!r} of {msgtype}; set --motion-topics. The bag has: {listing}"
+            )
 
 
 def _longest_stretch(recording: Recording, samples: _Samples) -> tuple[float, float]:
