@@ -1,11 +1,11 @@
-"""List every parameter and model, as the code defines them: the tables of the README, and config/calibration.yaml."""
+"""List every parameter, model and effect as the code defines them: the README's tables, and config/calibration.yaml."""
 
 from __future__ import annotations
 
 import argparse
 
 NAME = "parameters"
-HELP = "list every parameter, or every model, or write a parameter file"
+HELP = "list every parameter, model or effect, or write a parameter file"
 EXAMPLE = "dvl-calib parameters --yaml > calibration.yaml"
 
 
@@ -14,10 +14,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--yaml", action="store_true", help="a ROS 2 parameter file with every default")
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
+    what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Print."""
+    if arguments.effects:
+        from ..effects.table import effect_table
+
+        print(effect_table(), end="")
+        return
     from ..io.parameter_files import model_table, parameter_file_text, parameter_table
 
     make = parameter_file_text if arguments.yaml else model_table if arguments.models else parameter_table

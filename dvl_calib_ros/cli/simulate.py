@@ -1,4 +1,4 @@
-"""Write a bag from a trajectory and an error model. The same options and seed give the same bag."""
+"""Write a bag from a motion, an error model and any effects. The same options and seed give the same bag."""
 
 from __future__ import annotations
 
@@ -8,18 +8,48 @@ from pathlib import Path
 from . import common
 
 NAME = "simulate"
-HELP = "write a bag from a trajectory and an error model"
-EXAMPLE = "dvl-calib simulate my_bag --trajectory box --misalignment 1.5 -2 3 --scale 0.5 --gnss-outage 300 390"
+HELP = "write a bag from a motion, an error model and any effects"
+GNSS_FRAMES = ("from_frame_id", "body", "enu", "ned")
+EXAMPLE = "dvl-calib simulate my_bag --misalignment 1.5 -2 3 --scale 0.5 --effect lever_arm:x_m=0.3,z_m=-0.1"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    from ..simulation.trajectories import ROUNDS
+    from ..simulation.injection import FORM
+    from ..simulation.trajectories import TRAJECTORIES
 
     parser.add_argument("output", type=Path, metavar="BAG", help="folder to write; must not exist")
-    parser.add_argument("--trajectory", choices=tuple(ROUNDS), default="box", help="default: %(default)s")
-    parser.add_argument("--duration", type=float, default=600.0, metavar="S", help="default: %(default)g s")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise; default: %(default)s")
+    motion = parser.add_mutually_exclusive_group()
+    motion.add_argument("--trajectory", choices=TRAJECTORIES, default="box", help="default: %(default)s")
+    motion.add_argument(
+        "--motion-of", type=Path, metavar="RECORDED",
+        help="take the motion from a bag: its reference velocity and attitude, the longest stretch without a gap",
+    )  # fmt: skip
+    parser.add_argument(
+        "--motion-topics", nargs=2, default=("gnss/twist", "imu/data"), metavar=("GNSS", "IMU"),
+        help="topics of RECORDED; default: gnss/twist imu/data",
+    )  # fmt: skip
+    parser.add_argument(
+        "--motion-frame", choices=GNSS_FRAMES, default=GNSS_FRAMES[0],
+        help="frame of RECORDED's reference velocity, as the parameter gnss_frame; default: %(default)s",
+    )  # fmt: skip
+    parser.add_argument(
+        "--motion-smoothing", type=float, default=1.0, metavar="S",
+        help="window (standard deviation) that smooths RECORDED's velocity; default: %(default)g",
+    )  # fmt: skip
+    parser.add_argument("--duration", type=float, metavar="S", help="default: 600 s, or all of RECORDED")
+    parser.add_argument(
+        "--waves", nargs=2, type=float, metavar=("HEIGHT", "PERIOD"),
+        help="surface waves: significant height (m), period of the peak (s)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="of all that is by chance; default: %(default)s")
+    parser.add_argument(
+        "--effect", action="append", default=[], metavar=FORM,
+        help="add an effect, such as lever_arm:x_m=0.3; repeatable (dvl-calib parameters --effects lists them)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--truth", action="store_true", help="attach all that was simulated to the bag, as truth.json (MCAP only)"
+    )
     angles = ("ROLL", "PITCH", "YAW")
     none = (0.0, 0.0, 0.0)
     parser.add_argument(
@@ -35,12 +65,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gnss-rate", type=float, default=5.0, metavar="HZ", help="default: %(default)g; 0: no GNSS")
     parser.add_argument("--imu-rate", type=float, default=20.0, metavar="HZ", help="default: %(default)g; 0: no IMU")
     parser.add_argument("--beam-std", type=float, default=0.005, metavar="M/S", help="default: %(default)g per beam")
+    parser.add_argument(
+        "--beam-bias", nargs=4, type=float, default=(0.0,) * 4, metavar=("B1", "B2", "B3", "B4"),
+        help="constant error of each beam, m/s",
+    )  # fmt: skip
     parser.add_argument("--gnss-std", type=float, default=0.1, metavar="M/S", help="default: %(default)g per axis")
     parser.add_argument("--gnss-frame", choices=("enu", "body"), default="enu", help="default: %(default)s")
     parser.add_argument(
         "--gnss-outage", nargs=2, type=float, action="append", default=[], metavar=("FROM", "TO"),
         help="seconds without GNSS; repeatable",
     )  # fmt: skip
+    parser.add_argument("--attitude-std", type=float, default=0.0, metavar="DEG", help="IMU; default: %(default)g")
+    parser.add_argument("--gyro-std", type=float, default=0.0, metavar="DEG/S", help="IMU; default: %(default)g")
+    parser.add_argument(
+        "--gyro-bias", nargs=3, type=float, default=none, metavar=("X", "Y", "Z"), help="IMU, degrees per second"
+    )
     common.add_storage_options(parser)
 
 
@@ -50,17 +89,27 @@ def run(arguments: argparse.Namespace) -> None:
 
     from ..calibration.samples import VelocityFrame
     from ..io.bags import Compression, Storage
+    from ..simulation.injection import injection
+    from ..simulation.recorded import Recording
     from ..simulation.scenario import Scenario, write_bag
-    from ..simulation.sensors import DvlErrors
+    from ..simulation.sensors import DvlErrors, ImuErrors
+    from ..simulation.waves import Waves
 
     _check(arguments)
     roll, pitch, yaw = map(math.radians, arguments.misalignment)
     scale = [0.01 * s for s in arguments.scale] * (3 if len(arguments.scale) == 1 else 1)
+    bias_x, bias_y, bias_z = map(math.radians, arguments.gyro_bias)
+    gnss_topic, imu_topic = arguments.motion_topics
+    recording = arguments.motion_of and Recording(
+        arguments.motion_of, gnss_topic, imu_topic, arguments.motion_frame, arguments.motion_smoothing
+    )
     scenario = Scenario(
         trajectory=arguments.trajectory,
         seconds=arguments.duration,
         seed=arguments.seed,
-        errors=DvlErrors((roll, pitch, yaw), (scale[0], scale[1], scale[2]), beam_std=arguments.beam_std),
+        errors=DvlErrors(
+            (roll, pitch, yaw), (scale[0], scale[1], scale[2]), tuple(arguments.beam_bias), arguments.beam_std
+        ),
         mounting_rpy=tuple(arguments.mounting_rpy),
         dvl_rate=arguments.dvl_rate,
         gnss_rate=arguments.gnss_rate,
@@ -68,8 +117,15 @@ def run(arguments: argparse.Namespace) -> None:
         gnss_std=arguments.gnss_std,
         gnss_frame=VelocityFrame(arguments.gnss_frame),
         outages=tuple((start, end) for start, end in arguments.gnss_outage),
+        imu_errors=ImuErrors(
+            math.radians(arguments.attitude_std), math.radians(arguments.gyro_std), (bias_x, bias_y, bias_z)
+        ),
+        recording=recording,
+        waves=Waves(*arguments.waves) if arguments.waves else None,
+        effects=tuple(injection(text) for text in arguments.effect),
     )
-    write_bag(scenario, arguments.output, Storage(arguments.storage), Compression(arguments.compression))
+    storage, compression = Storage(arguments.storage), Compression(arguments.compression)
+    write_bag(scenario, arguments.output, storage, compression, with_truth=arguments.truth)
     print(f"wrote {arguments.output}")
 
 
@@ -85,6 +141,11 @@ LIMITS = {
     "imu_rate": (0.01, 100.0),
     "beam_std": (0.0, 10.0),
     "gnss_std": (0.0, 10.0),
+    "beam_bias": (-10.0, 10.0),
+    "attitude_std": (0.0, 30.0),
+    "gyro_std": (0.0, 100.0),
+    "gyro_bias": (-100.0, 100.0),
+    "motion_smoothing": (0.0, 60.0),
 }
 MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # no such sensor
 
@@ -96,9 +157,11 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError("--scale: give one number for all axes, or three")
     for name, (low, high) in LIMITS.items():
         given = getattr(arguments, name)
-        for value in given if isinstance(given, list | tuple) else [given]:
+        for value in given if isinstance(given, list | tuple) else [] if given is None else [given]:
             if not low <= value <= high and not (value == 0.0 and name in MAY_BE_ZERO):
                 raise InputError(f"--{name.replace('_', '-')}: {value:g} is outside {low:g} .. {high:g}")
+    if arguments.waves and not (0.0 <= arguments.waves[0] <= 10.0 and 1.0 <= arguments.waves[1] <= 30.0):
+        raise InputError("--waves: give a height of 0 .. 10 m, then a period of 1 .. 30 s")
     for start, end in arguments.gnss_outage:
         if not start < end:
             raise InputError(f"--gnss-outage: {start:g} is not before {end:g}; give the beginning, then the end")

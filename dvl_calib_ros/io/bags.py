@@ -27,6 +27,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from .attachments import attach
 from .errors import InputError
 from .messages import IMU_TYPE, TWIST_TYPE
 from .salvage import MCAP_MAGIC, SQLITE_MAGIC, DamagedError, Salvaged, salvage_mcap, salvage_sqlite
@@ -440,6 +441,14 @@ class BagWriter:
         self._writer.set_compression(_COMPRESSION[compression], CompressionFormat.ZSTD)
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[str, Any] = {}
+        self._storage, self._compression = storage, compression
+        self._attachments: list[tuple[str, str, bytes]] = []
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Attach a file to the bag. Raises InputError unless it is plain MCAP."""
+        if self._storage is not Storage.MCAP or self._compression is Compression.FILE:
+            raise InputError(f"{name}: only MCAP holds attachments; use storage mcap, and no file compression")
+        self._attachments.append((name, media_type, data))
 
     def __enter__(self) -> BagWriter:
         try:
@@ -453,6 +462,9 @@ class BagWriter:
     ) -> None:
         try:
             self._writer.__exit__(kind, error, trace)
+            for name, media_type, data in self._attachments if error is None else ():
+                file = self._writer.path / f"{self._writer.path.name}.mcap"
+                attach(file, name, media_type, data, self._compression is Compression.CHUNK)
         except (OSError, sqlite3.Error) as failure:
             error = failure
         if error is not None:  # half a bag would pass for a whole one

@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from .. import __version__
 from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ..effects.base import ActsOn, EffectInput
 from ..io.bags import BagWriter, Compression, Storage
-from .sensors import DvlErrors, axis_covariance, measure_dvl, measure_gnss
+from .injection import Injection, disturbed, injection_document, traces
+from .recorded import Recording, recorded_motion
+from .sensors import (
+    DvlErrors,
+    ImuErrors,
+    axis_covariance,
+    equivalent_error_terms,
+    measure_dvl,
+    measure_gnss,
+    measure_imu,
+)
 from .trajectories import Motion, make_motion
+from .waves import Waves, add_waves
 
 MOTION_RATE_HZ = 100.0
+DEFAULT_SECONDS = 600.0
+TRUTH_NAME = "truth.json"
 START_NS = 1_760_000_000_000_000_000
 # GNSS and DVL do not measure at the same instant
 GNSS_PHASE_S = 0.037
@@ -25,11 +42,12 @@ GNSS_PHASE_S = 0.037
 class Scenario:
     """Everything about a simulated run. Rates in Hz, standard deviations in m/s, times in s from the start.
 
-    outages: (from, to) without GNSS. gnss_frame: BODY or ENU.
+    recording: a bag whose motion it is, instead of a trajectory. seconds: None is 600, or all of the recording.
+    outages: (from, to) without GNSS. gnss_frame: BODY or ENU. effects: what is added beside the errors.
     """
 
     trajectory: str = "box"
-    seconds: float = 600.0
+    seconds: float | None = None
     seed: int = 0
     errors: DvlErrors = field(default_factory=DvlErrors)
     mounting_rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -39,6 +57,10 @@ class Scenario:
     gnss_std: float = 0.1
     gnss_frame: VelocityFrame = VelocityFrame.ENU
     outages: tuple[tuple[float, float], ...] = ()
+    imu_errors: ImuErrors = field(default_factory=ImuErrors)
+    recording: Recording | None = None
+    waves: Waves | None = None
+    effects: tuple[Injection, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -50,21 +72,68 @@ class Run:
     imu: list[ImuSample]
 
 
+@dataclass(frozen=True)
+class _World:
+    """What all sensors share: the motion and its length, the same as effects see it, and the effects with seeds."""
+
+    motion: Motion
+    seconds: float
+    input: EffectInput
+    seeded: Sequence[tuple[Injection, np.random.SeedSequence]]
+
+
 def simulate(scenario: Scenario) -> Run:
-    """Simulate a run. The same scenario gives the same run; noise of DVL and GNSS has random streams of its own."""
-    motion = make_motion(scenario.trajectory, scenario.seconds, MOTION_RATE_HZ)
-    dvl_seed, gnss_seed = np.random.SeedSequence(scenario.seed).spawn(2)
+    """Simulate a run. The same scenario gives the same run; every kind of noise has a random stream of its own.
+
+    So what one option adds leaves the noise of the others as it was. Raises InputError for a recording without motion.
+    """
+    dvl_seed, gnss_seed, imu_seed, motion_seed, *seeds = np.random.SeedSequence(scenario.seed).spawn(
+        4 + len(scenario.effects)
+    )
+    motion, seconds = _motion(scenario, motion_seed)
+    world = _World(motion, seconds, _effect_input(scenario, motion), list(zip(scenario.effects, seeds, strict=True)))
     return Run(
-        _simulate_dvl(scenario, motion, np.random.default_rng(dvl_seed)),
-        _simulate_gnss(scenario, motion, np.random.default_rng(gnss_seed)),
-        _simulate_imu(scenario, motion),
+        _simulate_dvl(scenario, world, np.random.default_rng(dvl_seed)),
+        _simulate_gnss(scenario, world, np.random.default_rng(gnss_seed)),
+        _simulate_imu(scenario, motion, np.random.default_rng(imu_seed)),
     )
 
 
-def write_bag(scenario: Scenario, path: Path, storage: Storage, compression: Compression) -> None:
-    """Simulate a run into a new bag. Raises InputError."""
+def _motion(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Motion, float]:
+    """The motion, and its length in s."""
+    free_seed, wave_seed = seed.spawn(2)
+    if scenario.recording:
+        motion = recorded_motion(scenario.recording, MOTION_RATE_HZ, scenario.seconds)
+        seconds = len(motion.time) / MOTION_RATE_HZ
+    else:
+        seconds = scenario.seconds or DEFAULT_SECONDS
+        motion = make_motion(scenario.trajectory, seconds, MOTION_RATE_HZ, np.random.default_rng(free_seed))
+    if scenario.waves:
+        motion = add_waves(motion, scenario.waves, np.random.default_rng(wave_seed))
+    return motion, seconds
+
+
+def _effect_input(scenario: Scenario, motion: Motion) -> EffectInput:
+    return EffectInput(
+        motion.time,
+        motion.velocity_body,
+        rotation_from_rpy(scenario.mounting_rpy).T,
+        motion.rotation_enu_from_body,
+        motion.angular_velocity,
+        scenario.gnss_frame,
+    )
+
+
+def write_bag(
+    scenario: Scenario, path: Path, storage: Storage, compression: Compression, with_truth: bool = False
+) -> None:
+    """Simulate a run into a new bag, with everything that was simulated attached if asked for. Raises InputError."""
+    writer = BagWriter(path, storage, compression)
+    if with_truth:
+        text = json.dumps(truth_document(scenario), indent=1, allow_nan=False)
+        writer.attachment(TRUTH_NAME, "application/json", text.encode())
     run = simulate(scenario)
-    with BagWriter(path, storage, compression) as bag:
+    with writer as bag:
         samples: Iterable[DvlSample | ReferenceSample | ImuSample] = heapq.merge(
             run.imu, run.gnss, run.dvl, key=lambda sample: sample.stamp_ns
         )
@@ -77,23 +146,44 @@ def write_bag(scenario: Scenario, path: Path, storage: Storage, compression: Com
                 bag.imu("imu/data", sample)
 
 
-def _simulate_dvl(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> list[DvlSample]:
-    at = _times(scenario.seconds, scenario.dvl_rate, 0.0)
-    rotation_dvl_from_body = rotation_from_rpy(scenario.mounting_rpy).T
-    velocity = _interpolate(at, motion.time, motion.velocity_body)
-    measured = measure_dvl(velocity, scenario.errors, rotation_dvl_from_body, rng)
+def truth_document(scenario: Scenario) -> dict[str, Any]:
+    """Everything that was simulated, as plain data: options, errors in the calibration's terms, effects."""
+    phi, delta_k = equivalent_error_terms(scenario.errors)
+    document = asdict(replace(scenario, effects=()))
+    document["gnss_frame"] = scenario.gnss_frame.value
+    if scenario.recording:
+        document["recording"]["path"] = str(scenario.recording.path)
+        del document["trajectory"]
+    return document | {
+        "phi_rad": phi.tolist(),
+        "delta_k": delta_k.tolist(),
+        "effects": [injection_document(each) for each in scenario.effects],
+        "version": __version__,
+    }
+
+
+def _simulate_dvl(scenario: Scenario, world: _World, rng: np.random.Generator) -> list[DvlSample]:
+    at = _times(world.seconds, scenario.dvl_rate, 0.0)
+    motion, rotation_dvl_from_body = world.motion, world.input.rotation_dvl_from_body
+    velocity = motion.velocity_body + traces(scenario.effects, world.input, ActsOn.MOTION)
+    measured = measure_dvl(_interpolate(at, motion.time, velocity), scenario.errors, rotation_dvl_from_body, rng)
+    added = traces(scenario.effects, world.input, ActsOn.DVL) @ rotation_dvl_from_body.T
+    measured = measured + _interpolate(at, motion.time, added)
+    measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.DVL)
     covariance = axis_covariance(scenario.errors.beam_std) if scenario.errors.beam_std else None
     return [DvlSample(stamp, (x, y, z), covariance) for stamp, (x, y, z) in _stamped(at, measured)]
 
 
-def _simulate_gnss(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> list[ReferenceSample]:
+def _simulate_gnss(scenario: Scenario, world: _World, rng: np.random.Generator) -> list[ReferenceSample]:
     if not scenario.gnss_rate:
         return []
-    at = _times(scenario.seconds, scenario.gnss_rate, GNSS_PHASE_S)
-    velocity = motion.velocity_body
+    at = _times(world.seconds, scenario.gnss_rate, GNSS_PHASE_S)
+    motion = world.motion
+    velocity = motion.velocity_body - traces(scenario.effects, world.input, ActsOn.REFERENCE)
     if scenario.gnss_frame is VelocityFrame.ENU:
         velocity = np.einsum("nij,nj->ni", motion.rotation_enu_from_body, velocity)
     measured = measure_gnss(_interpolate(at, motion.time, velocity), scenario.gnss_std, rng)
+    measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.REFERENCE)
     covariance = np.eye(3) * scenario.gnss_std**2 if scenario.gnss_std else None
     return [
         ReferenceSample(stamp, (x, y, z), covariance, scenario.gnss_frame)
@@ -102,15 +192,30 @@ def _simulate_gnss(scenario: Scenario, motion: Motion, rng: np.random.Generator)
     ]
 
 
-def _simulate_imu(scenario: Scenario, motion: Motion) -> list[ImuSample]:
+def _simulate_imu(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> list[ImuSample]:
     if not scenario.imu_rate:
         return []
     every = max(1, round(MOTION_RATE_HZ / scenario.imu_rate))
-    rates = _stamped(motion.time[::every], motion.angular_velocity[::every])
+    attitudes, rates = motion.rotation_enu_from_body[::every], motion.angular_velocity[::every]
+    if scenario.imu_errors != ImuErrors():
+        attitudes, rates = measure_imu(attitudes, rates, scenario.imu_errors, rng)
     return [
         ImuSample(stamp, quaternion_from_rotation(rotation), (x, y, z))
-        for (stamp, (x, y, z)), rotation in zip(rates, motion.rotation_enu_from_body[::every], strict=True)
+        for (stamp, (x, y, z)), rotation in zip(_stamped(motion.time[::every], rates), attitudes, strict=True)
     ]
+
+
+def _input_at(world: _World, at: Array) -> EffectInput:
+    """The motion at a sensor's times, to the nearest sample: what effects on the noise go by."""
+    nearest = np.clip(np.rint(at * MOTION_RATE_HZ).astype(int), 0, len(world.motion.time) - 1)
+    motion = world.motion
+    return replace(
+        world.input,
+        time=at,
+        velocity_body=motion.velocity_body[nearest],
+        rotation_enu_from_body=motion.rotation_enu_from_body[nearest],
+        angular_velocity=motion.angular_velocity[nearest],
+    )
 
 
 def _times(seconds: float, rate: float, phase: float) -> Array:

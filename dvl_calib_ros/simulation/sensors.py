@@ -37,6 +37,15 @@ class DvlErrors:
     beam_std: float = 0.0
 
 
+@dataclass(frozen=True)
+class ImuErrors:
+    """Errors of an IMU, per axis: white noise of attitude (rad) and angular velocity (rad/s), gyro bias (rad/s)."""
+
+    attitude_std: float = 0.0
+    gyro_std: float = 0.0
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 def equivalent_error_terms(errors: DvlErrors) -> tuple[Array, Array]:
     """φ (3,) rad and δk (3,) of the calibration's error model that stand for these errors: the truth to compare with.
 
@@ -82,3 +91,13 @@ def measure_dvl_matched(
 def measure_gnss(velocity: Array, std: float, rng: np.random.Generator) -> Array:
     """GNSS velocities (N, 3) m/s with white noise per axis."""
     return velocity + rng.normal(0.0, std, velocity.shape)
+
+
+def measure_imu(
+    rotation_enu_from_body: Array, angular_velocity: Array, errors: ImuErrors, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Attitudes (N, 3, 3) and angular velocities (N, 3) rad/s, body frame, that an IMU reports."""
+    shape = angular_velocity.shape
+    tilted = rotation_from_rpy(rng.normal(0.0, errors.attitude_std, shape))
+    gyro_noise = rng.normal(0.0, errors.gyro_std, shape)
+    return rotation_enu_from_body @ tilted, angular_velocity + errors.gyro_bias + gyro_noise

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import cycle
 
@@ -63,34 +63,53 @@ ROUNDS: Mapping[str, Callable[[], list[Leg]]] = {
     "lawnmower": lambda: [Leg(60.0, SPEED_MPS), _half(1.0), Leg(60.0, SPEED_MPS), _half(-1.0)],
     "figure8": lambda: [part for speed in (1.0, 2.0) for part in (_full(1.0, speed), _full(-1.0, speed))],
 }
+FREE = "free"
+TRAJECTORIES = (*ROUNDS, FREE)
+# Free manoeuvres: a leg's length, speed and yaw rate are drawn from these; three legs in ten are straight
+FREE_SECONDS, FREE_SPEEDS_MPS, FREE_YAW_RATE = (5.0, 40.0), (0.6, 2.2), np.deg2rad(12.0)
+FREE_STRAIGHT = 0.3
 
 
-def make_motion(trajectory: str, seconds: float, rate_hz: float) -> Motion:
-    """Motion along a trajectory of `ROUNDS` for so long, sampled at a rate."""
+def make_motion(trajectory: str, seconds: float, rate_hz: float, rng: np.random.Generator | None = None) -> Motion:
+    """Motion along one of `TRAJECTORIES` for so long, sampled at a rate. rng: of free manoeuvres; seed 0 if None."""
     time = np.arange(0.0, seconds, 1.0 / rate_hz)
-    speed, yaw_rate = _smoothed(ROUNDS[trajectory](), seconds, time)
+    free = trajectory == FREE
+    legs = _free_legs(rng or np.random.default_rng(0)) if free else cycle(ROUNDS[trajectory]())
+    speed, yaw_rate = _smoothed(legs, seconds, time)
     yaw = _integral(time, yaw_rate)
     phase = 2 * np.pi * time / WAVE_PERIOD_S
     roll, pitch = WAVE_ROLL * np.sin(phase), WAVE_PITCH * np.cos(1.3 * phase)
     sway = -SKID_S * yaw_rate * speed
     rotation = rotation_from_rpy(np.column_stack([roll, pitch, yaw]))
+    rates = body_rates(time, roll, pitch, yaw_rate)
+    return Motion(time, np.column_stack([speed, sway, np.zeros_like(speed)]), rotation, rates)
+
+
+def body_rates(time: Array, roll: Array, pitch: Array, yaw_rate: Array) -> Array:
+    """Angular velocity (N, 3) rad/s in the body frame of roll and pitch (N,) rad over time and a yaw rate (N,)."""
     roll_rate, pitch_rate = np.gradient(roll, time), np.gradient(pitch, time)
     # Euler angle rates to body rates, Z-Y-X order
-    rates = np.column_stack(
+    return np.column_stack(
         [
             roll_rate - yaw_rate * np.sin(pitch),
             pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
             -pitch_rate * np.sin(roll) + yaw_rate * np.cos(roll) * np.cos(pitch),
         ]
     )
-    return Motion(time, np.column_stack([speed, sway, np.zeros_like(speed)]), rotation, rates)
 
 
-def _smoothed(one_round: list[Leg], seconds: float, time: Array) -> tuple[Array, Array]:
+def _free_legs(rng: np.random.Generator) -> Iterator[Leg]:
+    while True:
+        straight = rng.random() < FREE_STRAIGHT
+        yaw_rate = 0.0 if straight else float(rng.uniform(-FREE_YAW_RATE, FREE_YAW_RATE))
+        yield Leg(float(rng.uniform(*FREE_SECONDS)), float(rng.uniform(*FREE_SPEEDS_MPS)), yaw_rate)
+
+
+def _smoothed(legs: Iterator[Leg], seconds: float, time: Array) -> tuple[Array, Array]:
     """Speed (N,) and yaw rate (N,), with changes spread over 3 s: a vehicle has inertia."""
     ends, speeds, yaw_rates = [], [], []
     end = 0.0
-    for leg in cycle(one_round):
+    for leg in legs:
         end += leg.seconds
         ends.append(end)
         speeds.append(leg.speed)

@@ -1,0 +1,168 @@
+"""What an effect is: something the simulator lacks and a vehicle has.
+
+One class each, in one registry (`EFFECTS`); the same class adds the effect to a simulation and explains it in a
+diagnosis, through one function, `trace`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import ClassVar
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.samples import VelocityFrame
+
+
+@dataclass(frozen=True)
+class EffectInput:
+    """The motion that an effect acts on: the truth in the simulator, the best knowledge of it in the diagnosis.
+
+    time: (N,) s, increasing. velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
+    rotation_dvl_from_body: (3, 3) T. rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame;
+    None where the bag has none. reference_frame: the frame in which the reference velocity was recorded; what delays or
+    filters it there turns with the vehicle only if that is the body.
+    """
+
+    time: Array
+    velocity_body: Array
+    rotation_dvl_from_body: Array
+    rotation_enu_from_body: Array | None = None
+    angular_velocity: Array | None = None
+    reference_frame: VelocityFrame = VelocityFrame.ENU
+
+    @property
+    def attitude(self) -> Array:
+        """rotation_enu_from_body, of an effect that needs it. Raises ValueError without."""
+        if self.rotation_enu_from_body is None:
+            raise ValueError("this effect needs the attitude (rotation_enu_from_body)")
+        return self.rotation_enu_from_body
+
+    @property
+    def turn_rate(self) -> Array:
+        """angular_velocity, of an effect that needs it. Raises ValueError without."""
+        if self.angular_velocity is None:
+            raise ValueError("this effect needs the angular velocity")
+        return self.angular_velocity
+
+    @property
+    def velocity_dvl(self) -> Array:
+        """(N, 3) m/s in the nominal frame of the DVL."""
+        return self.velocity_body @ self.rotation_dvl_from_body.T
+
+    @property
+    def speed(self) -> Array:
+        """(N,) m/s."""
+        return np.linalg.norm(self.velocity_body, axis=1)
+
+    @property
+    def elapsed(self) -> Array:
+        """(N,) s since the first time."""
+        return self.time - self.time[0]
+
+
+class Needs(Enum):
+    """What a recording must hold for an effect to be testable."""
+
+    ATTITUDE = "attitude"
+    ANGULAR_VELOCITY = "angular velocity"
+
+
+class ActsOn(Enum):
+    """Where an effect comes in, with D = (I + diag(δk)) (I + [φ×]) the calibration and traces in the body frame.
+
+        v_dvl = D T (v_reference + traces on MOTION + traces on REFERENCE) + T (traces on DVL)
+
+    MOTION: the velocity at which the DVL is moved. DVL: what it makes of it. REFERENCE: the simulator takes the trace
+    off the reference velocity.
+    """
+
+    MOTION = "motion"
+    DVL = "dvl"
+    REFERENCE = "reference"
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """One parameter.
+
+    typical: size in `unit` that would be worth knowing of. low, high: bounds. default: its value where none is given;
+    an effect with all parameters at their defaults does nothing. linear: the trace is linear in it, the others fixed.
+    """
+
+    name: str
+    unit: str
+    typical: float
+    low: float
+    high: float
+    description: str
+    default: float = 0.0
+    linear: bool = True
+
+
+def along_axes(suffix: str, unit: str, typical: float, bound: float, description: str) -> tuple[ParameterSpec, ...]:
+    """One parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
+    return tuple(
+        ParameterSpec(f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis)) for axis in "xyz"
+    )
+
+
+def vector(values: Mapping[str, float], suffix: str) -> Array:
+    """The three values (3,) of `along_axes`."""
+    return np.array([values[f"{axis}_{suffix}"] for axis in "xyz"])
+
+
+class AnyEffect:
+    """What systematic effects and effects on the noise have in common.
+
+    name: as in the documentation. parameters: in the order of `values`. needs: what a recording must hold.
+    confounded_with: effects that some data cannot tell from this one.
+    """
+
+    name: ClassVar[str]
+    summary: ClassVar[str]
+    parameters: ClassVar[tuple[ParameterSpec, ...]]
+    acts_on: ClassVar[ActsOn]
+    needs: ClassVar[frozenset[Needs]] = frozenset()
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Values with which the effect does nothing."""
+        return {parameter.name: parameter.default for parameter in self.parameters}
+
+
+class Effect(AnyEffect, ABC):
+    """A systematic effect: the same motion always gives the same trace.
+
+    manoeuvre: what to fly to see it and to tell it from what it is confounded with.
+    """
+
+    manoeuvre: ClassVar[str]
+
+    @property
+    def linear(self) -> bool:
+        """Whether the trace is linear in all parameters together."""
+        return all(parameter.linear for parameter in self.parameters)
+
+    @abstractmethod
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """What the effect adds to (DVL velocity - ideal DVL velocity as expected from the reference).
+
+        values: every parameter by name. (N, 3) m/s in the nominal body frame, at `motion.time`; where it comes in is
+        told by `ActsOn`. An effect on the reference returns minus what it adds to the reference velocity.
+        """
+
+
+class NoiseEffect(AnyEffect, ABC):
+    """An effect on the noise: it changes samples by chance, so it has no trace; the diagnosis has tests of its own."""
+
+    @abstractmethod
+    def disturb(
+        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
+    ) -> Array:
+        """Samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, as they come out with the effect."""

@@ -1,0 +1,64 @@
+"""Effects of what surrounds the vehicle: water instead of ground, a compass that is off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .base import ActsOn, Effect, EffectInput, Needs, ParameterSpec
+
+_CURRENT = "{} part of the velocity added: minus the current, which carries the water along"
+
+
+class WaterLock(Effect):
+    """The DVL tracks the water, all the time or for some of it, so it misses what the current does."""
+
+    name = "water_lock"
+    summary = "the DVL tracks water: an earth-fixed velocity (minus the current) added from from_s to to_s"
+    manoeuvre = "straight legs on four headings or more, over ground known to be in range"
+    parameters = (
+        ParameterSpec("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),
+        ParameterSpec("north_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("north")),
+        ParameterSpec("from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False),
+        ParameterSpec("to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False),
+    )
+    acts_on = ActsOn.MOTION
+    needs = frozenset({Needs.ATTITUDE})
+    confounded_with = ("heading_error", "velocity_bias")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """R_body_from_enu c while from_s <= t < to_s."""
+        current_enu = np.array([values["east_mps"], values["north_mps"], 0.0])
+        locked = (motion.elapsed >= values["from_s"]) & (motion.elapsed < values["to_s"])
+        return locked[:, None] * (current_enu @ motion.attitude)
+
+
+class HeadingError(Effect):
+    """The heading is wrong by an amount that swings once around with the heading, as of an uncompensated compass.
+
+    It turns the reference, which is what the wrong heading is used for. A constant error is misalignment about z.
+    """
+
+    name = "heading_error"
+    summary = "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ"
+    manoeuvre = "straight legs on eight headings, at two speeds"
+    parameters = (
+        ParameterSpec("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),
+        ParameterSpec("cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False),
+    )
+    acts_on = ActsOn.REFERENCE
+    needs = frozenset({Needs.ATTITUDE})
+    confounded_with = ("water_lock",)
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """g - R_body_from_enu Rz(-error) R_enu_from_body g; one in the body frame that was made with it is no other."""
+        rotation = motion.attitude
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        error = values["sin_rad"] * np.sin(yaw) + values["cos_rad"] * np.cos(yaw)
+        east, north, _ = np.einsum("nij,nj->in", rotation, motion.velocity_body)
+        sine, cosine_less_one = np.sin(error), -2.0 * np.sin(0.5 * error) ** 2
+        added = [cosine_less_one * east + sine * north, cosine_less_one * north - sine * east, np.zeros_like(east)]
+        return -np.einsum("nji,jn->ni", rotation, np.array(added))

@@ -1,0 +1,74 @@
+"""Effects of how the vehicle moves: where the DVL sits, how the vehicle skids and tilts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .base import ActsOn, Effect, EffectInput, Needs, ParameterSpec, along_axes, vector
+
+
+class LeverArm(Effect):
+    """ω×l: the DVL is not where the reference velocity is measured, so turning moves it."""
+
+    name = "lever_arm"
+    summary = "the DVL sits at l from the reference point and moves when the vehicle turns: ω × l"
+    manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
+    parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
+    acts_on = ActsOn.MOTION
+    needs = frozenset({Needs.ANGULAR_VELOCITY})
+    confounded_with = ("sideslip", "reference_time_offset", "reference_lag")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """ω × l."""
+        return np.cross(motion.turn_rate, vector(values, "m"))
+
+
+class Sideslip(Effect):
+    """Sway in a turn that the DVL sees and the reference does not, as one that is derived from course does not."""
+
+    name = "sideslip"
+    summary = "sway that only the DVL sees: coefficient · ω_z · horizontal speed"
+    manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
+    parameters = (
+        ParameterSpec("coefficient_s", "s", 0.1, -10.0, 10.0, "sway per turn rate and speed; negative: outward"),
+    )
+    acts_on = ActsOn.MOTION
+    needs = frozenset({Needs.ANGULAR_VELOCITY})
+    confounded_with = ("lever_arm", "reference_time_offset", "reference_lag")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """(0, coefficient · ω_z · speed, 0)."""
+        sway = values["coefficient_s"] * motion.turn_rate[:, 2] * np.hypot(*motion.velocity_body[:, :2].T)
+        return sway[:, None] * [0.0, 1.0, 0.0]
+
+
+class TiltCoupling(Effect):
+    """Velocity that leaks in with the tilt of the vehicle."""
+
+    name = "tilt_coupling"
+    summary = "an error in proportion to pitch or roll, body frame"
+    manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
+    parameters = (
+        ParameterSpec("x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)"),
+        ParameterSpec("z_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "heave error per pitch"),
+        ParameterSpec("y_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "sway error per roll (positive: port side up)"),
+        ParameterSpec("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll"),
+    )
+    acts_on = ActsOn.DVL
+    needs = frozenset({Needs.ATTITUDE})
+    confounded_with = ("velocity_bias", "lever_arm")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Gains (3, 2) times pitch and roll."""
+        rotation = motion.attitude
+        pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
+        roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
+        gains = [
+            [values["x_per_pitch"], 0.0],
+            [0.0, values["y_per_roll"]],
+            [values["z_per_pitch"], values["z_per_roll"]],
+        ]
+        return np.column_stack([pitch, roll]) @ np.transpose(gains)

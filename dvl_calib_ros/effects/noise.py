@@ -1,0 +1,95 @@
+"""Effects on the noise: what the simulator or the messages' covariances do not tell of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .base import ActsOn, EffectInput, Needs, NoiseEffect, ParameterSpec
+
+_SHARE = "share of the samples, 0 .. 1"
+
+
+class Outliers(NoiseEffect):
+    """Now and then a sample is far off."""
+
+    name = "outliers"
+    summary = "some DVL samples are far off"
+    parameters = (
+        ParameterSpec("share", "1", 0.01, 0.0, 1.0, _SHARE),
+        ParameterSpec("std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis", 0.5),
+    )
+    acts_on = ActsOn.DVL
+
+    def disturb(
+        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
+    ) -> Array:
+        """Normal errors on a share of the samples, on all axes at once."""
+        hit = rng.random(len(velocity)) < values["share"]
+        return velocity + hit[:, None] * rng.normal(0.0, values["std_mps"], velocity.shape)
+
+
+class StaleSamples(NoiseEffect):
+    """Now and then the sample before is sent again with a new stamp."""
+
+    name = "stale_samples"
+    summary = "some DVL samples repeat the one before"
+    parameters = (ParameterSpec("share", "1", 0.05, 0.0, 1.0, _SHARE),)
+    acts_on = ActsOn.DVL
+
+    def disturb(
+        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
+    ) -> Array:
+        """Each stale sample is the last fresh one."""
+        stale = rng.random(len(velocity)) < values["share"]
+        stale[:1] = False
+        return velocity[np.maximum.accumulate(np.where(stale, 0, np.arange(len(velocity))))]
+
+
+class NoiseInflation(NoiseEffect):
+    """More white noise than the DVL reports, or noise that grows as it goes faster or turns."""
+
+    name = "noise_inflation"
+    summary = "the DVL's noise is larger than reported, or grows with speed or turn rate"
+    parameters = (
+        ParameterSpec("std_mps", "m/s", 0.02, 0.0, 10.0, "standard deviation added, per axis"),
+        ParameterSpec("per_speed", "1", 0.01, 0.0, 10.0, "its growth per m/s of speed"),
+        ParameterSpec("per_turn_rate_m", "m", 0.1, 0.0, 100.0, "its growth per rad/s of turn rate"),
+    )
+    acts_on = ActsOn.DVL
+    needs = frozenset({Needs.ANGULAR_VELOCITY})
+
+    def disturb(
+        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
+    ) -> Array:
+        """White noise of std + per_speed · speed + per_turn_rate · ‖ω‖."""
+        turn_rate = np.linalg.norm(motion.turn_rate, axis=1)
+        std = values["std_mps"] + values["per_speed"] * motion.speed + values["per_turn_rate_m"] * turn_rate
+        return velocity + std[:, None] * rng.standard_normal(velocity.shape)
+
+
+class ColouredReferenceNoise(NoiseEffect):
+    """Noise of the reference that stays alike for a while, as of multipath."""
+
+    name = "coloured_reference_noise"
+    summary = "the reference's noise is correlated in time"
+    parameters = (
+        ParameterSpec("std_mps", "m/s", 0.05, 0.0, 10.0, "standard deviation, per axis"),
+        ParameterSpec("correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e", 5.0),
+    )
+    acts_on = ActsOn.REFERENCE
+
+    def disturb(
+        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
+    ) -> Array:
+        """First-order Gauss-Markov noise, exact at any spacing of the samples."""
+        noise = values["std_mps"] * rng.standard_normal(velocity.shape)
+        tau = values["correlation_time_s"]
+        if tau > 0.0:
+            decay = np.exp(-np.diff(motion.time) / tau)
+            fresh = np.sqrt(1.0 - decay**2)
+            for i in range(1, len(noise)):
+                noise[i] = decay[i - 1] * noise[i - 1] + fresh[i - 1] * noise[i]
+        return velocity + noise

@@ -1,0 +1,111 @@
+"""All effects by name: the package's own, and those that other packages bring.
+
+A package brings an effect by an entry point of the group `dvl_calib_ros.effects` that names its class:
+
+    [project.entry-points."dvl_calib_ros.effects"]
+    cable_drag = "my_vehicle.effects:CableDrag"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property, lru_cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Generic, TypeVar
+
+from ..io.errors import InputError
+from .base import AnyEffect, Effect, NoiseEffect
+from .environment import HeadingError, WaterLock
+from .kinematic import LeverArm, Sideslip, TiltCoupling
+from .noise import ColouredReferenceNoise, NoiseInflation, Outliers, StaleSamples
+from .sensor import (
+    AxisNonorthogonality,
+    MisalignmentDrift,
+    MountFlexure,
+    QuadraticScale,
+    ScaleDrift,
+    VelocityBias,
+)
+from .timing import DvlTimeOffset, ReferenceLag, ReferenceTimeOffset
+
+ENTRY_POINTS = "dvl_calib_ros.effects"
+
+OWN: tuple[type[AnyEffect], ...] = (
+    LeverArm,
+    DvlTimeOffset,
+    ReferenceTimeOffset,
+    ReferenceLag,
+    VelocityBias,
+    QuadraticScale,
+    ScaleDrift,
+    MisalignmentDrift,
+    MountFlexure,
+    AxisNonorthogonality,
+    WaterLock,
+    HeadingError,
+    Sideslip,
+    TiltCoupling,
+    Outliers,
+    StaleSamples,
+    NoiseInflation,
+    ColouredReferenceNoise,
+)
+
+E = TypeVar("E", bound=AnyEffect)
+
+
+class Registry(Mapping[str, E], Generic[E]):
+    """Name -> the one instance of each effect of a kind, own ones first. Looks for entry points when first used."""
+
+    def __init__(self, kind: type[E]) -> None:
+        self._kind = kind
+
+    @cached_property
+    def _effects(self) -> dict[str, E]:
+        return {effect.name: effect for effect in all_effects() if isinstance(effect, self._kind)}
+
+    def __getitem__(self, name: str) -> E:
+        return self._effects[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._effects)
+
+    def __len__(self) -> int:
+        return len(self._effects)
+
+
+@lru_cache(maxsize=1)
+def all_effects() -> tuple[AnyEffect, ...]:
+    """Systematic effects and those of the noise, own ones first. Raises InputError for a broken plug-in."""
+    effects = {kind.name: kind() for kind in OWN}
+    for point in entry_points(group=ENTRY_POINTS):
+        effect = _plugged_in(point)
+        if effect.name in effects:
+            raise InputError(f"{_named(point)}: there is an effect {effect.name!r} already; give it another name")
+        effects[effect.name] = effect
+    return tuple(effects.values())
+
+
+def _plugged_in(point: EntryPoint) -> AnyEffect:
+    try:
+        kind = point.load()
+        if not (isinstance(kind, type) and issubclass(kind, Effect | NoiseEffect)):
+            raise TypeError(f"{point.value} is no subclass of Effect or NoiseEffect")
+        effect = kind()
+        wanted = ("name", "summary", "parameters", "acts_on", *(["manoeuvre"] if isinstance(effect, Effect) else []))
+        for attribute in wanted:
+            getattr(effect, attribute)
+    except Exception as error:  # whatever a foreign package does wrong
+        raise InputError(
+            f"{_named(point)}: cannot be used ({type(error).__name__}: {error}); mend or uninstall that package"
+        ) from error
+    return effect
+
+
+def _named(point: EntryPoint) -> str:
+    package = f" of package {point.dist.name}" if point.dist else ""
+    return f"effect plug-in {point.name!r}{package}"
+
+
+EFFECTS: Registry[Effect] = Registry(Effect)  # type: ignore[type-abstract]
+NOISE_EFFECTS: Registry[NoiseEffect] = Registry(NoiseEffect)  # type: ignore[type-abstract]

@@ -1,0 +1,115 @@
+"""Effects within the DVL and its mounting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .base import ActsOn, Effect, EffectInput, ParameterSpec, along_axes, vector
+
+HOUR_S = 3600.0
+
+
+class VelocityBias(Effect):
+    """A constant velocity on the DVL's axes, as of beam biases."""
+
+    name = "velocity_bias"
+    summary = "a constant velocity added on the DVL's axes"
+    manoeuvre = "straight legs at two speeds or more, one of them slow"
+    parameters = along_axes("mps", "m/s", 0.02, 1.0, "bias of the DVL's axis {}")
+    acts_on = ActsOn.DVL
+    confounded_with = ("quadratic_scale", "mount_flexure", "water_lock")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Tᵀ b."""
+        bias = motion.rotation_dvl_from_body.T @ vector(values, "mps")
+        return np.broadcast_to(bias, motion.velocity_body.shape).copy()
+
+
+class QuadraticScale(Effect):
+    """A scale-factor error that grows with speed."""
+
+    name = "quadratic_scale"
+    summary = "an error that grows with speed squared: coefficient · ‖v‖ · v"
+    manoeuvre = "straight legs at three speeds or more"
+    parameters = (ParameterSpec("coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed"),)
+    acts_on = ActsOn.DVL
+    confounded_with = ("velocity_bias",)
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """coefficient · speed · v."""
+        return values["coefficient_s_per_m"] * motion.speed[:, None] * motion.velocity_body
+
+
+class ScaleDrift(Effect):
+    """A scale-factor error that changes along the run, as the speed of sound does."""
+
+    name = "scale_drift"
+    summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
+    manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
+    parameters = (ParameterSpec("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),)
+    acts_on = ActsOn.DVL
+    confounded_with = ("misalignment_drift",)
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """rate · (t - t_0) · v."""
+        return values["rate_per_hour"] / HOUR_S * motion.elapsed[:, None] * motion.velocity_body
+
+
+class MisalignmentDrift(Effect):
+    """The mounting turns slowly along the run."""
+
+    name = "misalignment_drift"
+    summary = "the misalignment changes along the run: φ = rate · (t - start)"
+    manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
+    parameters = along_axes("rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour")
+    acts_on = ActsOn.DVL
+    confounded_with = ("scale_drift",)
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Tᵀ ((t - t_0) rate × T v)."""
+        turn = motion.elapsed[:, None] * vector(values, "rad_per_hour") / HOUR_S
+        return np.cross(turn, motion.velocity_dvl) @ motion.rotation_dvl_from_body
+
+
+class MountFlexure(Effect):
+    """The mounting gives way to the water: misalignment that depends on speed."""
+
+    name = "mount_flexure"
+    summary = "the mounting bends with speed: φ = flexure · ‖v‖"
+    manoeuvre = "straight legs at three speeds or more"
+    parameters = along_axes("rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed")
+    acts_on = ActsOn.DVL
+    confounded_with = ("velocity_bias", "quadratic_scale")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Tᵀ (speed · flexure × T v)."""
+        turn = motion.speed[:, None] * vector(values, "rad_per_mps")
+        return np.cross(turn, motion.velocity_dvl) @ motion.rotation_dvl_from_body
+
+
+class AxisNonorthogonality(Effect):
+    """Axes that are not at right angles, as of beams that are not where they should be.
+
+    The symmetric part; the skew part is misalignment. Going straight ahead the two look the same.
+    """
+
+    name = "axis_nonorthogonality"
+    summary = "the DVL's axes are not at right angles: symmetric shear S v, DVL frame"
+    manoeuvre = "sway and heave beside surge: drift across, dive or go in waves"
+    parameters = tuple(
+        ParameterSpec(
+            f"{axes}_rad", "rad", 0.01, -0.3, 0.3, f"half of what the angle between {axes[0]} and {axes[1]} lacks"
+        )
+        for axes in ("xy", "xz", "yz")
+    )
+    acts_on = ActsOn.DVL
+    confounded_with = ("sideslip", "lever_arm")
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Tᵀ S T v with S symmetric, zero on its diagonal."""
+        xy, xz, yz = (values[parameter.name] for parameter in self.parameters)
+        shear = np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
+        return motion.velocity_dvl @ shear @ motion.rotation_dvl_from_body

@@ -1,0 +1,111 @@
+"""Effects with their parameters, as given to the simulator, and what they do to a motion and to samples."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..effects.base import ActsOn, AnyEffect, Effect, EffectInput, NoiseEffect
+from ..effects.registry import EFFECTS, NOISE_EFFECTS
+from ..io.errors import InputError
+
+FORM = "NAME:PARAMETER=VALUE,PARAMETER=VALUE"
+
+
+@dataclass(frozen=True)
+class Injection:
+    """An effect and the value of each of its parameters."""
+
+    effect: AnyEffect
+    values: Mapping[str, float]
+
+
+def injection(text: str) -> Injection:
+    """What ``lever_arm:x_m=0.3,z_m=-0.1`` says; parameters not given keep their defaults. Raises InputError."""
+    name, _, rest = text.strip().partition(":")
+    effect = _effect(name.strip())
+    values = effect.defaults
+    given: set[str] = set()
+    for assignment in filter(str.strip, rest.split(",")):
+        parameter, value = _assignment(effect, assignment)
+        if parameter in given:
+            raise InputError(f"effect {effect.name}: {parameter} is given twice; give it once")
+        given.add(parameter)
+        values[parameter] = value
+    if not given:
+        raise InputError(f"effect {effect.name} without parameters does nothing; give some of {_listed(effect)}")
+    return Injection(effect, values)
+
+
+def _effect(name: str) -> AnyEffect:
+    known: dict[str, AnyEffect] = {**EFFECTS, **NOISE_EFFECTS}
+    if name not in known:
+        raise InputError(
+            f"effect {name!r}: no such effect{_meant(name, list(known))}; give {FORM}, with one of {', '.join(known)}"
+        )
+    return known[name]
+
+
+def _assignment(effect: AnyEffect, text: str) -> tuple[str, float]:
+    name, equals, number = (part.strip() for part in text.partition("="))
+    parameters = {parameter.name: parameter for parameter in effect.parameters}
+    if not equals:
+        raise InputError(f"effect {effect.name}: {text.strip()!r} is no PARAMETER=VALUE; it has {_listed(effect)}")
+    if name not in parameters:
+        meant = _meant(name, list(parameters))
+        raise InputError(f"effect {effect.name}: no parameter {name!r}{meant}; it has {_listed(effect)}")
+    parameter = parameters[name]
+    try:
+        value = float(number)
+    except ValueError:
+        raise InputError(
+            f"effect {effect.name}: {name}: {number!r} is no number; give it in {parameter.unit}, without the unit"
+        ) from None
+    if not parameter.low <= value <= parameter.high:
+        raise InputError(
+            f"effect {effect.name}: {name}: {value:g} is outside {parameter.low:g} .. {parameter.high:g} "
+            f"{parameter.unit}"
+        )
+    return name, value
+
+
+def _listed(effect: AnyEffect) -> str:
+    return ", ".join(f"{parameter.name} ({parameter.unit})" for parameter in effect.parameters)
+
+
+def _meant(name: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    return f", did you mean {close[0]!r}?" if close else ""
+
+
+def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn) -> Array:
+    """Sum (N, 3) m/s, body frame, of what the systematic effects add there."""
+    total = np.zeros_like(motion.velocity_body)
+    for each in injections:
+        if isinstance(each.effect, Effect) and each.effect.acts_on is acts_on:
+            total += each.effect.trace(motion, each.values)
+    return total
+
+
+def disturbed(
+    velocity: Array,
+    injections: Sequence[tuple[Injection, np.random.SeedSequence]],
+    motion: EffectInput,
+    acts_on: ActsOn,
+) -> Array:
+    """Samples (N, 3) m/s of a sensor at `motion.time`, after the effects on its noise in the order given."""
+    for each, seed in injections:
+        if isinstance(each.effect, NoiseEffect) and each.effect.acts_on is acts_on:
+            velocity = each.effect.disturb(velocity, motion, each.values, np.random.default_rng(seed))
+    return velocity
+
+
+def injection_document(each: Injection) -> dict[str, object]:
+    """Plain data, as in the diagnosis' JSON; null is no limit."""
+    values = {name: value if math.isfinite(value) else None for name, value in each.values.items()}
+    return {"name": each.effect.name, "parameters": values}

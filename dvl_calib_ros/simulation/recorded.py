@@ -1,0 +1,157 @@
+"""The motion of a recorded vehicle, to simulate sensors on: reference velocity and attitude of a bag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from ..calibration.calibrator import Calibrator
+from ..calibration.frames import ENU_FROM_NED, Array, Quaternion, Vector
+from ..calibration.parameters import Parameters
+from ..calibration.samples import VelocityFrame
+from ..calibration.screening import is_valid_velocity, unit_quaternion
+from ..io.bags import BagReader
+from ..io.errors import InputError
+from ..io.messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from ..io.replay import Topics
+from .trajectories import Motion
+
+# Across longer gaps nothing is known of the motion
+MAX_GAP_S = 2.5
+SHORTEST_S = 10.0
+# Attitude is thinned to this: noise of faster samples would pass for angular velocity
+ATTITUDE_STEP_S = 0.05
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Where a bag's motion is to be found.
+
+    gnss_frame: as the parameter. smoothing: s, standard deviation of the window that takes the receiver's noise off
+    the velocity (in the body frame, so turns keep their speed).
+    """
+
+    path: Path
+    gnss_topic: str = "gnss/twist"
+    imu_topic: str = "imu/data"
+    gnss_frame: str = "from_frame_id"
+    smoothing: float = 1.0
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Times (N,) s and velocities (N, 3) m/s with their frames (N); times (M,) s and quaternions (M, 4) xyzw."""
+
+    velocity_time: Array
+    velocity: Array
+    frames: list[VelocityFrame]
+    attitude_time: Array
+    attitude: Array
+
+
+def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None = None) -> Motion:
+    """Motion of a bag, sampled at a rate from time 0: its longest stretch without a gap, or the first part of that.
+
+    Raises InputError if it holds no reference velocity with attitude for long enough.
+    """
+    samples = _read(recording)
+    start, end = _longest_stretch(recording, samples)
+    time = np.arange(0.0, min(end - start, seconds or np.inf), 1.0 / rate_hz)
+    attitude_time, attitude = _thinned(samples.attitude_time, samples.attitude)
+    spline = RotationSpline(attitude_time, Rotation.from_quat(attitude))
+    velocity = _in_body(samples, spline)
+    at = start + time
+    on_grid = np.column_stack([np.interp(at, samples.velocity_time, column) for column in velocity.T])
+    if recording.smoothing > 0.0:
+        on_grid = gaussian_filter1d(on_grid, recording.smoothing * rate_hz, axis=0, mode="nearest")
+    rotation = spline(at)
+    return Motion(time, on_grid, rotation.as_matrix(), spline(at, 1))
+
+
+def _read(recording: Recording) -> _Samples:
+    parameters = Parameters(gnss_frame=recording.gnss_frame)
+    feed = MessageFeed(Calibrator(parameters), lambda _: None)
+    velocities: dict[int, tuple[Vector, VelocityFrame]] = {}
+    attitudes: dict[int, Quaternion] = {}
+    with BagReader([recording.path]) as bag:
+        topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
+        _check_topics(recording, topics, bag.topics)
+        for topic, log_ns, message, undecodable in bag.messages([topics.gnss, topics.imu]):
+            if undecodable:
+                continue
+            if topic == topics.imu:
+                attitude = feed.imu(message, log_ns)
+                orientation = unit_quaternion(attitude.orientation)
+                if orientation is not None:
+                    attitudes[attitude.stamp_ns] = orientation
+                continue
+            sample = feed.reference(message, log_ns)
+            if sample is not None and is_valid_velocity(sample.velocity, parameters.max_speed):
+                velocities[sample.stamp_ns] = sample.velocity, sample.frame
+    for what, found in ((recording.gnss_topic, velocities), (recording.imu_topic, attitudes)):
+        if len(found) < 2:
+            raise InputError(
+                f"{recording.path}: {what} holds {len(found)} usable samples; a motion takes reference velocity and "
+                f"attitude. {' '.join(feed.problems.values())}".strip()
+            )
+    velocity_ns, attitude_ns = sorted(velocities), sorted(attitudes)
+    first_ns = min(velocity_ns[0], attitude_ns[0])
+    return _Samples(
+        1e-9 * (np.array(velocity_ns) - first_ns),
+        np.array([velocities[stamp][0] for stamp in velocity_ns]),
+        [velocities[stamp][1] for stamp in velocity_ns],
+        1e-9 * (np.array(attitude_ns) - first_ns),
+        np.array([attitudes[stamp] for stamp in attitude_ns]),
+    )
+
+
+def _check_topics(recording: Recording, topics: Topics, present: dict[str, str]) -> None:
+    for name, msgtype in ((topics.gnss, TWIST_TYPE), (topics.imu, IMU_TYPE)):
+        if present.get(name) != msgtype:
+            listing = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(present.items())) or "none"
+            raise InputError(
+                f"{recording.path}: no topic {name!r} of {msgtype}; set --motion-topics. The bag has: {listing}"
+            )
+
+
+def _longest_stretch(recording: Recording, samples: _Samples) -> tuple[float, float]:
+    """The longest time (from, to) in which neither velocity nor attitude has a gap."""
+    common = [
+        (max(a, c), min(b, d))
+        for a, b in _stretches(samples.velocity_time)
+        for c, d in _stretches(samples.attitude_time)
+    ]
+    start, end = max(common, key=lambda stretch: stretch[1] - stretch[0])
+    if end - start < SHORTEST_S:
+        raise InputError(
+            f"{recording.path}: velocity and attitude come together for {max(end - start, 0.0):.1f} s without a gap "
+            f"of {MAX_GAP_S:g} s, a motion takes {SHORTEST_S:g} s; use a longer recording"
+        )
+    return start, end
+
+
+def _stretches(time: Array) -> list[tuple[float, float]]:
+    gaps = np.flatnonzero(np.diff(time) > MAX_GAP_S)
+    bounds = [0, *(gaps + 1).tolist(), len(time)]
+    return [(float(time[first]), float(time[last - 1])) for first, last in pairwise(bounds)]
+
+
+def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
+    every = max(1, round(ATTITUDE_STEP_S / float(np.median(np.diff(time)))))
+    return time[::every], values[::every]
+
+
+def _in_body(samples: _Samples, attitude: RotationSpline) -> Array:
+    """Velocities (N, 3) m/s in the body frame."""
+    earth = samples.velocity.copy()
+    is_ned = np.array([frame is VelocityFrame.NED for frame in samples.frames])
+    is_body = np.array([frame is VelocityFrame.BODY for frame in samples.frames])
+    earth[is_ned] = earth[is_ned] @ ENU_FROM_NED.T
+    span = np.clip(samples.velocity_time, samples.attitude_time[0], samples.attitude_time[-1])
+    turned = attitude(span).inv().apply(earth)
+    return np.where(is_body[:, None], samples.velocity, turned)
