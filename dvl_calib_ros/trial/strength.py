@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from .motion import Floats, Motion
-from .vehicle import FAULTS, Faults, Vehicle, dvl_velocity, recorded_attitude, reference_velocity
+from .vehicle import FAULTS, REFERENCE_FAULTS, Faults, Vehicle, dvl_velocity, recorded_attitude, reference_velocity
 
 # Traces of unit faults are differences over this many typical sizes
 STEP = 0.1
@@ -57,10 +57,11 @@ class Yardstick:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._pairs = [_paired_stamps(scene, motion) for motion in scene.motions]
+        self._sound_reference = self._reference({})
         self._sound = self._difference({})
         sharing = max(scene.dvl_rate / scene.gnss_rate, self._interpolated_share())
         self._std = np.sqrt(scene.dvl_std**2 + sharing * scene.gnss_std**2)
-        self._absorbed = _basis(self._whitened(_calibration_traces(self._reference({}))))
+        self._absorbed = _basis(self._whitened(_calibration_traces(self._sound_reference)))
 
     def vector(self, faults: Faults) -> Floats:
         """(3 N,) of faults together."""
@@ -121,7 +122,8 @@ class Yardstick:
             dvl_velocity(motion, scene.vehicle, faults, dvl)
             for motion, (dvl, _) in zip(scene.motions, self._pairs, strict=True)
         ]
-        return np.vstack(measured) - self._reference(faults)
+        on_reference = not REFERENCE_FAULTS.isdisjoint(faults)
+        return np.vstack(measured) - (self._reference(faults) if on_reference else self._sound_reference)
 
     def _interpolated_share(self) -> float:
         """What interpolation leaves of the reference's variance, on average."""

@@ -53,6 +53,8 @@ FAULTS: Mapping[str, Fault] = {
     "sideslip": Fault({"coefficient_s": 0.1}, 10.0),
     "tilt_coupling": Fault({"x_per_pitch": 0.5, "z_per_pitch": 0.5, "y_per_roll": 0.5, "z_per_roll": 0.5}, 12.0),
 }
+# Faults of the reference velocity or of the attitude that turns it into the body
+REFERENCE_FAULTS = frozenset({"reference_time_offset", "reference_lag", "heading_error"})
 
 
 # ------------------------------------------------------------------ what no library knows
