@@ -23,7 +23,7 @@ from dvl_calib_ros.io.trajectories import read_columns
 from dvl_calib_ros.trial import generator
 from dvl_calib_ros.trial.cases import Case, draw, plan
 from dvl_calib_ros.trial.generator import Noise, record
-from dvl_calib_ros.trial.motion import MARGIN_S, TUNING_KINDS, manoeuvre, recorded
+from dvl_calib_ros.trial.motion import MARGIN_S, TUNING_KINDS, attitude, manoeuvre, recorded
 from dvl_calib_ros.trial.run import Trial, read_answers
 from dvl_calib_ros.trial.scorer import join, score
 from dvl_calib_ros.trial.strength import Scene, Yardstick
@@ -131,6 +131,11 @@ def test_the_library_means_by_its_names_what_the_generator_means(name, in_body):
     assert apart < 0.1
 
 
+def test_attitude_is_that_of_yaw_pitch_roll(rng):
+    yaw_pitch_roll = rng.uniform(-1.5, 1.5, (20, 3))
+    assert np.allclose(attitude(yaw_pitch_roll).as_matrix(), rotation_from_rpy(yaw_pitch_roll[:, ::-1]))
+
+
 def test_recorded_motion_is_the_recording_turned_into_forward_left_up(snapir):
     motion = recorded(snapir, "T05")
     time, velocity_frd = read_columns(snapir / "T05_dvl.csv", "m/s")
@@ -139,8 +144,8 @@ def test_recorded_motion_is_the_recording_turned_into_forward_left_up(snapir):
     state = motion.at(time[inside] - time[0] - MARGIN_S)
     off = np.linalg.norm(state.velocity_body - velocity_frd[inside] * [1.0, -1.0, -1.0], axis=1)
     assert np.median(off) < 0.05  # smoothed
-    attitude = attitude_enu_flu_from_ned_frd(rpy[inside])
-    turned = np.einsum("nji,njk->nik", attitude, state.attitude.as_matrix())
+    recorded_attitude = attitude_enu_flu_from_ned_frd(rpy[inside])
+    turned = np.einsum("nji,njk->nik", recorded_attitude, state.attitude.as_matrix())
     assert np.median(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1))) < np.deg2rad(2.0)
 
 

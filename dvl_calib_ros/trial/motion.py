@@ -70,10 +70,25 @@ class Motion:
         return State(
             times,
             _interpolate(times, self.time, self.velocity_enu),
-            Rotation.from_euler("ZYX", euler),
+            attitude(euler),
             _interpolate(times, self.time, self.rates),
             euler,
         )
+
+
+def attitude(euler: Floats) -> Rotation:
+    """Rotations of N Euler angles (N, 3) rad. scipy's own conversion takes ten times as long, half of a case's time."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(0.5 * euler).T, np.sin(0.5 * euler).T
+    return Rotation.from_quat(
+        np.column_stack(
+            [
+                sr * cp * cy - cr * sp * sy,
+                cr * sp * cy + sr * cp * sy,
+                cr * cp * sy - sr * sp * cy,
+                cr * cp * cy + sr * sp * sy,
+            ]
+        )
+    )
 
 
 def _interpolate(at: Floats, time: Floats, columns: Floats) -> Floats:
@@ -81,7 +96,7 @@ def _interpolate(at: Floats, time: Floats, columns: Floats) -> Floats:
 
 
 def _motion(seconds: float, time: Floats, velocity_enu: Floats, euler: Floats) -> Motion:
-    turned = Rotation.from_euler("ZYX", euler)
+    turned = attitude(euler)
     steps = (turned[:-2].inv() * turned[2:]).as_rotvec() / (time[2:] - time[:-2])[:, None]
     rates = np.vstack([steps[:1], steps, steps[-1:]])
     return Motion(seconds, time, velocity_enu, euler, rates)
@@ -205,7 +220,7 @@ def manoeuvre(kind: str, seconds: float, rng: np.random.Generator, calm: bool = 
     skid, rise = rng.uniform(0.1, 0.4), rng.uniform(-0.02, 0.02)
     through_water = np.column_stack([speed, -skid * turn_rate * speed, rise * speed])
     current = np.array([*rng.normal(0.0, 0.1, 2), 0.0])
-    velocity = Rotation.from_euler("ZYX", euler).apply(through_water) + current + swell.velocity(time)
+    velocity = attitude(euler).apply(through_water) + current + swell.velocity(time)
     return _motion(seconds, time, velocity, euler)
 
 
@@ -293,7 +308,7 @@ def recorded(folder: Path, name: str) -> Motion:
     )
     time = np.arange(-MARGIN_S, length + MARGIN_S, 1.0 / RATE_HZ)
     both = smooth(time)
-    return _motion(length, time, Rotation.from_euler("ZYX", both[:, 3:]).apply(both[:, :3]), both[:, 3:])
+    return _motion(length, time, attitude(both[:, 3:]).apply(both[:, :3]), both[:, 3:])
 
 
 def _columns(path: Path) -> tuple[Floats, Floats]:

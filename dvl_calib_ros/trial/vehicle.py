@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .motion import HELD_OUT_KINDS, RATE_HZ, TUNING_KINDS, Floats, Motion, State, lagged
+from .motion import HELD_OUT_KINDS, RATE_HZ, TUNING_KINDS, Floats, Motion, State, attitude, lagged
 
 Values = Mapping[str, float]
 Faults = Mapping[str, Values]
@@ -232,4 +232,4 @@ def recorded_attitude(motion: Motion, faults: Faults, stamps: Floats) -> Rotatio
     euler = state.euler.copy()
     if swing := faults.get("heading_error"):
         euler[:, 0] += swing["sin_rad"] * np.sin(euler[:, 0]) + swing["cos_rad"] * np.cos(euler[:, 0])
-    return Rotation.from_euler("ZYX", euler)
+    return attitude(euler)
