@@ -381,6 +381,7 @@ def answer(verdict, *effects, closure=None):
         "document": {
             "verdict": verdict,
             "gap": {"closure": closure},
+            "noise": [{"name": "outliers"}] if verdict == "no_gap" else [],
             "effects": [
                 {
                     "name": name,
@@ -481,6 +482,12 @@ def test_confusion_and_verdicts_count_every_case_once(hand_made):
         "sideslip": {"sideslip": 1},
     }
     assert sum(sum(row.values()) for row in hand_made.verdicts.values()) == len(HAND_MADE) == hand_made.n_cases
+
+
+def test_what_is_said_of_the_noise_is_counted_by_the_noise_there_is(hand_made):
+    (table,) = (table for table in hand_made.tables if table.title.startswith("Findings"))
+    assert table.columns == ("noise", "runs", "outliers")
+    assert table.rows == (("ar1", "1", ""), ("ordinary", "4", "2"))
 
 
 def test_score_is_written_as_json_and_markdown(hand_made):

@@ -32,7 +32,8 @@ NOTHING = "-"
 class Scored:
     """A case and its answer: what the figures are made of.
 
-    named: names of the effects, the strongest first, each with the ones that it cannot be told from.
+    named: names of the effects, the strongest first, each with the ones that it cannot be told from. intervals: low,
+    true value, high of each parameter of a fault that was named. noise: names of the findings about the noise.
     """
 
     truth: Truth
@@ -41,6 +42,7 @@ class Scored:
     closure: float | None
     intervals: tuple[tuple[float, float, float], ...]
     cpu_s: float
+    noise: frozenset[str]
 
     @property
     def claimed(self) -> bool:
@@ -92,7 +94,13 @@ def _scored(truth: Truth, answer: Mapping[str, Any]) -> Scored:
     named = tuple((each["name"], frozenset([each["name"], *each.get("equivalent_to", [])])) for each in effects)
     gap = document.get("gap") or {}
     return Scored(
-        truth, document["verdict"], named, gap.get("closure"), tuple(_intervals(truth, effects)), answer["cpu_s"]
+        truth,
+        document["verdict"],
+        named,
+        gap.get("closure"),
+        tuple(_intervals(truth, effects)),
+        answer["cpu_s"],
+        frozenset(each["name"] for each in document.get("noise", [])),
     )
 
 
@@ -294,6 +302,7 @@ def score(scored: Sequence[Scored]) -> Score:
         _confusion_table(confusion),
         _group_table("Verdicts", verdicts),
         _kind_table(scored),
+        _noise_table(scored),
         _detail_table(scored),
     )
     failed = sum(case.verdict == "failed" for case in scored)
@@ -414,6 +423,15 @@ def _kind_table(scored: Sequence[Scored]) -> Table:
         )
     columns = ("trajectory", "", "false alarms", "detected q >= 8", "right first q >= 8", "in the set q >= 8")
     return Table("By trajectory", columns, tuple(rows))
+
+
+def _noise_table(scored: Sequence[Scored]) -> Table:
+    """What is said of the noise where it is ordinary, and of each kind of hard null."""
+    nulls = [case for case in scored if case.truth.category in (Category.NULL, Category.HARD_NULL)]
+    counts = _counts((case.truth.hardness or "ordinary", name) for case in nulls for name in ("runs", *case.noise))
+    columns = ("runs", *sorted({name for row in counts.values() for name in row} - {"runs"}))
+    rows = [(hardness, *(str(row.get(column, "")) for column in columns)) for hardness, row in counts.items()]
+    return Table("Findings about the noise of nulls", ("noise", *columns), tuple(rows))
 
 
 def _detail_table(scored: Sequence[Scored]) -> Table:
