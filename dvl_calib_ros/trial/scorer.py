@@ -7,6 +7,7 @@ the chance with which the likelihood tells two effects a known distance apart.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -97,11 +98,15 @@ def _scored(truth: Truth, answer: Mapping[str, Any]) -> Scored:
         truth,
         document["verdict"],
         named,
-        gap.get("closure"),
+        _finite(gap.get("closure")),
         tuple(_intervals(truth, effects)),
         answer["cpu_s"],
         frozenset(each["name"] for each in document.get("noise", [])),
     )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _intervals(truth: Truth, effects: Iterable[Mapping[str, Any]]) -> Iterable[tuple[float, float, float]]:
