@@ -1,0 +1,125 @@
+"""How much of the gap goes away, on data that the parameters have not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .fitting import Fit, Fitter
+from .problem import PRIOR_STD, Problem
+
+BLOCK_S = 20.0
+FOLDS = 5
+RESAMPLES = 1000
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Vector RMS, m/s, on held-out data. closure: nan where there is no gap to close, as its interval."""
+
+    before: float
+    after: float
+    noise_floor: float
+    closure: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Columns (M, 3, p) that explain a series (M, 3), least squares with prior (p,) one over std."""
+
+    columns: Array
+    series: Array
+    prior: Array
+
+
+def explanation(fitter: Fitter, fit: Fit) -> Explanation:
+    """A fit, made linear about its values: calibration and effects."""
+    columns, series, prior = [fitter.problem.base], fit.residual + fitter.problem.base @ fit.change, [1.0 / PRIOR_STD]
+    for effect in fit.effects:
+        specs, jacobian = fitter.jacobian(effect, fit.values[effect.name])
+        columns.append(jacobian)
+        series = series + jacobian @ np.array([fit.values[effect.name][spec.name] for spec in specs])
+        prior.append(np.array([1e-3 / spec.typical for spec in specs]))
+    return Explanation(np.concatenate(columns, axis=2), series, np.concatenate(prior))
+
+
+def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
+    """Held-out gap before and after the effects of a fit.
+
+    Calibration and effects are fitted on all folds but one and judged on that. The noise floor is what is left by
+    everything together, the dictionary of `unexplained` too, with the degrees of freedom given back: so it shares the
+    noise of before and after, and their differences are exact to the size of the gap rather than of the noise.
+    """
+    problem, noise = fitter.problem, fit.noise
+    block, fold = blocks_of(problem)
+    bare = Explanation(problem.base, fitter.residual, 1.0 / PRIOR_STD)
+    full = explanation(fitter, fit)
+    before = _held_out(bare, noise.whiten(bare.columns), noise.whiten(bare.series), block, fold)
+    after = before
+    if fit.effects:
+        after = _held_out(full, noise.whiten(full.columns), noise.whiten(full.series), block, fold)
+    size = np.maximum(np.sqrt((dictionary**2).mean(axis=(0, 1))), 1e-12)
+    everything = Explanation(
+        np.concatenate([full.columns, dictionary / size], axis=2),
+        full.series,
+        np.concatenate([full.prior, np.full(dictionary.shape[2], 1e-3)]),
+    )
+    floor = _floor(everything, noise.whiten(everything.columns), noise.whiten(everything.series), block)
+    n = len(fitter.residual)
+
+    def closure(at: Array) -> Array:
+        gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
+        return 1.0 - np.maximum((after - floor)[at].sum(axis=-1), 0.0) / gap
+
+    rng = np.random.default_rng(0)
+    resampled = closure(rng.integers(0, len(before), (RESAMPLES, len(before))))
+    low, high = np.percentile(np.clip(resampled, -1.0, 1.0), [2.5, 97.5]).tolist()
+    excess = [max(0.0, float(part.sum() - floor.sum()) / n) for part in (before, after)]
+    is_gap = bool(fit.effects) and excess[0] > 0.0
+    value = min(1.0, float(closure(np.arange(len(before))))) if is_gap else np.nan
+    return Gap(
+        before=float(np.sqrt(excess[0])),
+        after=float(np.sqrt(min(excess) if not fit.effects else excess[1])),
+        noise_floor=float(np.sqrt(max(0.0, floor.sum() / n))),
+        closure=max(-1.0, value) if is_gap else np.nan,
+        interval=(low, high) if is_gap else (np.nan, np.nan),
+    )
+
+
+def blocks_of(problem: Problem) -> tuple[Array, Array]:
+    """Block of each of the M samples, and fold of each block: whole recordings, of one recording stretches in turn."""
+    index = np.floor(problem.time / BLOCK_S).astype(int)
+    keys = problem.recording_of * (index.max() + 1) + index
+    _, first, block = np.unique(keys, return_index=True, return_inverse=True)
+    if len(problem.recordings) > 1:
+        return block, problem.recording_of[first]
+    return block, np.arange(len(first)) % FOLDS
+
+
+def _held_out(it: Explanation, white: Array, white_series: Array, block: Array, fold: Array) -> Array:
+    """Squared error (m/s)² of each block, with coefficients from the folds that it is not in."""
+    p = it.columns.shape[2]
+    error = np.zeros(len(fold))
+    of_row = np.repeat(fold[block], 3)
+    for held in np.unique(fold):
+        train = of_row != held
+        a = white[train]
+        solution = np.linalg.lstsq(
+            np.concatenate([a, np.diag(it.prior)]), np.concatenate([white_series[train], np.zeros(p)]), rcond=None
+        )[0]
+        test = fold[block] == held
+        left = it.series[test] - it.columns[test] @ solution
+        error += np.bincount(block[test], (left**2).sum(axis=1), minlength=len(fold))
+    return error
+
+
+def _floor(it: Explanation, white: Array, white_series: Array, block: Array) -> Array:
+    """Squared noise (m/s)² of each block: what is left, and what the fit has taken of it."""
+    normal = white.T @ white + np.diag(it.prior**2)
+    covariance = np.linalg.pinv(normal, hermitian=True)
+    left = it.series - it.columns @ (covariance @ (white.T @ white_series))
+    taken = np.einsum("mip,pq,miq->m", it.columns, covariance, it.columns, optimize=True)
+    return np.bincount(block, (left**2).sum(axis=1) + taken)

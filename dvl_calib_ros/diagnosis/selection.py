@@ -1,0 +1,183 @@
+"""Which effects the data calls for: forward selection with backward check, and what could stand in for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..effects.base import ActsOn, Effect
+from .fitting import WINDOW_STEPS, Fit, Fitter, is_time_of_run, log_p_value
+from .levels import with_levels
+from .noise import Noise, white_noise
+from .problem import Problem
+
+# Family-wise level of the claim that there is any effect at all
+LEVEL = 0.008
+MAX_EFFECTS = 3
+# Effects whose evidence (log p) is within this of the best could be the cause as well: with truth j and a rival that it
+# takes for better by d = 2 · this, the odds are at most those of a normal variable beyond √d.
+INDISTINGUISHABLE = 3.0
+# log p beyond which a hypothesis is worth an estimate of its own noise
+WORTH_A_LOOK = -3.0
+
+
+@dataclass(frozen=True)
+class Selected:
+    """An effect that the data calls for. log_p: with all others in; equivalent: names that could stand in for it."""
+
+    effect: Effect
+    log_p: float
+    equivalent: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Outcome of a selection: the effects, strongest first, the fits without and with them, and the fitter."""
+
+    selected: tuple[Selected, ...]
+    base: Fit
+    fit: Fit
+    fitter: Fitter
+
+
+def first_noise(problem: Problem) -> tuple[Noise, Array]:
+    """Noise of a problem's residual in the frame where it is simplest, and the residual robustified with it."""
+    best: tuple[float, Noise] | None = None
+    for rotation in {id(r): r for r in (problem.rotation_enu_from_body, None)}.values():
+        noise = white_noise(problem.residual, problem.segments, rotation).refitted(problem.residual)
+        robust = noise.robust(problem.residual)
+        noise = noise.refitted(robust)
+        deviance = noise.deviance(robust)
+        if best is None or deviance < best[0]:
+            best = deviance, noise
+    assert best is not None
+    noise = with_levels(problem, best[1])
+    robust = noise.robust(problem.residual)
+    return noise.refitted(robust), robust
+
+
+def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
+    """Forward selection among testable effects; each step keeps what the data calls for at the family-wise level."""
+    noise, robust = first_noise(problem)
+    fitter = Fitter(problem, robust)
+    base = fit = fitter.fit_with_noise([], noise, {})
+    threshold = float(np.log(LEVEL / len(effects)))
+    chosen: list[Effect] = []
+    while len(chosen) < MAX_EFFECTS:
+        tested = {name: added(fitter, fit, effect) for name, effect in effects.items() if effect not in chosen}
+        name, (log_p, found) = min(tested.items(), key=lambda item: item[1][0])
+        if log_p > threshold:
+            break
+        chosen, fit = _backward(fitter, [*chosen, effects[name]], found, threshold)
+        fitter = Fitter(problem, _robust_about(fitter, fit, problem))
+        base = fitter.fit_with_noise([], fit.noise, {})
+        fit = fitter.fit_with_noise(chosen, fit.noise, fit.values)
+        if effects[name] not in chosen:
+            break
+    selected = [_selected(fitter, fit, effect, effects) for effect in chosen]
+    return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter)
+
+
+def added(fitter: Fitter, fit: Fit, effect: Effect) -> tuple[float, Fit]:
+    """log p of an effect on top of a fit, and the fit with it."""
+    effects = [*fit.effects, effect]
+    best: tuple[float, float, Fit] | None = None
+    for start, tried in fitter.starts(effect):
+        trial = fitter.fit(effects, fit.noise, {**fit.values, effect.name: start})
+        log_p = log_p_value(fit.deviance - trial.deviance, trial.dof - fit.dof, tried)
+        if best is None or log_p < best[0]:
+            best = log_p, tried, trial
+    assert best is not None
+    log_p, tried, trial = best
+    if log_p < WORTH_A_LOOK:
+        trial = fitter.fit_with_noise(effects, fit.noise, trial.values)
+        # a better optimum of the noise must not count for the effect
+        without = fitter.fit_with_noise(fit.effects, trial.noise, fit.values, rounds=1)
+        drop = min(fit.deviance, without.deviance) - trial.deviance
+        log_p = log_p_value(drop, trial.dof - fit.dof, tried)
+    return log_p, trial
+
+
+def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
+    rest = [other for other in fit.effects if other is not effect]
+    return fitter.fit_with_noise(rest, fit.noise, fit.values)
+
+
+def _backward(fitter: Fitter, chosen: list[Effect], fit: Fit, threshold: float) -> tuple[list[Effect], Fit]:
+    """Drop what is not called for any more now that others are in."""
+    for effect in chosen[:-1]:
+        rest = _without(fitter, fit, effect)
+        if log_p_value(rest.deviance - fit.deviance, fit.dof - rest.dof) > threshold:
+            chosen = [other for other in chosen if other is not effect]
+            fit = rest
+    return chosen, fit
+
+
+def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
+    """Test an effect given all others, and every other effect in its place."""
+    rest = _without(fitter, fit, effect)
+    log_p, _ = _again(fitter, rest, effect, fit)
+    rivals = {
+        name: added(fitter, rest, other)[0]
+        for name, other in effects.items()
+        if all(other is not each for each in fit.effects)
+    }
+    ordered = sorted(rivals, key=lambda name: rivals[name])
+    return Selected(effect, log_p, tuple(name for name in ordered if rivals[name] - log_p < INDISTINGUISHABLE))
+
+
+def _again(fitter: Fitter, rest: Fit, effect: Effect, fit: Fit) -> tuple[float, Fit]:
+    tried = fitter.tried(effect, fit.values[effect.name])
+    return log_p_value(rest.deviance - fit.deviance, fit.dof - rest.dof, tried), fit
+
+
+def _robust_about(fitter: Fitter, fit: Fit, problem: Problem) -> Array:
+    """The problem's residual robustified about a fit."""
+    explained = fitter.residual - fit.residual
+    return explained + fit.noise.robust(problem.residual - explained)
+
+
+def robust_fitter(selection: Selection) -> tuple[Fitter, Fit]:
+    """The fit of a selection once more, with the problem about its own calibration and motion."""
+    problem = relinearised(selection.fitter.problem, selection.fit)
+    fit = selection.fit
+    fitter = Fitter(problem, problem.residual)
+    again = fitter.fit(fit.effects, fit.noise, fit.values)
+    fitter = Fitter(problem, _robust_about(fitter, again, problem))
+    return fitter, fitter.fit_with_noise(fit.effects, fit.noise, again.values)
+
+
+def refined(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
+    """A fit with the times at which an effect begins and ends made finer than the grid they were found on."""
+    times = [spec for spec in effect.parameters if is_time_of_run(spec)]
+    if all(fit.values[effect.name][spec.name] == spec.default for spec in times):
+        return fit
+    seconds = max(recording.seconds for recording in fitter.problem.recordings)
+    step = seconds / WINDOW_STEPS
+    while step > seconds / 500.0:
+        step /= 2.0
+        for spec in times:
+            for sign in (-1.0, 1.0):
+                values = dict(fit.values[effect.name])
+                values[spec.name] = float(np.clip(values[spec.name] + sign * step, 0.0, seconds))
+                trial = fitter.fit(fit.effects, fit.noise, {**fit.values, effect.name: values})
+                if trial.deviance < fit.deviance:
+                    fit = trial
+    return fit
+
+
+def relinearised(problem: Problem, fit: Fit) -> Problem:
+    """The problem about the calibration of a fit, its motion without what the fit's effects add to the DVL."""
+    added = None
+    if fit.effects:
+        traces = [problem.traces(effect, fit.values[effect.name]) for effect in fit.effects if not on_reference(effect)]
+        added = tuple(map(sum, zip(*traces, strict=True))) if traces else None
+    return replace(problem, calibration=problem.calibration.changed(fit.change), added=added)
+
+
+def on_reference(effect: Effect) -> bool:
+    """Whether an effect leaves the DVL's velocity as it is."""
+    return effect.acts_on is ActsOn.REFERENCE
