@@ -270,7 +270,7 @@ def test_the_registry_holds_own_effects_first_and_one_instance_of_each():
     assert not set(EFFECTS) & set(NOISE_EFFECTS)
 
 
-PLUGIN = ROOT / "examples" / "effect_plugin"
+PLUGIN = ROOT / "test" / "effect_plugin"
 
 
 def test_the_example_of_an_own_effect_is_found_once_its_package_is_installed(tmp_path):

@@ -139,6 +139,7 @@ def test_coverage_of_errors_as_large_as_claimed_is_68_and_95_per_cent(rng):
     found = metrics.coverage("M1", ("honest", "overconfident"), errors, std)
     assert found.within_68 == pytest.approx([0.680, 0.381], abs=0.012)
     assert found.within_95 == pytest.approx([0.950, 0.673], abs=0.012)
+    assert found.normalised_rms == pytest.approx(np.sqrt(2.5), rel=0.02)
     assert found.n_errors == 20_000
 
 
@@ -166,6 +167,21 @@ def test_a_set_is_calibrated_on_its_own_window(evaluation):
     at_200_s = evaluation.windows_s.index(200.0)
     np.testing.assert_array_equal(evaluation.avg_vrmse[0], evaluation.avg_vrmse_by_time[0, at_200_s])
     np.testing.assert_array_equal(evaluation.avg_vrmse[1:], evaluation.avg_vrmse_by_time[1:, -1])
+
+
+def test_calibrations_are_judged_on_samples_that_they_had_not_seen(evaluation):
+    found = {(each.set_name, each.model): each for each in evaluation.held_out}
+    assert set(found) == {(each.name, model) for each in evaluation.sets for model in MODELS} - {
+        ("E3", "A1"),
+        ("E4", "A1"),
+    }
+    for each in found.values():
+        assert sum(each.verdicts.values()) == len(protocol.MISALIGNMENTS_DEG)
+    g1 = found["E4", "G1"]
+    gnss_noise = 0.2 * np.sqrt(3)
+    assert gnss_noise * 0.95 < g1.corrected < gnss_noise * 1.05
+    assert g1.corrected < g1.uncorrected - 0.005
+    assert g1.corrected == pytest.approx(g1.predicted, rel=0.03)
 
 
 def test_errors_in_variables_pull_the_scale_as_predicted(evaluation):
@@ -212,27 +228,34 @@ def test_workers_change_nothing(evaluation):
     assert same(evaluate(None, Parameters(**DEFAULTS), n_seeds=2, workers=Workers(jobs=2)), evaluation)
 
 
+def test_a_worker_process_that_is_killed_is_said():
+    with pytest.raises(InputError, match="a worker process was killed"):
+        run_all(os._exit, [1, 1], Workers(jobs=2))
+
+
 def test_a_dask_worker_killed_on_the_way_loses_nothing():
     """A real scheduler with two worker processes; the one that finished first is killed."""
     distributed = pytest.importorskip("distributed")
     procedure = Procedure(own_trajectories(), ("M4", "M7"), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
-    expected = [run_seed(procedure, seed) for seed in range(60)]
+    expected = [run_seed(procedure, seed) for seed in range(24)]
     killed: list[int] = []
+    done_before: list[float] = []
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, processes=True) as cluster,
-        distributed.Client(cluster) as watcher,
+        distributed.Client(cluster, set_as_default=False) as watcher,
     ):
 
-        def kill_one(_: float) -> None:
+        def kill_one(share: float) -> None:
             if killed:
                 return
+            done_before.append(share)
             done = {address: len(keys) for address, keys in watcher.has_what().items()}
             address = max(done, key=lambda each: done[each])
             killed.append(watcher.run(os.getpid, workers=[address])[address])
             os.kill(killed[0], signal.SIGKILL)
 
-        found = run_all(partial(run_seed, procedure), range(60), Workers(dask=cluster.scheduler_address), kill_one)
-    assert killed
+        found = run_all(partial(run_seed, procedure), range(24), Workers(dask=cluster.scheduler_address), kill_one)
+    assert killed and done_before[0] < 1.0
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one.by_set[0].by_time, other.by_set[0].by_time)
 
@@ -351,7 +374,7 @@ def test_the_command_writes_json_and_csv_and_says_what_it_ran_on(folder, tmp_pat
     ]
     assert main(["evaluate", str(folder), *options, "--json", str(target[0]), "--csv", str(target[1])]) == 0
     output = capsys.readouterr().out
-    assert f"folder {folder}" in output and "mounting_rpy is not used here" in output
+    assert f"folder {folder}" in output and "mounting_rpy is not used by the procedure" in output
     document = json.loads(target[0].read_text())
     assert set(document["avg_vrmse"]) == {"E1", "E3"}
     assert set(document["avg_vrmse"]["E1"]) == set(document["mean"]) == {UNCALIBRATED, "M3", "M7"}

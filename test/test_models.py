@@ -72,9 +72,10 @@ def predicted_z(model, state, seen):
     speed = np.linalg.norm(velocity_dvl, axis=1)
     expected = np.column_stack([speed, np.tile(PRIOR, (len(speed), 1))])
     if model.in_correction_parameters:  # G1: the state is ψ, κ, heave
-        body = velocity_dvl @ (np.eye(3) - skew(phi) - np.diag(dk)).T @ t
+        fast = np.abs(velocity_dvl) > 0.3  # axes that are slower say nothing of their scale
         level = (velocity_dvl @ t) * [1, 1, 0] @ t.T  # scale acts on level motion only
-        body[:, 2] = (velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - level @ np.diag(dk) @ t)[:, 2]
+        body = velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - fast * velocity_dvl @ np.diag(dk) @ t
+        body[:, 2] = (velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - fast * level @ np.diag(dk) @ t)[:, 2]
         r = t.T @ np.eye(3) @ t
         variance = seen.assumptions.motion_std**2 * 2 * seen.assumptions.motion_correlation_time / 0.2
         return body - velocity_dvl @ t - r[:, 2] / (r[2, 2] + variance) * state[5]

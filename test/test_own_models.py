@@ -66,15 +66,33 @@ def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_g1():
     assert abs(free) < 0.002
 
 
-def test_g1_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows():
-    samples = make_samples(MatchedRun("box", 600.0))
+def calibrated_on(velocity, measured, **parameters):
+    """A calibrator that was fed velocities (N, 3) and what the DVL made of them, once a second, without GNSS noise."""
+    calibrator = Calibrator(Parameters(**parameters), block_size=512)
+    for i, (v, g) in enumerate(zip(measured.tolist(), velocity.tolist(), strict=True)):
+        calibrator.feed_reference(ReferenceSample(i * SECOND, tuple(g)))
+        calibrator.feed_dvl(DvlSample(i * SECOND, tuple(v)))
+    return calibrator
+
+
+def test_g1_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows(rng):
     scale = np.array([0.005, -0.01, 0.0])
-    samples = [
-        s._replace(velocity=tuple((np.array(s.velocity) * (1 + scale)).tolist())) if isinstance(s, DvlSample) else s
-        for s in samples
-    ]
-    calibrator = calibrate(samples, Parameters(gnss_aided_std=0.001, initial_std_scale=0.02), block_size=512)
-    np.testing.assert_allclose(calibrator.estimate("G1").scale[:2], scale[:2], atol=2e-4)
+    velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.6, 400), np.zeros(400)])
+    estimate = calibrated_on(velocity, velocity * (1 + scale), gnss_aided_std=0.01, initial_std_scale=0.02).estimate(
+        "G1"
+    )
+    np.testing.assert_allclose(estimate.scale[:2], scale[:2], atol=3e-4)
+
+
+def test_noise_of_the_dvl_does_not_make_a_scale_of_an_axis_that_hardly_moves(rng):
+    """Its own noise would pull the scale of y by (0.01/0.06)² = 3 %."""
+    velocity = np.column_stack([np.full(20000, 1.5), rng.normal(0, 0.06, 20000), np.zeros(20000)])
+    estimate = calibrated_on(velocity, velocity + rng.normal(0, 0.01, velocity.shape), gnss_aided_std=0.01).estimate(
+        "G1"
+    )
+    assert not estimate.observability[4].observed
+    assert abs(estimate.scale[1]) < 0.001
+    assert abs(estimate.scale[0]) < 0.001
 
 
 @pytest.mark.parametrize("degrees", [(5.0, -0.5, 2.5), (-1.0, -2.5, -3.0)])
@@ -83,11 +101,8 @@ def test_g1_finds_5_degrees_but_for_what_the_error_model_cannot_hold(degrees, rn
     velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.4, 400), np.zeros(400)])
     errors = DvlErrors(misalignment_rpy=tuple(np.deg2rad(degrees)), scale=(0.005,) * 3)
     measured = measure_dvl(velocity, errors, np.eye(3), rng)
-    calibrator = Calibrator(Parameters(initial_std_misalignment=0.5, initial_std_scale=0.5, gnss_aided_std=0.001))
-    for i, (v, g) in enumerate(zip(measured, velocity, strict=True)):
-        calibrator.feed_reference(ReferenceSample(i * SECOND, tuple(g)))
-        calibrator.feed_dvl(DvlSample(i * SECOND, tuple(v)))
-    estimate = calibrator.estimate("G1")
+    wide = {"initial_std_misalignment": 0.5, "initial_std_scale": 0.5, "gnss_aided_std": 0.001}
+    estimate = calibrated_on(velocity, measured, **wide).estimate("G1")
     misalignment, scale = equivalent_error_terms(errors)
     np.testing.assert_allclose(estimate.misalignment, misalignment, atol=2.5e-3)
     np.testing.assert_allclose(estimate.scale[:2], scale[:2], atol=5e-4)

@@ -319,7 +319,7 @@ def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_p
 
 def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
     path = tmp_path / "evaluation.html"
-    write_evaluation_report(path, evaluation(own_generator=True, published={}))
+    write_evaluation_report(path, evaluation(own_generator=True))
     page = Page(path)
     assert "simulated" in page.text and "×" not in page.text and "Rings: published" not in page.text
 

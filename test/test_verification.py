@@ -18,7 +18,7 @@ from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.verification import HeldOutError, Word, held_out_error, verify
 
-GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05)
+GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05, calibration=0.002)
 
 
 @pytest.mark.parametrize("weights", [False, True])
@@ -81,6 +81,14 @@ def test_a_good_run_is_accepted_with_the_error_that_was_predicted():
         assert held_out.samples == calibrator.counts["pairing"]["paired"]
 
 
+def test_a_dvl_without_errors_is_not_rejected_for_what_correcting_nothing_adds():
+    for seed in range(10):
+        run = MatchedRun("box", 200.0, gnss_std=0.1, dvl_std=0.01, seed=seed)
+        calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.105), verified=True, block_size=512)
+        for name in ("G1", "F1"):  # of M3 it would be true: noise pulls its scale
+            assert calibrator.verification(name).verdict is not Word.REJECT
+
+
 def test_a_receiver_noisier_than_it_says_makes_the_calibration_marginal():
     run = MatchedRun("box", 300.0, phi=(0.005, -0.01, 0.03), gnss_std=0.05)
     calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.02), verified=True, block_size=512)
@@ -121,10 +129,15 @@ def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, 
         ({"scale": 0.051}, Word.REJECT, "scale"),
         ({"scale": -0.051}, Word.REJECT, "scale"),
         ({"scale": 0.051, "max_scale_error": 0.1}, Word.ACCEPT, "0.050 with it"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2)}, Word.REJECT, "worse"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05)}, Word.MARGINAL, "noisier"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05), "max_error_ratio": 1.3}, Word.ACCEPT, "0.060 with it"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.0501, 0.05)}, Word.ACCEPT, "0.050 with it"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002)}, Word.REJECT, "worse"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002)}, Word.MARGINAL, "noisier"),
+        (
+            {"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002), "max_error_ratio": 1.3},
+            Word.ACCEPT,
+            "0.060 with it",
+        ),
+        ({"held_out": HeldOutError(1000, 0.10, 0.0501, 0.05, 0.002)}, Word.ACCEPT, "0.050 with it"),
+        ({"held_out": HeldOutError(1000, 0.0500, 0.0501, 0.0501, 0.002)}, Word.ACCEPT, "0.050 with it"),
         ({"held_out": None}, Word.MARGINAL, "reference"),
         ({"convergence": Convergence.COLLECTING}, Word.MARGINAL, "none of the angles"),
         ({"degrees": 3.0, "scale": 0.06}, Word.REJECT, "scale"),

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtr, gammaincinv, ndtri
 
 from . import kalman
-from .correction_parameters import to_correction, to_errors, with_prior_on_errors
+from .correction_parameters import PriorOnErrors, to_correction, to_errors
 from .folds import FOLDS, FoldInformation, folds_of
 from .frames import Array
 from .kalman import GaussianState
@@ -47,6 +47,16 @@ class Assembler:
         self._n = max(model.n_state for model in self.models)
         self._starts = [(initial or {}).get(model.name) or prior(model, parameters) for model in self.models]
         self.start = self._start()
+        self._prior_on_errors = {
+            index: PriorOnErrors(
+                GaussianState(
+                    self.start.x[index, : model.n_state], self.start.p[index, : model.n_state, : model.n_state]
+                ),
+                self._starts[index],
+            )
+            for index, model in enumerate(self.models)
+            if model.in_correction_parameters
+        }
         self._gate = np.array([_gate(model, parameters) for model in self.models])
         self._needs_prior = np.array([model.needs_prior for model in self.models])
         rows = np.array([np.arange(N_MEASUREMENT) < model.n_measurement for model in self.models])
@@ -80,8 +90,7 @@ class Assembler:
             return held
         if self.process_rate is not None:  # what the prior still weighs is then not known
             return to_errors(held)
-        start = GaussianState(self.start.x[index, :n], self.start.p[index, :n, :n])
-        return with_prior_on_errors(held, start, self._starts[index])
+        return self._prior_on_errors[index].to_errors(held)
 
     def measurements(self, seen: Observations, weight: Array, prior_known: kalman.Mask) -> kalman.Measurements:
         """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
@@ -132,6 +141,7 @@ class ModelBank:
         self.models = self._assembler.models
         self._index = {model.name: k for k, model in enumerate(self.models)}
         self.x, self.p = self._assembler.start
+        self._states: dict[str, GaussianState] = {}
         self._last_stamp_ns: int | None = None
         self.n_given = 0
         k = len(self.models)
@@ -149,6 +159,7 @@ class ModelBank:
         else:
             after = kalman.recursion(self.x, self.p, data, process)
         self.x, self.p = after.x, after.p
+        self._states.clear()
         if self._folds is not None:
             self._folds.add(folds_of(stamps_ns, self._parameters), data, after.used)
         self._used += after.used.sum(axis=1)
@@ -164,9 +175,11 @@ class ModelBank:
         return np.diff(stamps)[:, None, None, None] * 1e-9 * rate
 
     def state(self, name: str) -> GaussianState:
-        """State and covariance of one model."""
-        index = self._index[name]
-        return self._assembler.state(index, self.x[index], self.p[index])
+        """State and covariance of one model; not to be written to."""
+        if name not in self._states:  # asked for more than once per sample, live
+            index = self._index[name]
+            self._states[name] = self._assembler.state(index, self.x[index], self.p[index])
+        return self._states[name]
 
     def states_without_folds(self, name: str) -> list[GaussianState]:
         """For every fold the state and covariance of one model had it not seen that fold."""

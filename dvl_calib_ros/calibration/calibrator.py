@@ -163,6 +163,8 @@ class Calibrator:
         self._awaiting_imu: deque[_Moving] = deque()
         self._awaiting_attitude: deque[_Moving] = deque()
         self._awaiting_reference: deque[_Moving] = deque()
+        # found for the models that need attitude, until the reference of the same sample has been turned by it
+        self._orientation_at: dict[int, Quaternion | None] = {}
         # what the models with these needs will be given next
         self._plain: list[tuple[_Moving, bool]] = []
         self._oriented: list[_Oriented] = []
@@ -314,9 +316,13 @@ class Calibrator:
             self._awaiting_reference.popleft()
             self._decided_ns = sample.stamp_ns
             self._take_paired(sample, bracket)
-        for needs in Needs:
-            if self._n_waiting(needs) >= self._block_size:
-                self._update(needs)
+        size = self._block_size
+        if len(self._plain) >= size:
+            self._update(Needs.NOTHING)
+        if len(self._oriented) >= size:
+            self._update(Needs.ATTITUDE)
+        if len(self._paired) >= size:
+            self._update(Needs.REFERENCE)
 
     def _is_decided(self, track: Track[Any], stamp_ns: int, horizon_ns: int) -> bool:
         """Whether a DVL sample need not wait for a track any more; if it must, note for what and until when."""
@@ -328,7 +334,9 @@ class Calibrator:
 
     def _take_plain(self, sample: _Moving) -> None:
         if self._needs_turn_rate:
-            sample = sample._replace(angular_velocity=self._angular_velocity(sample.stamp_ns))
+            sample = sample._replace(
+                angular_velocity=_interpolated(self._imu.bracket(sample.stamp_ns), _ANGULAR_VELOCITY, _mix)
+            )
         unusable = self._unusable(sample)
         if unusable is None:
             if self._lever_arm is not None and sample.angular_velocity is None:
@@ -356,7 +364,11 @@ class Calibrator:
         return None
 
     def _take_oriented(self, sample: _Moving) -> None:
-        orientation, rate = self._orientation(sample.stamp_ns), self._angular_velocity(sample.stamp_ns)
+        bracket = self._imu.bracket(sample.stamp_ns)
+        orientation = _interpolated(bracket, _ORIENTATION, slerp)
+        rate = _interpolated(bracket, _ANGULAR_VELOCITY, _mix)
+        if self._decided_ns is None or sample.stamp_ns > self._decided_ns:  # its reference is still to come
+            self._orientation_at[sample.stamp_ns] = orientation
         if orientation is None or rate is None:
             self._tally["pairing"]["not_oriented"] += 1
             return
@@ -366,6 +378,7 @@ class Calibrator:
     def _take_paired(self, sample: _Moving, bracket: Bracket[ReferenceSample] | None) -> None:
         paired = None if bracket is None else self._pair(sample, bracket)
         self._tally["pairing"]["paired" if paired else "unpaired"] += 1
+        self._orientation_at.pop(sample.stamp_ns, None)
         self.selection.update(sample.stamp_ns, paired is not None, self.parameters)
         if paired is not None and sample.usable:
             self._paired.append(paired)
@@ -398,24 +411,10 @@ class Calibrator:
             around_s = (1e-9 * (sample.stamp_ns - before.stamp_ns), 1e-9 * (after.stamp_ns - sample.stamp_ns))
         return _Paired(sample, velocity, covariance, weight, after.frame, orientation, around_s)
 
-    def _angular_velocity(self, stamp_ns: int) -> Vector | None:
-        return self._from_imu(stamp_ns, attrgetter("angular_velocity"), _mix)
-
     def _orientation(self, stamp_ns: int) -> Quaternion | None:
-        return self._from_imu(stamp_ns, attrgetter("orientation"), slerp)
-
-    def _from_imu(
-        self, stamp_ns: int, read: Callable[[ImuSample], V | None], mix: Callable[[V, V, float], V]
-    ) -> V | None:
-        """What the IMU gives for a time, interpolated; None where it has nothing to interpolate between."""
-        bracket = self._imu.bracket(stamp_ns)
-        if bracket is None:
-            return None
-        after = read(bracket.after)
-        if bracket.fraction == 1.0 or bracket.before is None:
-            return after
-        before = read(bracket.before)
-        return None if before is None or after is None else mix(before, after, bracket.fraction)
+        if stamp_ns in self._orientation_at:
+            return self._orientation_at[stamp_ns]
+        return _interpolated(self._imu.bracket(stamp_ns), _ORIENTATION, slerp)
 
     # ------------------------------------------------------------------ models
 
@@ -634,6 +633,22 @@ class _PriorWindow:
         self._sum += (self._rotation_body_from_dvl @ velocity_dvl)[1:]
         self._count += 1
         return False
+
+
+_ORIENTATION, _ANGULAR_VELOCITY = attrgetter("orientation"), attrgetter("angular_velocity")
+
+
+def _interpolated(
+    bracket: Bracket[ImuSample] | None, read: Callable[[ImuSample], V | None], mix: Callable[[V, V, float], V]
+) -> V | None:
+    """What the IMU gives for a time; None where it has nothing to interpolate between."""
+    if bracket is None:
+        return None
+    after = read(bracket.after)
+    if bracket.fraction == 1.0 or bracket.before is None:
+        return after
+    before = read(bracket.before)
+    return None if before is None or after is None else mix(before, after, bracket.fraction)
 
 
 def _mix(a: Vector, b: Vector, fraction: float) -> Vector:

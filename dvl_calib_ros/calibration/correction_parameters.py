@@ -19,7 +19,10 @@ from .kalman import GaussianState
 _N = 5  # three angles, two scales
 # d([ψ×] + diag(κ)) / d(ψ, κ): (5, 3, 3)
 _GENERATORS: Array = np.concatenate([skew(np.eye(3)), [np.diag(axis) for axis in np.eye(3)]])[:_N]
+_IDENTITY: Array = np.eye(3)
 _NEWTON_STEPS = 20
+# After a step as small as this what is left is smaller by orders of magnitude, below what anybody reads.
+_LAST_STEP = 1e-10
 
 
 class Mapped(NamedTuple):
@@ -31,7 +34,7 @@ class Mapped(NamedTuple):
 
 def errors_from_correction(correction: Array) -> Mapped:
     """ψ (3) and κ (2) as one vector (..., 5) -> φ, δk with their derivatives."""
-    b = np.linalg.inv(np.eye(3) - np.tensordot(correction, _GENERATORS, 1))
+    b = np.linalg.inv(_IDENTITY - (correction @ _GENERATORS.reshape(_N, 9)).reshape(*correction.shape[:-1], 3, 3))
     db = b[..., None, :, :] @ _GENERATORS @ b[..., None, :, :]  # (..., 5, 3, 3), by each of ψ and κ
     scale, dscale = np.diagonal(b, axis1=-2, axis2=-1), np.diagonal(db, axis1=-2, axis2=-1)
     c = b / scale[..., None]
@@ -68,31 +71,39 @@ def to_correction(state: GaussianState) -> GaussianState:
     return GaussianState(x, _propagated(_extended(jacobian, x.shape[-1]), state.p))
 
 
-def with_prior_on_errors(held: GaussianState, start: GaussianState, prior: GaussianState) -> GaussianState:
-    """`to_errors` of states (..., n), with the one prior (n,) where it belongs: on φ and δk.
+class PriorOnErrors:
+    """`to_errors` of a filter's states, with the prior where it belongs: on φ and δk.
 
     The filter ran on ψ and κ from `start`, the first-order image of `prior`. A prior of zero scale that was put on κ
     would pull the found scale towards that of a rotation by no angle, 0.4 per cent off at 5 degrees where the data is
     weak. What the filter has gained, Λ - Λ_start, is the data's alone; with it the maximum of the posterior is found
     by Gauss-Newton, exact as the data is linear in ψ and κ.
     """
-    gained, gained_state = _information(held)
-    started, started_state = _information(start)
-    gained, gained_state = gained - started, gained_state - started_state
-    prior_information = np.linalg.inv(prior.p)
-    x = held.x
-    for _ in range(_NEWTON_STEPS):
-        mapped = errors_from_correction(x[..., :_N])
-        errors = np.concatenate([mapped.errors, x[..., _N:]], axis=-1)
-        jacobian = _extended(mapped.jacobian, x.shape[-1])
-        weighted = np.swapaxes(jacobian, -1, -2) @ prior_information
-        information = gained + weighted @ jacobian
-        wanted = gained_state + _product(weighted, _product(jacobian, x) + prior.x - errors)
-        step = _solve(information, wanted) - x
-        x = x + step
-        if np.abs(step).max() < 1e-13:  # what is left is smaller by orders of magnitude: below rounding
-            break
-    return to_errors(GaussianState(x, np.linalg.inv(information)))
+
+    def __init__(self, start: GaussianState, prior: GaussianState) -> None:
+        """Both (n,)."""
+        self._started, self._started_state = _information(start)
+        self._information = np.linalg.inv(prior.p)
+        self._mean = prior.x
+
+    def to_errors(self, held: GaussianState) -> GaussianState:
+        """States x (..., n), P (..., n, n) of the filter -> of the errors."""
+        information, state = _information(held)
+        gained, gained_state = information - self._started, state - self._started_state
+        x = held.x
+        for _ in range(_NEWTON_STEPS):
+            mapped = errors_from_correction(x[..., :_N])
+            errors = np.concatenate([mapped.errors, x[..., _N:]], axis=-1)
+            jacobian = _extended(mapped.jacobian, x.shape[-1])
+            weighted = np.swapaxes(jacobian, -1, -2) @ self._information
+            information = gained + weighted @ jacobian
+            step = (
+                _solve(information, gained_state + _product(weighted, _product(jacobian, x) + self._mean - errors)) - x
+            )
+            x = x + step
+            if np.abs(step).max() < _LAST_STEP:
+                break
+        return to_errors(GaussianState(x, np.linalg.inv(information)))
 
 
 def _information(state: GaussianState) -> tuple[Array, Array]:
@@ -128,6 +139,6 @@ def _propagated(jacobian: Array, p: Array) -> Array:
 
 def _skew_part(matrix: Array) -> Array:
     """Vector (..., 3) of the skew-symmetric part of (..., 3, 3)."""
-    m = matrix
-    parts = [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]]
-    return 0.5 * np.stack(parts, axis=-1)
+    # the inner product of two skew matrices is twice that of their vectors
+    part: Array = 0.5 * matrix.reshape(*matrix.shape[:-2], 9) @ _GENERATORS[:3].reshape(3, 9).T
+    return part

@@ -33,7 +33,8 @@ class Observability(NamedTuple):
     """One parameter of one model.
 
     std: standard deviation (rad, or dimensionless). observed: the data has halved the prior's. axis: the body axis
-    (roll, pitch, yaw) that an angle's uncertainty turns about, or scale (across). missing: what to fly, '' once observed.
+    (roll, pitch, yaw) that an angle's uncertainty turns about, or scale (across). missing: what to fly, '' once
+    observed.
     """
 
     name: str

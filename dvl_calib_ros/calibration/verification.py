@@ -26,6 +26,9 @@ from .parameters import Parameters
 
 # Fewer samples with a reference prove nothing.
 ENOUGH_SAMPLES = 20
+# A squared error that grows by more than so many times the estimate's variance is no chance (99 % of chi-square with
+# three degrees of freedom and more).
+WORSE_FROM = 4.0
 # Share of runs whose held-out error may by chance exceed what a true covariance predicts.
 CHANCE = 0.01
 
@@ -35,13 +38,15 @@ class HeldOutError:
     """Velocity error against the reference on held-out samples, m/s rms over the vector.
 
     uncorrected: with the nominal mounting. corrected: with the estimate. predicted: what R of the reference and the
-    covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference.
+    covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference. calibration: the
+    part of predicted that is the estimate's.
     """
 
     samples: int
     uncorrected: float
     corrected: float
     predicted: float
+    calibration: float
 
 
 def held_out_error(
@@ -55,17 +60,16 @@ def held_out_error(
     if samples < ENOUGH_SAMPLES or np.count_nonzero(moments.count) < 2:
         return None
     nominal = rotation_dvl_from_body.T
-    uncorrected = corrected = predicted = 0.0
+    uncorrected = corrected = noise = calibration = 0.0
     for fold, state in enumerate(without):
         errors = model.error_terms_from_state @ state.x
         covariance = model.error_terms_from_state @ state.p @ model.error_terms_from_state.T
         uncorrected += moments.squared_error(fold, nominal)
         corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
-        predicted += moments.noise[fold] + _calibration_variance(covariance, moments.vv[fold])
-    uncorrected, corrected, predicted = (
-        math.sqrt(max(total, 0.0) / samples) for total in (uncorrected, corrected, predicted)
-    )
-    return HeldOutError(samples, uncorrected, corrected, predicted)
+        noise += moments.noise[fold]
+        calibration += _calibration_variance(covariance, moments.vv[fold])
+    sums = (uncorrected, corrected, noise + calibration, calibration)
+    return HeldOutError(samples, *(math.sqrt(max(total, 0.0) / samples) for total in sums))
 
 
 def _calibration_variance(covariance: Array, vv: Array) -> float:
@@ -137,7 +141,8 @@ def _error_finding(held_out: HeldOutError | None, parameters: Parameters) -> Fin
         f"on {held_out.samples} samples that it had not seen the velocity error is {uncorrected:.3f} m/s rms without "
         f"correction, {corrected:.3f} with it, {predicted:.3f} predicted"
     )
-    if corrected > uncorrected:
+    # where there is nothing to correct, correcting adds the estimate's own variance, give or take
+    if corrected**2 - uncorrected**2 > WORSE_FROM * held_out.calibration**2:
         return Word.REJECT, f"{found}: the calibration makes it worse"
     dof = 3 * held_out.samples
     by_chance = math.sqrt(float(chdtri(dof, CHANCE)) / dof)

@@ -15,9 +15,14 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from . import common
+from .reporting import add_report_option, report_writer
+
+if TYPE_CHECKING:
+    from ..calibration.results import Result
+    from ..io.replay import Replayed
 
 NAME = "demo"
 HELP = "live node, replay and truth side by side on a shipped bag"
@@ -31,14 +36,18 @@ SCALE_PERCENT = 0.5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
+    add_report_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare."""
+    from ..calibration.models import MODELS
     from ..io.errors import InputError
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
+    common.check_outputs(arguments, "report")
+    write_report = report_writer(arguments, "write_replay_report")
     bag = common.share_folder() / "bags" / BAG
     # its own domain: the demo must neither hear nor disturb a vehicle that is running
     os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
@@ -65,7 +74,11 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")
-        agree = _compare(out, bag, saved, latency)
+        offline = _offline(bag, latency, with_history=write_report is not None)
+        agree = _compare(out, saved, offline.result)
+    if write_report is not None:
+        write_report(arguments.report, offline, [bag], list(MODELS))
+        out.print(f"The replay's report is in {arguments.report}.")
     return 0 if agree else 1
 
 
@@ -101,17 +114,21 @@ def _truth() -> dict[str, float]:
     return angles | {"delta_k": 100.0 * scale[0]}
 
 
-def _compare(out: Any, bag: Path, saved: Path, latency: str) -> bool:
+def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
+    from ..io.parameter_files import load_parameters
+    from ..io.replay import replay
+
+    return replay([bag], load_parameters(None, [latency]), with_history=with_history)
+
+
+def _compare(out: Any, saved: Path, offline: Result) -> bool:
     import numpy as np
     from rich.table import Table
 
-    from ..io.parameter_files import load_parameters
-    from ..io.replay import replay
     from ..io.result_file import load_initial_calibration
     from ..io.yaml_files import load_yaml
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
-    offline = replay([bag], load_parameters(None, [latency])).result
     live = load_initial_calibration(saved)
     table = Table(title="Live node against replay and truth", title_justify="left")
     for column in ("model", *common.ESTIMATE_COLUMNS, "max |live - replay|"):

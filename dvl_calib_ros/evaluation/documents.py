@@ -34,6 +34,7 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
             for name, rows in zip(names, e.avg_vrmse_by_time.mean(axis=-1), strict=True)
         },
         "coverage": _coverage(e.coverage),
+        "coverage_of_all": _coverage(e.coverage_of_all),
         "errors_in_variables": _errors_in_variables(e),
         "each": _each(e.each, e.columns),
         "single_heading": _each(e.single_heading, e.columns),
@@ -96,6 +97,7 @@ def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
     return {
         each.model: {
             "errors": each.n_errors,
+            "normalised_rms": each.normalised_rms,
             "within_68": {"pooled": each.pooled_68, **_row(each.state_names, each.within_68)},
             "within_95": {"pooled": each.pooled_95, **_row(each.state_names, each.within_95)},
             "mean_error": _row(each.state_names, each.mean_error),

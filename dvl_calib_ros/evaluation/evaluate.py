@@ -15,6 +15,7 @@ from ..calibration.models import MODELS
 from ..calibration.observations import Observations
 from ..calibration.parameters import SCHEMA, Parameters
 from . import protocol
+from .holdout import verify_set
 from .metrics import coverage
 from .parallel import Workers, run_all
 from .procedure import (
@@ -37,7 +38,7 @@ from .trajectories import Trajectory, load_folder, own_trajectories
 DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "reference"}
 # The unit under test is mounted straight, at the reference point, in step, and its errors are constant.
 FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", "process_std_misalignment",
-         "process_std_scale")  # fmt: skip
+         "process_std_scale", "max_speed")  # fmt: skip
 # Trajectories and the combination of the pictures
 TRACED, TRACED_COMBINATION = ("T01", "T07"), 0
 TRACE_SAMPLES = 400
@@ -70,7 +71,14 @@ def evaluate(
         parameters=parameters,
     )
     seeds = tuple(range(n_seeds))
-    outcomes = run_all(partial(run_seed, procedure), seeds, workers, on_progress)
+    total = n_seeds + len(procedure.sets)
+    outcomes = run_all(partial(run_seed, procedure), seeds, workers, lambda x: on_progress(x * n_seeds / total))
+    held_out = run_all(
+        partial(verify_set, procedure, seeds[0]),
+        procedure.sets,
+        workers,
+        lambda x: on_progress((n_seeds + x * len(procedure.sets)) / total),
+    )
     own_generator = folder is None
     return Evaluation(
         source="own generator (simulated trajectories)" if own_generator else f"folder {folder}",
@@ -86,12 +94,14 @@ def evaluate(
         avg_vrmse_by_time=np.stack([[run.by_time for run in each.by_set] for each in outcomes], axis=-1),
         published=protocol.PUBLISHED,
         coverage=_coverage(procedure.models, [run for each in outcomes for run in each.by_set]),
+        coverage_of_all=_coverage(procedure.models, [run for each in outcomes for run in (*each.by_set, *each.each)]),
         errors_in_variables=_errors_in_variables(procedure, outcomes),
         each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
         single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),
         traces=tuple(_traces(procedure, seeds[0], outcomes[0])),
         parameters=parameters.as_dict(),
         version=__version__,
+        held_out=tuple(each for of_set in held_out for each in of_set),
     )
 
 
@@ -99,7 +109,7 @@ def _for_procedure(parameters: Parameters) -> tuple[Parameters, tuple[str, ...]]
     """The parameters that the procedure runs with, and a note for every one that it does not take."""
     defaults = {name: SCHEMA[name].default for name in FIXED}
     ignored = [name for name, default in defaults.items() if getattr(parameters, name) != default]
-    notes = tuple(f"{name} is not used here: the procedure's unit has none" for name in ignored)
+    notes = tuple(f"{name} is not used by the procedure" for name in ignored)
     return parameters.replace(**defaults), notes
 
 

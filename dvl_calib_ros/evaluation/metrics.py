@@ -77,4 +77,5 @@ def coverage(model: str, state_names: Sequence[str], errors: Array, std: Array) 
         mean_error=errors.mean(axis=0),
         rms_error=np.sqrt((errors**2).mean(axis=0)),
         mean_std=std.mean(axis=0),
+        normalised_rms=float(np.sqrt(np.mean((errors / std) ** 2))),
     )

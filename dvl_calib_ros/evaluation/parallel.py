@@ -6,8 +6,10 @@ order in which they finish changes anything.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -41,7 +43,8 @@ def run_all(
     Exceptions of `work` go through. Raises InputError for a cluster that does not answer, or workers that died.
     """
     if workers.dask:
-        return _on_dask(work, items, workers.dask, on_progress)
+        with _quiet_logs():
+            return _on_dask(work, items, workers.dask, on_progress)
     if workers.jobs == 1 or len(items) == 1:
         outcomes = []
         for done, item in enumerate(items, start=1):
@@ -81,23 +84,42 @@ def _on_dask(
     work: Callable[[Item], Outcome], items: Sequence[Item], address: str, on_progress: Callable[[float], None]
 ) -> list[Outcome]:
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
+        from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise InputError(f"--dask needs Dask ({error}); pip install 'dvl_calib_ros[dask]'") from error
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise InputError(f"--dask {address}: no scheduler answers there; start one, or leave --dask out") from error
-    with client:
+    with client, client.as_current():
         try:
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
         except TimeoutError as error:
             raise InputError(f"--dask {address}: the scheduler has no workers; start some") from error
         # Dask runs what a dead worker had done or was doing again elsewhere, as long as somebody holds the futures
         futures = client.map(work, items, pure=False)
-        _wait(client, futures, address, on_progress)
-        outcomes: list[Outcome] = client.gather(futures)
+        try:
+            _wait(client, futures, address, on_progress)
+            outcomes: list[Outcome] = client.gather(futures)
+        except ImportError as error:
+            raise InputError(
+                f"--dask {address}: workers lack something ({error}); install this package there"
+            ) from error
+        except (CancelledError, CommClosedError, KilledWorker) as error:
+            raise InputError(f"--dask {address}: the cluster was lost on the way; start it anew") from error
         return outcomes
+
+
+@contextmanager
+def _quiet_logs() -> Iterator[None]:
+    """Dask logs what it raises as well, with tracebacks."""
+    before = logging.root.manager.disable
+    logging.disable(logging.ERROR)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _wait(client: Any, futures: Sequence[Any], address: str, on_progress: Callable[[float], None]) -> None:

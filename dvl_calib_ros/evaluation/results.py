@@ -8,7 +8,7 @@ attitude on a run without).
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,7 @@ class Coverage:
 
     model: name. state_names: the n error states (nuisance states have no truth). within_68, within_95: (n,) per state.
     pooled_68, pooled_95: over all states. n_errors: errors per state. mean_error, rms_error, mean_std: (n,).
+    normalised_rms: rms of error / σ over all states, 1 for an honest σ, by how much it is too small above.
     """
 
     model: str
@@ -55,6 +56,7 @@ class Coverage:
     mean_error: Array
     rms_error: Array
     mean_std: Array
+    normalised_rms: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,12 @@ class Trace:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Hold-out verdict of one model on one set, for a report: velocity errors (rms, m/s) on blocks held back."""
+    """Hold-out verification of one model's calibration on one set: velocity error (vector rms, m/s) against the
+    reference, its noise included, on samples that the calibration had not seen.
+
+    uncorrected, corrected, predicted: rms over combinations of errors. verdict: the one most of them got. verdicts: how
+    many got which.
+    """
 
     set_name: str
     model: str
@@ -123,6 +130,7 @@ class HeldOut:
     uncorrected: float
     corrected: float
     predicted: float
+    verdicts: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,8 @@ class Evaluation:
     source: folder or generator, in words. own_generator: True if the trajectories are not recorded ones, so that the
     published figures do not apply. notes: what the reader must know. columns: `UNCALIBRATED`, then the models.
     avg_vrmse: (S, C, Q). windows_s: (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column ->
-    m/s. parameters: as used, plain values. version: of the software.
+    m/s. coverage: over the sets; coverage_of_all: over these and the runs of `each`. parameters: as used, plain
+    values. version: of the software.
     """
 
     source: str
@@ -155,6 +164,7 @@ class Evaluation:
     parameters: Mapping[str, Any]
     version: str
     held_out: tuple[HeldOut, ...] = ()
+    coverage_of_all: tuple[Coverage, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ ALL_STANDS_S = 40.0
 CLAIMED = ((0.68, (0.60, 0.76)), (0.95, (0.91, 0.98)))
 
 
-def improvement_bars(models: Sequence[str], sets: Sequence[str], improvement: Array, published: Array) -> Figure:
+def improvement_bars(models: Sequence[str], improvement: Array, published: Array) -> Figure:
     """How much of the uncalibrated error each model takes away.
 
     improvement, published: (S, M) share of Avg.VRMSE that is gone, nan where there is none. Bars are the mean over the

@@ -12,10 +12,11 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.models import MODELS
+from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
-from .replay_figures import held_out_bars
+from .replay_figures import held_out_errors
 from .style import Picture, picture
 
 BODY_AXES = ("ahead", "to port", "up")
@@ -43,7 +44,7 @@ def _context(e: Evaluation) -> dict[str, Any]:
         "scores": _score_table(e),
         "improvement": [_improvement(e)],
         "times": list(_calibration_times(e)),
-        "has_published": bool(np.isfinite(e.published_table).any()),
+        "has_published": bool(np.isfinite(_published(e)).any()),
         "coverages": list(_coverages(e)),
         "errors_in_variables": None if e.errors_in_variables is None else _pull(e.errors_in_variables),
         "studies": [study for study in (_study(e, e.each, _EACH), _study(e, e.single_heading, _SINGLE)) if study],
@@ -51,6 +52,11 @@ def _context(e: Evaluation) -> dict[str, Any]:
         "held_out": _held_out(e.held_out) if e.held_out else None,
         "parameters": parameter_texts(e.parameters),
     }
+
+
+def _published(e: Evaluation) -> Array:
+    """(S, C) published Avg.VRMSE, nan where there is none: nowhere, if the trajectories are others."""
+    return np.full_like(e.published_table, np.nan) if e.own_generator else e.published_table
 
 
 # ------------------------------------------------------------------ summary
@@ -79,19 +85,18 @@ def _summary(e: Evaluation) -> Iterable[str]:
         name, value = best
         gain = 100.0 * (1.0 - value / uncalibrated)
         sentence = f"Best {words}: {name} with {value:.4f} m/s, {gain:.0f} % less than uncalibrated"
-        published = None if e.own_generator else _best(e.published_table.mean(axis=0), e.columns, aided)
+        published = _best(_published(e).mean(axis=0), e.columns, aided)
         if published is not None:
             sentence += f"; best published: {published[0]} with {published[1]:.4f} m/s"
         yield sentence + "."
     if e.each is not None and e.each.runs:
-        median = np.median(e.each.avg_vrmse.mean(axis=-1), axis=0)
-        medians = ((words, _best(median, e.columns, aided)) for aided, words in _KINDS)
+        medians = ((words, _best(e.each.median(), e.columns, aided)) for aided, words in _KINDS)
         found = ", ".join(f"{best[0]} {best[1]:.4f} m/s {words}" for words, best in medians if best is not None)
         yield f"Calibrated on each of {len(e.each.runs)} runs with attitude, best medians: {found}."
     if e.own_generator:
         yield "The trajectories are simulated: the published figures do not apply to them."
     else:
-        ratio = e.ratio[np.isfinite(e.ratio)]
+        ratio = (e.seed_mean / _published(e))[np.isfinite(_published(e))]
         if len(ratio):
             near = int((np.abs(ratio - 1.0) <= 0.25).sum())
             yield f"{near} of {len(ratio)} published cells are met within 25 %."
@@ -149,16 +154,16 @@ def _score(value: float, published: float) -> str | Cell:
 def _score_table(e: Evaluation) -> Table:
     """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below."""
     rows = []
-    for name, here, published in zip(e.columns, e.seed_mean.T, e.published_table.T, strict=True):
+    for name, here, published in zip(e.columns, e.seed_mean.T, _published(e).T, strict=True):
         means = _score(float(here.mean()), float(published.mean()))
         rows.append((name, *(_score(*pair) for pair in zip(here.tolist(), published.tolist(), strict=True)), means))
     notes = [
         "Avg.VRMSE in m/s: root mean square of the velocity error, mean over trajectories, combinations and seeds."
     ]
-    if np.isfinite(e.published_table).any():
+    if np.isfinite(_published(e)).any():
         notes.append(
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
-            "beyond. Means are those of the cells beside them (the paper's own mean of M3, 0.0323, is not)."
+            "beyond. Means are those of the cells beside them, not the paper's."
         )
     return Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
 
@@ -167,11 +172,11 @@ def _improvement(e: Evaluation) -> Picture:
     base = e.columns.index(UNCALIBRATED)
     models = [e.columns.index(name) for name in e.models]
     gone = 1.0 - e.seed_mean[:, models] / e.seed_mean[:, [base]]
-    published = 1.0 - e.published_table[:, models] / e.published_table[:, [base]]
+    published = 1.0 - _published(e)[:, models] / _published(e)[:, [base]]
     alt = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
     return picture(
         "Improvement over uncalibrated", f"Mean over the sets: {alt}",
-        figures.improvement_bars, e.models, [each.name for each in e.sets], gone, published,
+        figures.improvement_bars, e.models, gone, published,
     )  # fmt: skip
 
 
@@ -184,7 +189,7 @@ def _calibration_times(e: Evaluation) -> Iterable[Picture]:
             f"{each.name}: calibrated on {each.calibration_run}",
             f"Avg.VRMSE against calibration time for set {each.name}, all models",
             figures.error_over_calibration_time, e.models, e.windows_s, float(e.seed_mean[i, base]),
-            by_time[i][:, models], each.window_s, e.published_table[i, models],
+            by_time[i][:, models], each.window_s, _published(e)[i, models],
         )  # fmt: skip
 
 
@@ -193,6 +198,7 @@ def _calibration_times(e: Evaluation) -> Iterable[Picture]:
 
 def _coverages(e: Evaluation) -> Iterable[dict[str, Any]]:
     studies = (
+        ("Calibrated on the sets and on each run with attitude", e.coverage_of_all),
         ("Calibrated on the sets", e.coverage),
         ("Calibrated on each run with attitude", e.each.coverage if e.each else ()),
         ("Calibrated on stretches of a single heading", e.single_heading.coverage if e.single_heading else ()),
@@ -288,8 +294,11 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any]
             for name, value in zip(e.columns, values, strict=True)
         ]
         rows.append((label, f"{math.degrees(run.heading_spread):.0f}", *cells))
-    median = np.median(errors, axis=0)
-    rows.append(("median", "", *("–" if not math.isfinite(value) else f"{value:.4f}" for value in median.tolist())))
+    median = study.median()
+    rows.append(_median_row("median", median))
+    manoeuvring = study.median(MANOEUVRING)
+    if np.isfinite(manoeuvring).any():
+        rows.append(_median_row(f"of {MANOEUVRING[0]} .. {MANOEUVRING[-1]}", manoeuvring))
     alt = ", ".join(f"{name} {value:.4f}" for name, value in zip(e.columns, median.tolist(), strict=True))
     base = e.columns.index(UNCALIBRATED)
     models = [e.columns.index(name) for name in e.models]
@@ -298,7 +307,7 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any]
         "table": Table(
             ("run", "headings, °", *e.columns),
             rows,
-            marked=len(rows) - 1,
+            marked=len(study.runs),
             dense=True,
             notes=(
                 "Avg.VRMSE on all other trajectories, m/s. Headings: their circular standard deviation. ? marks where "
@@ -313,6 +322,10 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any]
             )
         ],
     }  # fmt: skip
+
+
+def _median_row(name: str, medians: Array) -> tuple[str, ...]:
+    return (name, "", *("–" if not math.isfinite(value) else f"{value:.4f}" for value in medians.tolist()))
 
 
 def _trace(trace: Trace) -> dict[str, Any]:
@@ -346,21 +359,26 @@ def _trace(trace: Trace) -> dict[str, Any]:
 
 
 def _held_out(held_out: Sequence[HeldOut]) -> dict[str, Any]:
-    rows = [
-        (
-            f"{each.set_name} {each.model}",
-            Cell(each.verdict, VERDICT_KINDS[each.verdict]),
-            f"{each.uncorrected:.4f}",
-            f"{each.corrected:.4f}",
-            f"{each.predicted:.4f}",
-        )
-        for each in held_out
+    sets = list(dict.fromkeys(each.set_name for each in held_out))
+    models = list(dict.fromkeys(each.model for each in held_out))
+    found = {(each.model, each.set_name): each for each in held_out}
+    rows = [(model, *(_held_out_cell(found.get((model, name))) for name in sets)) for model in models]
+    notes = ("Velocity error on held-out data, m/s rms; below: uncorrected → predicted, and the verdict.",)
+    pictures = [_held_out_picture(name, [each for each in held_out if each.set_name == name]) for name in sets]
+    return {"table": Table(("model", *sets), rows, notes=notes), "pictures": pictures}
+
+
+def _held_out_cell(each: HeldOut | None) -> str | Cell:
+    if each is None:
+        return "–"
+    below = f"{each.uncorrected:.4f} → {each.predicted:.4f}, {each.verdict}"
+    return Cell(f"{each.corrected:.4f}", VERDICT_KINDS[each.verdict], below)
+
+
+def _held_out_picture(name: str, held_out: Sequence[HeldOut]) -> Picture:
+    errors = [
+        np.array([getattr(each, kind) for each in held_out]) for kind in ("uncorrected", "corrected", "predicted")
     ]
-    labels = [f"{each.set_name} {each.model}" for each in held_out]
-    kinds = ("uncorrected", "corrected", "predicted")
-    errors = [np.array([getattr(each, kind) for each in held_out]) for kind in kinds]
-    alt = ", ".join(f"{label} {each.verdict}" for label, each in zip(labels, held_out, strict=True))
-    return {
-        "table": Table(("set, model", "verdict", "uncorrected", "corrected", "predicted"), rows, notes=("m/s rms.",)),
-        "pictures": [picture("Velocity error on held-out data", alt, held_out_bars, labels, *errors)],
-    }
+    alt = "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in held_out)
+    models = [each.model for each in held_out]
+    return picture(f"{name}: error on held-out data", alt, held_out_errors, models, *errors)

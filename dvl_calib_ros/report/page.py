@@ -51,7 +51,7 @@ class Table:
 
 def signed(value: float, digits: int = 2) -> str:
     """A number with its sign, the minus as wide as the plus."""
-    return f"{value:+.{digits}f}".replace("-", "−")
+    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")  # + 0.0: no minus before zero
 
 
 def parameter_texts(parameters: Mapping[str, Any]) -> dict[str, str]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from ..calibration.frames import Array
 from .series import running_mean, thin
@@ -135,7 +136,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
         if not used.any():
             continue
         colour, dashes = MODEL_STYLES[name]
-        where, mean = running_mean(t[used], np.log10(values[used]))
+        where, mean = running_mean(t[used], np.log10(values[used]), points=9)
         axes.plot(where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
     axes.axhline(1.0, color=INK, linewidth=0.8)
     axes.set_yscale("log")
@@ -154,28 +155,26 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
         axes.barh(models, values, left=left, color=colour, height=0.7, label=reason)
         left += np.asarray(values, dtype=float)
     axes.invert_yaxis()
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("DVL samples")
     axes.grid(False, axis="y")
     legend_above(axes, columns=4)
     return figure
 
 
-def held_out_bars(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
-    """Velocity error on data held back (N,), m/s rms: bars with the correction, marks for what they compare with."""
+def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
+    """Velocity error on data held back (N,), m/s rms. Points, not bars from zero: the reference's noise is in each."""
     figure, axes = new_figure(height=1.2 + 0.27 * len(labels))
     rows = np.arange(len(labels))
-    axes.barh(rows, corrected, height=0.6, color=AFTER, alpha=0.85, label="corrected")
+    axes.hlines(rows, corrected, uncorrected, color=FAINT, linewidth=1.6)
+    axes.plot(uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, label="uncorrected")
+    axes.plot(corrected, rows, "o", color=AFTER, markersize=6.0, label="corrected")
     axes.plot(
-        predicted, rows, "D", color=INK, markersize=4.5, markerfacecolor="white", markeredgewidth=1.1,
-        linestyle="none", label="predicted",
-    )  # fmt: skip
-    axes.plot(
-        uncorrected, rows, "|", color=BAD, markersize=11.0, markeredgewidth=2.2, linestyle="none", label="uncorrected"
+        predicted, rows, "D", color=INK, markersize=5.0, markerfacecolor="none", markeredgewidth=1.1, label="predicted"
     )
     axes.set_yticks(rows, labels)
     axes.set_ylim(len(labels) - 0.5, -0.5)
-    axes.set_xlim(left=0.0)
     axes.set_xlabel("velocity error on held-out data, m/s rms")
-    axes.grid(False, axis="y")
     legend_above(axes)
     return figure

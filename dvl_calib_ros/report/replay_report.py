@@ -22,7 +22,7 @@ from ..io.result_file import result_document
 from . import replay_figures as figures
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture
-from .time_axis import TimeAxis
+from .time_axis import TimeAxis, fitting_unit
 
 
 class Term(NamedTuple):
@@ -133,7 +133,7 @@ def _numbers(estimate: Estimate) -> list[dict[str, str]]:
 def _facts(result: Result, mounting: Mapping[str, Any], bags: Sequence[Path]) -> list[tuple[str, str]]:
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     estimate = result.estimate
-    missing = [f"{entry.axis}: needs {entry.missing}" for entry in estimate.observability if entry.missing]
+    missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
     return [
         ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
         ("Corrected mounting", _rpy(mounting["corrected_rpy"])),
@@ -155,7 +155,8 @@ def _when(result: Result) -> str:
     if result.first_ns is None or result.last_ns is None:
         return "nothing"
     seconds = (result.last_ns - result.first_ns) * 1e-9
-    duration = f"{seconds:.1f} s" if seconds < 600.0 else f"{seconds / 60.0:.1f} min"
+    unit_s, unit = fitting_unit(seconds)
+    duration = f"{seconds / unit_s:.1f} {unit}"
     return f"{_utc(result.first_ns)} to {_utc(result.last_ns)} UTC, {duration}"
 
 
@@ -188,7 +189,7 @@ def _held_out(result: Result, shown: Sequence[str]) -> dict[str, Any] | None:
             ("model", *kinds, "samples", "verdict"), rows, marked=list(verifications).index(result.selected)
         ),
         "pictures": [
-            picture("Velocity error on held-out data", alt, figures.held_out_bars, list(judged), *errors),
+            picture("Velocity error on held-out data", alt, figures.held_out_errors, list(judged), *errors),
         ],
     }
 

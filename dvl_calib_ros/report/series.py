@@ -8,8 +8,6 @@ from ..calibration.frames import Array
 
 # Points of a line: more cannot be seen at this width
 LINE_POINTS = 300
-# Points over which a residual is averaged
-AVERAGED_POINTS = 31
 
 
 def thin(n: int) -> slice:
@@ -18,9 +16,9 @@ def thin(n: int) -> slice:
     return slice((n - 1) % step if n else 0, None, step)
 
 
-def running_mean(t: Array, values: Array) -> tuple[Array, Array]:
-    """Positions and mean of AVERAGED_POINTS neighbours; of fewer where there are not so many, nan across a gap."""
-    width = min(AVERAGED_POINTS, len(values))
+def running_mean(t: Array, values: Array, points: int = 31) -> tuple[Array, Array]:
+    """Positions and mean of so many neighbours; of fewer where there are not enough, nan across a gap."""
+    width = max(1, min(points, len(values) // 5))
     window = np.ones(width) / width
     mean = np.convolve(values, window, "valid")
     duration = t[width - 1 :] - t[: len(t) - width + 1]

@@ -14,6 +14,11 @@ CUT_FROM_S, CUT_SHARE = 60.0, 0.2
 LEFT_SHARE = 0.02
 
 
+def fitting_unit(seconds: float) -> tuple[float, str]:
+    """Length in s and name of the unit in which people tell such a time."""
+    return (1.0, "s") if seconds <= 600.0 else (60.0, "min") if seconds <= 10_800.0 else (3600.0, "h")
+
+
 class TimeAxis:
     """Turns stamps into what is plotted.
 
@@ -29,7 +34,7 @@ class TimeAxis:
         recorded = float(steps[steps <= CUT_FROM_S].sum())
         cut = (steps > CUT_FROM_S) & (steps > CUT_SHARE * recorded)
         shown = np.concatenate([[0.0], np.cumsum(np.where(cut, LEFT_SHARE * recorded, steps))])
-        unit_s, unit = (1.0, "s") if shown[-1] <= 600.0 else (60.0, "min") if shown[-1] <= 10_800.0 else (3600.0, "h")
+        unit_s, unit = fitting_unit(float(shown[-1]))
         self._shown = shown / unit_s
         self.breaks = np.column_stack([self._shown[:-1][cut], self._shown[1:][cut]])
         self.label = f"time from the start, {unit}" + (" (gaps cut out)" if cut.any() else "")
