@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common, trial
+from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -35,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--apply", type=Path, metavar="FILE",
         help="write a parameter file for node and replay that compensates what was found, over --params and -p",
     )  # fmt: skip
+    add_report_option(parser)
     common.add_parameter_options(parser)
     common.add_topic_options(parser)
     parser.add_argument("--trial", action="store_true", help="try the diagnosis itself, blindly, on simulated bags")
@@ -59,14 +61,23 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.result_file import save_text
 
     parameters = common.load(arguments)
-    common.check_outputs(arguments, "json", "apply")
+    common.check_outputs(arguments, "json", "apply", "report")
+    write_report = report_writer(arguments, "write_diagnosis_report")
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("diagnosing") as on_progress:
-        diagnosis = diagnose(arguments.bags, common.load(arguments, DEFAULTS), topics, on_progress)
+        diagnosis = diagnose(
+            arguments.bags,
+            common.load(arguments, DEFAULTS),
+            topics,
+            on_progress,
+            with_series=write_report is not None,
+        )
     if arguments.json is not None:
         common.write_json(arguments.json, diagnosis_document(diagnosis))
     if arguments.apply is not None:
         save_text(arguments.apply, parameter_file(compensated(parameters, diagnosis)))
+    if write_report is not None:
+        write_report(arguments.report, diagnosis)
     _print(diagnosis)
 
 

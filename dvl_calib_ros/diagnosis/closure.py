@@ -46,8 +46,26 @@ def explanation(fitter: Fitter, fit: Fit) -> Explanation:
     return Explanation(np.concatenate(columns, axis=2), series, np.concatenate(prior))
 
 
-def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
-    """Held-out gap before and after the effects of a fit.
+@dataclass(frozen=True)
+class HeldOut:
+    """before, after: residuals (M, 3) m/s of calibrations without and with the effects that have not seen them.
+    floor: (M, 3) (m/s)², the square of the noise in both. block: (M,) index, for resampling.
+    """
+
+    before: Array
+    after: Array
+    floor: Array
+    block: Array
+
+    def squares(self) -> tuple[Array, Array, Array]:
+        """Squares of before, after and floor summed over each block (B,), (m/s)²."""
+        parts = (self.before**2, self.after**2, self.floor)
+        before, after, floor = (np.bincount(self.block, part.sum(axis=1)) for part in parts)
+        return before, after, floor
+
+
+def held_out(fitter: Fitter, fit: Fit, dictionary: Array) -> HeldOut:
+    """What is left before and after the effects of a fit, on held-out data.
 
     Calibration and effects are fitted on all folds but one and judged on that. The noise floor is what is left by
     everything together, the dictionary of `unexplained` too, with the degrees of freedom given back: so it shares the
@@ -57,17 +75,23 @@ def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
     block, fold = blocks_of(problem)
     bare = Explanation(problem.base, fitter.residual, 1.0 / PRIOR_STD)
     full = explanation(fitter, fit)
-    before = _held_out(bare, noise.whiten(bare.columns), noise.whiten(bare.series), block, fold)
+    before = _left_in_folds(bare, noise.whiten(bare.columns), noise.whiten(bare.series), fold[block])
     after = before
     if fit.effects:
-        after = _held_out(full, noise.whiten(full.columns), noise.whiten(full.series), block, fold)
+        after = _left_in_folds(full, noise.whiten(full.columns), noise.whiten(full.series), fold[block])
     size = np.maximum(np.sqrt((dictionary**2).mean(axis=(0, 1))), 1e-12)
     everything = Explanation(
         np.concatenate([full.columns, dictionary / size], axis=2),
         full.series,
         np.concatenate([full.prior, np.full(dictionary.shape[2], 1e-3)]),
     )
-    floor = _floor(everything, noise.whiten(everything.columns), noise.whiten(everything.series), block)
+    floor = _floor(everything, noise.whiten(everything.columns), noise.whiten(everything.series))
+    return HeldOut(before, after, floor, block)
+
+
+def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
+    """Held-out gap before and after the effects of a fit, with a bootstrap over blocks."""
+    before, after, floor = held_out(fitter, fit, dictionary).squares()
     n = len(fitter.residual)
 
     def closure(at: Array) -> Array:
@@ -99,27 +123,27 @@ def blocks_of(problem: Problem) -> tuple[Array, Array]:
     return block, np.arange(len(first)) % FOLDS
 
 
-def _held_out(it: Explanation, white: Array, white_series: Array, block: Array, fold: Array) -> Array:
-    """Squared error (m/s)² of each block, with coefficients from the folds that it is not in."""
+def _left_in_folds(it: Explanation, white: Array, white_series: Array, fold: Array) -> Array:
+    """(M, 3) m/s that is left of each sample, with coefficients from the folds that it (M,) is not in."""
     p = it.columns.shape[2]
-    error = np.zeros(len(fold))
-    of_row = np.repeat(fold[block], 3)
+    left = np.empty_like(it.series)
+    of_row = np.repeat(fold, 3)
     for held in np.unique(fold):
         train = of_row != held
         a = white[train]
         solution = np.linalg.lstsq(
             np.concatenate([a, np.diag(it.prior)]), np.concatenate([white_series[train], np.zeros(p)]), rcond=None
         )[0]
-        test = fold[block] == held
-        left = it.series[test] - it.columns[test] @ solution
-        error += np.bincount(block[test], (left**2).sum(axis=1), minlength=len(fold))
-    return error
+        test = fold == held
+        left[test] = it.series[test] - it.columns[test] @ solution
+    return left
 
 
-def _floor(it: Explanation, white: Array, white_series: Array, block: Array) -> Array:
-    """Squared noise (m/s)² of each block: what is left, and what the fit has taken of it."""
+def _floor(it: Explanation, white: Array, white_series: Array) -> Array:
+    """(M, 3) (m/s)², square of the noise: of what is left, and of what the fit has taken of it."""
     normal = white.T @ white + np.diag(it.prior**2)
     covariance = np.linalg.pinv(normal, hermitian=True)
     left = it.series - it.columns @ (covariance @ (white.T @ white_series))
-    taken = np.einsum("mip,pq,miq->m", it.columns, covariance, it.columns, optimize=True)
-    return np.bincount(block, (left**2).sum(axis=1) + taken)
+    taken = np.einsum("mip,pq,miq->mi", it.columns, covariance, it.columns, optimize=True)
+    floor: Array = left**2 + taken
+    return floor

@@ -22,6 +22,7 @@ from .problem import PRIOR_STD, Problem, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
 from .selection import LEVEL, Selected, Selection, refined, robust_fitter, select
+from .series import collect_series
 from .unexplained import Unexplained, unexplained
 from .where import places
 
@@ -46,10 +47,11 @@ def diagnose(
     topics: Topics | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
     effects: Mapping[str, Effect] = EFFECTS,
+    with_series: bool = False,
 ) -> Diagnosis:
     """Diagnose bags of one vehicle. Raises InputError for what cannot be compared at all."""
     loaded = load_recordings(paths, parameters, topics or Topics(), lambda share: on_progress(0.5 * share))
-    diagnosis = diagnose_recordings(loaded.recordings, parameters, loaded.notes, effects)
+    diagnosis = diagnose_recordings(loaded.recordings, parameters, loaded.notes, effects, with_series)
     on_progress(1.0)
     return diagnosis
 
@@ -59,6 +61,7 @@ def diagnose_recordings(
     parameters: Parameters,
     notes: Sequence[str] = (),
     effects: Mapping[str, Effect] = EFFECTS,
+    with_series: bool = False,
 ) -> Diagnosis:
     """`diagnose`, of recordings that are read already."""
     says_nothing = _says_nothing(recordings)
@@ -100,6 +103,7 @@ def diagnose_recordings(
         minimum_detectable=detectable,
         next_manoeuvre=next_manoeuvre,
         notes=tuple(notes),
+        series=collect_series(selection.fitter, selection.fit, rest) if with_series else None,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from .closure import Gap
 from .noise_findings import NoiseFinding
+from .series import DiagnosisSeries
 from .where import Place
 
 
@@ -37,7 +38,7 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer. misalignment: (3,) rad and scale: (3,), refitted with the effects. notes: on the data."""
+    """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any."""
 
     verdict: Verdict
     sentence: str
@@ -49,6 +50,7 @@ class Diagnosis:
     minimum_detectable: Mapping[str, Mapping[str, float]]
     next_manoeuvre: str
     notes: tuple[str, ...]
+    series: DiagnosisSeries | None = None
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
