@@ -1,4 +1,4 @@
-"""Diagnose the sim-to-real gap of recorded bags: where the DVL differs from its simulation, why, and what that explains.
+"""Diagnose the sim-to-real gap of recorded bags: where the DVL differs from its simulation, and which effect does it.
 
 One sentence with the answer comes first. Several bags must be of one vehicle; whole bags are then held out.
 """
@@ -132,8 +132,8 @@ def _where(diagnosis: Diagnosis) -> Table:
     table = _table("where the gap lies", "axis", "when", "time s", "band Hz", "share", "p")
     for place in diagnosis.where[:MAX_PLACES]:
         table.add_row(
-            place.axis, place.regime, "{:.0f} .. {:.0f}".format(*place.segment_s), "{:.2g} .. {:.2g}".format(*place.band_hz),
-            _share(place.share), f"{place.p:.1g}",
+            place.axis, place.regime, "{:.0f} .. {:.0f}".format(*place.segment_s),
+            "{:.2g} .. {:.2g}".format(*place.band_hz), _share(place.share), f"{place.p:.1g}",
         )  # fmt: skip
     return table
 

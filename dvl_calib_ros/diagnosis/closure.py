@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 from .fitting import Fit, Fitter
@@ -13,6 +15,7 @@ from .problem import PRIOR_STD, Problem
 BLOCK_S = 20.0
 FOLDS = 5
 RESAMPLES = 1000
+Integers = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,12 @@ class HeldOut:
     before: Array
     after: Array
     floor: Array
-    block: Array
+    block: Integers
 
     def squares(self) -> tuple[Array, Array, Array]:
         """Squares of before, after and floor summed over each block (B,), (m/s)²."""
         parts = (self.before**2, self.after**2, self.floor)
-        before, after, floor = (np.bincount(self.block, part.sum(axis=1)) for part in parts)
+        before, after, floor = (np.asarray(np.bincount(self.block, part.sum(axis=1))) for part in parts)
         return before, after, floor
 
 
@@ -94,9 +97,9 @@ def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
     before, after, floor = held_out(fitter, fit, dictionary).squares()
     n = len(fitter.residual)
 
-    def closure(at: Array) -> Array:
+    def closure(at: Integers) -> Array:
         gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
-        return 1.0 - np.maximum((after - floor)[at].sum(axis=-1), 0.0) / gap
+        return np.asarray(1.0 - np.maximum((after - floor)[at].sum(axis=-1), 0.0) / gap)
 
     rng = np.random.default_rng(0)
     resampled = closure(rng.integers(0, len(before), (RESAMPLES, len(before))))
@@ -113,7 +116,7 @@ def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
     )
 
 
-def blocks_of(problem: Problem) -> tuple[Array, Array]:
+def blocks_of(problem: Problem) -> tuple[Integers, Integers]:
     """Block of each of the M samples, and fold of each block: whole recordings, of one recording stretches in turn."""
     index = np.floor(problem.time / BLOCK_S).astype(int)
     keys = problem.recording_of * (index.max() + 1) + index
@@ -123,7 +126,7 @@ def blocks_of(problem: Problem) -> tuple[Array, Array]:
     return block, np.arange(len(first)) % FOLDS
 
 
-def _left_in_folds(it: Explanation, white: Array, white_series: Array, fold: Array) -> Array:
+def _left_in_folds(it: Explanation, white: Array, white_series: Array, fold: Integers) -> Array:
     """(M, 3) m/s that is left of each sample, with coefficients from the folds that it (M,) is not in."""
     p = it.columns.shape[2]
     left = np.empty_like(it.series)

@@ -18,7 +18,7 @@ from ..io.replay import Topics
 from .closure import Gap, measure_gap
 from .fitting import Fit, Fitter, is_time_of_run
 from .noise_findings import noise_findings
-from .problem import PRIOR_STD, Problem, calibrated
+from .problem import PRIOR_STD, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
 from .selection import LEVEL, Selected, Selection, refined, robust_fitter, select
@@ -128,9 +128,17 @@ def _says_nothing(recordings: Sequence[Recording]) -> str:
 def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
     nan = float("nan")
     return Diagnosis(
-        Verdict.INSUFFICIENT_EXCITATION, f"This recording cannot show a gap: {why}.", Gap(nan, nan, nan, nan, (nan, nan)),
-        (), (), (), {}, {}, "straight legs on several headings and at several speeds, with turns to both sides", tuple(notes),
-    )  # fmt: skip
+        verdict=Verdict.INSUFFICIENT_EXCITATION,
+        sentence=f"This recording cannot show a gap: {why}.",
+        gap=Gap(nan, nan, nan, nan, (nan, nan)),
+        effects=(),
+        noise=(),
+        where=(),
+        untestable={},
+        minimum_detectable={},
+        next_manoeuvre="straight legs on several headings and at several speeds, with turns to both sides",
+        notes=tuple(notes),
+    )
 
 
 def _check_mountings(recordings: Sequence[Recording], rotation_dvl_from_body: Array) -> None:

@@ -93,8 +93,8 @@ class Fitter:
 
             span = 1e-3 * (high - low)
             found = least_squares(
-                left, np.clip(x0, low + span, high - span), bounds=(low, high), x_scale=1.0, diff_step=1e-3,
-                xtol=1e-6, ftol=1e-9, max_nfev=40,
+                left, np.clip(x0, low + span, high - span), bounds=(low, high), x_scale=1.0,
+                diff_step=[1e-3] * len(smooth), xtol=1e-6, ftol=1e-9, max_nfev=40,
             )  # fmt: skip
             for (effect, spec), value in zip(smooth, found.x, strict=True):
                 values[effect.name][spec.name] = float(value * spec.typical)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from ..calibration.frames import Array
+from ..effects.base import Needs
 from .noise import Noise
 from .problem import Problem
 
@@ -17,7 +18,7 @@ SIGNIFICANT = 1e-4
 
 @dataclass(frozen=True)
 class Level:
-    """log standard deviation = const + Σ slope · (covariate - mean). p: of all slopes together; each slope's is p_of."""
+    """log standard deviation = const + Σ slope · (covariate - mean). p: of all slopes together, p_of: of each."""
 
     names: tuple[str, ...]
     slopes: Array
@@ -28,18 +29,13 @@ class Level:
 
 def covariates(problem: Problem) -> dict[str, Array]:
     """(M,) each: speed m/s, turn rate rad/s where there is an IMU, log of the reported std where it varies."""
-    found = {"speed": _averaged(problem, [motion.speed for motion in problem.motions])}
-    if all(motion.angular_velocity is not None for motion in problem.motions):
-        rates = [np.linalg.norm(motion.turn_rate, axis=1) for motion in problem.motions]
-        found["turn_rate"] = _averaged(problem, rates)
+    found = {"speed": problem.sampled(lambda motion: motion.speed)}
+    if Needs.ANGULAR_VELOCITY in problem.available:
+        found["turn_rate"] = problem.sampled(lambda motion: np.linalg.norm(motion.turn_rate, axis=1))
     if all(recording.reported_variance is not None for recording in problem.recordings):
         reported = problem.joined([r.averaged(r.reported_variance.mean(axis=1)) for r in problem.recordings])  # type: ignore[union-attr]
         found["reported"] = 0.5 * np.log(np.maximum(reported, 1e-12))
     return {name: values for name, values in found.items() if np.std(values) > 1e-3 * max(1.0, abs(np.mean(values)))}
-
-
-def _averaged(problem: Problem, parts: list[Array]) -> Array:
-    return problem.joined([r.averaged(part[:: r.finer]) for r, part in zip(problem.recordings, parts, strict=True)])
 
 
 def fit_level(problem: Problem, innovations: Array) -> Level | None:
@@ -58,7 +54,7 @@ def fit_level(problem: Problem, innovations: Array) -> Level | None:
         result = GLM(square, with_constant, family=Gamma(links.Log())).fit(scale="X2")
     slopes, covariance = result.params[1:], result.cov_params()[1:, 1:]
     wald = float(slopes @ np.linalg.solve(covariance, slopes))
-    p_of = 2.0 * chi2.sf(slopes**2 / np.diag(covariance), 1) / 2.0
+    p_of = chi2.sf(slopes**2 / np.diag(covariance), 1)
     level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
     return Level(tuple(found), 0.5 * slopes, float(chi2.sf(wald, len(slopes))), p_of, level)
 

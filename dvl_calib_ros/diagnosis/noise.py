@@ -6,6 +6,7 @@ to the reference. The level may grow with speed, turn rate and acceleration. Eve
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -124,7 +125,7 @@ def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:
         steps = np.diff(time)
         limit = 3.0 * float(np.median(steps)) if len(steps) else 0.0
         edges = [0, *(np.flatnonzero(steps > limit) + 1).tolist(), len(time)]
-        parts += [slice(begin + a, begin + b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        parts += [slice(begin + a, begin + b) for a, b in itertools.pairwise(edges)]
         begin += len(time)
     return tuple(parts)
 
@@ -145,7 +146,7 @@ def _fit_arma(
     best, best_bic = None, np.inf
     for p, q in orders:
         if p + q == 0:
-            candidates = [np.zeros(0)]
+            candidates: list[Array] = [np.zeros(0)]
         else:
             starts = [_encoded(start, q)] if start is not None else [_start(p, q, value) for value in _STARTS]
             candidates = [_fitted(series, segments, p, at) for at in starts]

@@ -58,7 +58,7 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
 def _outliers(innovations: Array) -> NoiseFinding | None:
     scale = 1.4826 * np.median(np.abs(innovations), axis=0)
     far = (np.abs(innovations) > OUTLIER_SIGMA * scale).any(axis=1)
-    count, n = int(far.sum()), len(far)
+    count, n = int(np.count_nonzero(far)), len(innovations)
     if count < 3:
         return None
     test = binomtest(count, n, 6.0 * norm.sf(OUTLIER_SIGMA), "greater")
@@ -103,8 +103,8 @@ def _inflation(problem: Problem, raw: Array, innovations: Array, noise: Noise) -
         error = 0.8 / np.sqrt(raw.size)
         if ratio > INFLATION:
             p = float(2.0 * norm.sf(np.log(ratio) / error))
-            interval = ratio * np.exp(-1.96 * error), ratio * np.exp(1.96 * error)
-            found.append(NoiseFinding("noise_inflation", {"factor": (float(ratio), *map(float, interval))}, p))
+            low, high = float(ratio * np.exp(-1.96 * error)), float(ratio * np.exp(1.96 * error))
+            found.append(NoiseFinding("noise_inflation", {"factor": (float(ratio), low, high)}, p))
     level = fit_level(problem, innovations * noise.level)
     if level is not None and level.p < SIGNIFICANT:
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps", "reported": "log_per_log_reported"}

@@ -11,11 +11,12 @@ estimates towards zero (errors in variables).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import convolve
 from scipy.spatial.transform import Rotation, Slerp
@@ -103,10 +104,10 @@ class Problem:
         time = recording.time
         fine = _finer(time, recording.finer)
         rotation = rate = None
-        if Needs.ATTITUDE in self.available:
+        if Needs.ATTITUDE in self.available and recording.rotation_enu_from_body is not None:
             attitude = Rotation.from_matrix(recording.rotation_enu_from_body)
             rotation = Slerp(time, attitude)(fine).as_matrix()
-        if Needs.ANGULAR_VELOCITY in self.available:
+        if Needs.ANGULAR_VELOCITY in self.available and recording.angular_velocity is not None:
             rate = make_interp_spline(time, recording.angular_velocity, k=1)(fine)
         return EffectInput(
             time=fine,
@@ -160,6 +161,12 @@ class Problem:
         matrix = self.calibration.body_from_measured @ self.calibration.rotation_dvl_from_body
         return [trace @ matrix.T for trace in traces]
 
+    def sampled(self, of: Callable[[EffectInput], Array]) -> Array:
+        """A function of the motion (N, ...) at the M samples."""
+        return self.joined(
+            [r.averaged(of(motion)[:: r.finer]) for r, motion in zip(self.recordings, self.motions, strict=True)]
+        )
+
     @staticmethod
     def joined(parts: Sequence[Array]) -> Array:
         """One array of what there is for every recording."""
@@ -179,7 +186,7 @@ class Problem:
         return self.joined(parts)
 
     @cached_property
-    def recording_of(self) -> Array:
+    def recording_of(self) -> NDArray[np.intp]:
         """(M,) index of the recording that a sample belongs to."""
         return np.repeat(np.arange(len(self.recordings)), [len(r.bin_time) for r in self.recordings])
 
@@ -215,8 +222,9 @@ def _robust_step(problem: Problem) -> Array:
     return np.asarray(x)
 
 
-def _middles(recording: Recording) -> Array:
-    return (recording.bins[:-1] + recording.bins[1:] - 1) // 2
+def _middles(recording: Recording) -> NDArray[np.intp]:
+    middles: NDArray[np.intp] = (recording.bins[:-1] + recording.bins[1:] - 1) // 2
+    return middles
 
 
 def _from_neighbours(time: Array, velocity: Array, own: int) -> Array:
@@ -247,15 +255,15 @@ def _interpolation_error(recording: Recording, velocity_body: Array) -> Array:
     around = recording.reference_around
     if around is None or len(recording.time) < 4:
         return np.zeros_like(velocity_body)
-    time, rotation = recording.time, recording.rotation_enu_from_body
-    turns = recording.reference_frame is not VelocityFrame.BODY and rotation is not None
-    velocity = np.einsum("nij,nj->ni", rotation, velocity_body) if turns else velocity_body
+    time = recording.time
+    rotation = None if recording.reference_frame is VelocityFrame.BODY else recording.rotation_enu_from_body
+    velocity = velocity_body if rotation is None else np.einsum("nij,nj->ni", rotation, velocity_body)
     curve = make_interp_spline(time, velocity, k=3)
     before = np.clip(time - around[:, 0], time[0], time[-1])
     after = np.clip(time + around[:, 1], time[0], time[-1])
     share = np.divide(time - before, after - before, out=np.zeros_like(time), where=after > before)[:, None]
     error: Array = (1.0 - share) * curve(before) + share * curve(after) - velocity
-    return np.einsum("nji,nj->ni", rotation, error) if turns else error
+    return error if rotation is None else np.einsum("nji,nj->ni", rotation, error)
 
 
 def _finer(time: Array, every: int) -> Array:

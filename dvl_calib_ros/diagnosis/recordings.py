@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +31,14 @@ MIN_ORIENTED_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording, N samples in order of time.
+    """One recording, N samples in order of time, which are averaged to M before hypotheses are tested.
 
     name: of the bag. time: (N,) s since its first sample. velocity_dvl: (N, 3) m/s, DVL frame, at the reference point.
-    reference_body: (N, 3) m/s. reported_variance: (N, 3) (m/s)² of the difference, DVL frame, or None where the
-    messages give none. rotation_enu_from_body: (N, 3, 3) and angular_velocity: (N, 3) rad/s, body, or None.
-    reference_around: (N, 2) s, as in `Observations`. reference_frame: in which the reference was recorded. bins: (M + 1,) where the groups of samples begin and end that
-    are averaged before hypotheses are tested.
+    reference_body: (N, 3) m/s. bins: (M + 1,) where the groups of samples begin and end that are averaged.
+    reported_variance: (N, 3) (m/s)² of the difference, DVL frame, or None where the messages give none.
+    rotation_enu_from_body: (N, 3, 3) and angular_velocity: (N, 3) rad/s, body, or None. reference_around: (N, 2) s, as
+    in `Observations`. reference_frame: in which the reference was recorded. repeats: of `received` DVL samples, how
+    many have the very velocity of the one before.
     """
 
     name: str
@@ -62,9 +64,7 @@ class Recording:
         """Means (M, ...) of values (N, ...) over the bins."""
         if len(self.bins) == len(values) + 1:
             return values
-        counts = np.diff(self.bins).reshape(-1, *[1] * (values.ndim - 1))
-        mean: Array = np.add.reduceat(values, self.bins[:-1], axis=0) / counts
-        return mean
+        return _means(values, self.bins)
 
     @property
     def every(self) -> int:
@@ -107,29 +107,37 @@ def make_recording(
     """A recording, thinned by averaging to rates that the diagnosis needs. reference_rate: Hz, of its own samples."""
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     received, repeats = len(time), int((np.diff(velocity_dvl, axis=0) == 0.0).all(axis=1).sum())
-    fields = {
-        "velocity_dvl": velocity_dvl, "reference_body": reference_body, "reported_variance": reported_variance,
-        "rotation_enu_from_body": rotation_enu_from_body, "angular_velocity": angular_velocity,
-        "reference_around": reference_around,
-    }  # fmt: skip
     thin = _bins(time, interval, MAX_RATE_HZ)
     if len(thin) < len(time) + 1:
-        counts = np.diff(thin)
-        for key, values in fields.items():
-            if values is not None:
-                sums = np.add.reduceat(values, thin[:-1], axis=0)
-                fields[key] = sums / counts.reshape(-1, *[1] * (values.ndim - 1))
-        if (variance := fields["reported_variance"]) is not None:
-            fields["reported_variance"] = variance / counts[:, None]
-        if (rotation := fields["rotation_enu_from_body"]) is not None:
-            u, _, vt = np.linalg.svd(rotation)  # the mean of rotations, back on the rotations
-            fields["rotation_enu_from_body"] = u @ vt
-        time = np.add.reduceat(time, thin[:-1]) / counts
+        time, velocity_dvl, reference_body = (_means(each, thin) for each in (time, velocity_dvl, reference_body))
+        if reported_variance is not None:
+            reported_variance = _means(reported_variance, thin) / np.diff(thin)[:, None]
+        if rotation_enu_from_body is not None:
+            u, _, vt = np.linalg.svd(_means(rotation_enu_from_body, thin))  # the mean, back on the rotations
+            rotation_enu_from_body = u @ vt
+        angular_velocity = None if angular_velocity is None else _means(angular_velocity, thin)
+        reference_around = None if reference_around is None else _means(reference_around, thin)
         interval = float(np.median(np.diff(time)))
-    bins = _bins(time, interval, min(MAX_TEST_RATE_HZ, reference_rate))
     return Recording(
-        name=name, time=time, bins=bins, reference_frame=reference_frame, repeats=repeats, received=received, **fields
-    )  # type: ignore[arg-type]
+        name=name,
+        time=time,
+        velocity_dvl=velocity_dvl,
+        reference_body=reference_body,
+        bins=_bins(time, interval, min(MAX_TEST_RATE_HZ, reference_rate)),
+        reported_variance=reported_variance,
+        rotation_enu_from_body=rotation_enu_from_body,
+        angular_velocity=angular_velocity,
+        reference_around=reference_around,
+        reference_frame=reference_frame,
+        repeats=repeats,
+        received=received,
+    )
+
+
+def _means(values: Array, bins: NDArray[np.intp]) -> Array:
+    counts = np.diff(bins).reshape(-1, *[1] * (values.ndim - 1))
+    mean: Array = np.add.reduceat(values, bins[:-1], axis=0) / counts
+    return mean
 
 
 def _bins(time: Array, interval: float, rate: float) -> NDArray[np.intp]:
@@ -146,8 +154,8 @@ class _Collector:
     """Keeps what `Calibrator.on_block` tells: paired blocks, and oriented blocks to be joined to them by stamp."""
 
     def __init__(self) -> None:
-        self._paired: list[tuple[Array, ...]] = []
-        self._oriented: list[tuple[Array, Array, Array]] = []
+        self._paired: list[tuple[NDArray[Any], ...]] = []
+        self._oriented: list[tuple[NDArray[Any], ...]] = []
 
     @property
     def has_paired(self) -> bool:
@@ -233,7 +241,8 @@ def _load(
         lost = ", ".join(f"{value} {key}" for key, value in result.counts["reference"].items() if value)
         raise InputError(
             f"{path}: no DVL sample has a reference velocity at its time (reference: {lost}); do the stamps of "
-            f"{topics.dvl} and {topics.gnss} overlap, and is attitude on {topics.imu} for a reference in an earth frame?"
+            f"{topics.dvl} and {topics.gnss} overlap, and is attitude on {topics.imu} for a reference in an earth "
+            "frame?"
         )
     seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
     rate = received / seconds if seconds else np.inf

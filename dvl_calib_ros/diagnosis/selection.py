@@ -68,10 +68,10 @@ def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
     chosen: list[Effect] = []
     while len(chosen) < MAX_EFFECTS:
         tested = {name: added(fitter, fit, effect) for name, effect in effects.items() if effect not in chosen}
-        name, (log_p, found) = min(tested.items(), key=lambda item: item[1][0])
-        if log_p > threshold:
+        name = min(tested, key=lambda name: tested[name].log_p)
+        if tested[name].log_p > threshold:
             break
-        chosen, fit = _backward(fitter, [*chosen, effects[name]], found, threshold)
+        chosen, fit = _backward(fitter, [*chosen, effects[name]], tested[name].fit, threshold)
         fitter = Fitter(problem, _robust_about(fitter, fit, problem))
         base = fitter.fit_with_noise([], fit.noise, {})
         fit = fitter.fit_with_noise(chosen, fit.noise, fit.values)
@@ -81,8 +81,17 @@ def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
     return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter)
 
 
-def added(fitter: Fitter, fit: Fit, effect: Effect) -> tuple[float, Fit]:
-    """log p of an effect on top of a fit, and the fit with it."""
+@dataclass(frozen=True)
+class Tested:
+    """An effect tested on top of a fit: log p, the drop in deviance, and the fit with it."""
+
+    log_p: float
+    drop: float
+    fit: Fit
+
+
+def added(fitter: Fitter, fit: Fit, effect: Effect) -> Tested:
+    """Test an effect on top of a fit."""
     effects = [*fit.effects, effect]
     best: tuple[float, float, Fit] | None = None
     for start, tried in fitter.starts(effect):
@@ -92,13 +101,14 @@ def added(fitter: Fitter, fit: Fit, effect: Effect) -> tuple[float, Fit]:
             best = log_p, tried, trial
     assert best is not None
     log_p, tried, trial = best
+    drop = fit.deviance - trial.deviance
     if log_p < WORTH_A_LOOK:
         trial = fitter.fit_with_noise(effects, fit.noise, trial.values)
         # a better optimum of the noise must not count for the effect
         without = fitter.fit_with_noise(fit.effects, trial.noise, fit.values, rounds=1)
         drop = min(fit.deviance, without.deviance) - trial.deviance
         log_p = log_p_value(drop, trial.dof - fit.dof, tried)
-    return log_p, trial
+    return Tested(log_p, drop, trial)
 
 
 def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
@@ -117,21 +127,21 @@ def _backward(fitter: Fitter, chosen: list[Effect], fit: Fit, threshold: float) 
 
 
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
-    """Test an effect given all others, and every other effect in its place."""
+    """Test an effect given all others, and every other effect in its place.
+
+    One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
+    that fits worse could be if it needs fewer.
+    """
     rest = _without(fitter, fit, effect)
-    log_p, _ = _again(fitter, rest, effect, fit)
-    rivals = {
-        name: added(fitter, rest, other)[0]
-        for name, other in effects.items()
-        if all(other is not each for each in fit.effects)
-    }
-    ordered = sorted(rivals, key=lambda name: rivals[name])
-    return Selected(effect, log_p, tuple(name for name in ordered if rivals[name] - log_p < INDISTINGUISHABLE))
-
-
-def _again(fitter: Fitter, rest: Fit, effect: Effect, fit: Fit) -> tuple[float, Fit]:
-    tried = fitter.tried(effect, fit.values[effect.name])
-    return log_p_value(rest.deviance - fit.deviance, fit.dof - rest.dof, tried), fit
+    drop = rest.deviance - fit.deviance
+    log_p = log_p_value(drop, fit.dof - rest.dof, fitter.tried(effect, fit.values[effect.name]))
+    rivals = {name: added(fitter, rest, other) for name, other in effects.items() if other not in fit.effects}
+    equivalent = [
+        name
+        for name, rival in rivals.items()
+        if rival.log_p - log_p < INDISTINGUISHABLE or drop - rival.drop < 2.0 * INDISTINGUISHABLE
+    ]
+    return Selected(effect, log_p, tuple(sorted(equivalent, key=lambda name: rivals[name].log_p)))
 
 
 def _robust_about(fitter: Fitter, fit: Fit, problem: Problem) -> Array:
@@ -174,7 +184,8 @@ def relinearised(problem: Problem, fit: Fit) -> Problem:
     added = None
     if fit.effects:
         traces = [problem.traces(effect, fit.values[effect.name]) for effect in fit.effects if not on_reference(effect)]
-        added = tuple(map(sum, zip(*traces, strict=True))) if traces else None
+        if traces:
+            added = tuple(np.sum(parts, axis=0) for parts in zip(*traces, strict=True))
     return replace(problem, calibration=problem.calibration.changed(fit.change), added=added)
 
 

@@ -98,9 +98,9 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
         raw = _along_axes(functions)
         columns.append(raw)
         for block in _per_axis(raw):
-            tests.append((_log_p(q, noise.whiten(block), white, variance)[0], name))
+            tests.append((explained(q, noise.whiten(block), white, variance)[0], name))
     raw = np.concatenate(columns, axis=2)
-    log_p, energy = _log_p(q, noise.whiten(raw), white, variance)
+    log_p, energy = explained(q, noise.whiten(raw), white, variance)
     best, name = min(tests)
     best = best + np.log(len(tests) + 1)
     together = log_p + np.log(len(tests) + 1)
@@ -125,7 +125,7 @@ def _orthonormal(white: Array) -> Array:
     return u[:, s > INDEPENDENT]
 
 
-def _log_p(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
+def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
     """log p of what columns explain of a whitened series, and their energy beyond chance."""
     lengths = np.linalg.norm(white_columns, axis=0)
     left = white_columns - q @ (q.T @ white_columns)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from numpy.typing import NDArray
 
 from ..calibration.frames import Array
+from ..effects.base import Needs
 from .fitting import Fit, Fitter
+from .noise import Noise
 from .problem import Problem
+from .unexplained import explained
 
 LEVEL = 0.01
 TURNING_RADPS = np.deg2rad(2.0)
@@ -17,6 +21,7 @@ ACCELERATING_MPS2 = 0.05
 STRETCHES = 6
 BANDS_HZ = (0.0, 0.01, 0.05, 0.2, np.inf)
 ALL = "all"
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -31,20 +36,13 @@ class Place:
     p: float
 
 
-def regimes(problem: Problem) -> dict[str, Array]:
+def regimes(problem: Problem) -> dict[str, Mask]:
     """(M,) bool each: where the vehicle goes straight, turns, changes speed, is slow or fast (terciles)."""
-    speed, acceleration, rate = [], [], []
-    for recording, motion in zip(problem.recordings, problem.motions, strict=True):
-        every = recording.finer
-        speed.append(recording.averaged(motion.speed[::every]))
-        change = np.gradient(motion.velocity_body[:, 0], motion.time)
-        acceleration.append(recording.averaged(np.abs(change)[::every]))
-        if motion.angular_velocity is not None:
-            rate.append(recording.averaged(np.abs(motion.angular_velocity[:, 2])[::every]))
-    speeds = problem.joined(speed)
-    found = {"accelerating": problem.joined(acceleration) > ACCELERATING_MPS2}
-    if rate:
-        found["turning"] = problem.joined(rate) > TURNING_RADPS
+    speeds = problem.sampled(lambda motion: motion.speed)
+    change = problem.sampled(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
+    found = {"accelerating": np.abs(change) > ACCELERATING_MPS2}
+    if Needs.ANGULAR_VELOCITY in problem.available:
+        found["turning"] = np.abs(problem.sampled(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
         found["straight"] = ~found["turning"]
     slow, fast = np.quantile(speeds, [1 / 3, 2 / 3])
     if fast - slow > 0.1 * fast:
@@ -67,18 +65,19 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[Place]:
     white = noise.whiten(base.residual)
     q = np.linalg.qr(noise.whiten(problem.base))[0]
     white = white - q @ (q.T @ white)
+    functions = _simplest(problem)
     seconds = max(recording.seconds for recording in problem.recordings)
     nyquist = 0.5 / float(np.median(np.diff(problem.recordings[0].bin_time)))
     everywhere = np.ones(len(gap), dtype=bool)
     cells = [(axis, name, (0.0, seconds), mask) for name, mask in ({ALL: everywhere} | regimes(problem)).items()
              for axis in range(3)]  # fmt: skip
     edges = np.linspace(0.0, seconds, STRETCHES + 1)
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in itertools.pairwise(edges.tolist()):
         within = (problem.time >= start) & (problem.time <= end)
         cells += [(axis, ALL, (float(start), float(end)), within) for axis in range(3)]
     found: list[Place] = []
     for axis, name, segment, mask in cells:
-        p = _p_value(problem, noise.whiten, q, white, axis, mask)
+        p = float(np.exp(_log_p(noise, functions, q, white, axis, mask)))
         share = float((gap[mask, axis] ** 2).sum()) / total
         found.append(Place("xyz"[axis], name, segment, (0.0, nyquist), share, p))
         if name == ALL and segment == (0.0, seconds):
@@ -107,33 +106,20 @@ def _signal(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> Array:
     return np.asarray(raw @ solution)
 
 
-def _p_value(problem: Problem, whiten, q: Array, white: Array, axis: int, mask: Array) -> float:  # type: ignore[no-untyped-def]
-    """Chi-square of what the simplest functions of motion, within the place, explain of the whitened residual."""
-    functions = [np.ones(len(mask))]
-    motion = problem.joined(
-        [r.averaged(m.speed[:: r.finer]) for r, m in zip(problem.recordings, problem.motions, strict=True)]
-    )
-    functions.append(motion)
-    if all(m.angular_velocity is not None for m in problem.motions):
-        functions.append(
-            problem.joined(
-                [
-                    r.averaged(m.turn_rate[:: r.finer, 2])
-                    for r, m in zip(problem.recordings, problem.motions, strict=True)
-                ]
-            )
-        )
-    columns = np.zeros((len(mask), 3, len(functions)))
-    columns[mask, axis] = np.column_stack(functions)[mask]
-    a = whiten(columns)
-    lengths = np.linalg.norm(a, axis=0)
-    a = a - q @ (q.T @ a)
-    keep = np.linalg.norm(a, axis=0) > 0.02 * np.maximum(lengths, 1e-300)
-    if not keep.any():
-        return 1.0
-    u, s, _ = np.linalg.svd(a[:, keep] / lengths[keep], full_matrices=False)
-    u = u[:, s > 1e-3]
-    return float(chi2.sf(float(np.sum((u.T @ white) ** 2)), u.shape[1]))
+def _simplest(problem: Problem) -> Array:
+    """(M, c): one, speed, and turn rate where it is known."""
+    speed = problem.sampled(lambda motion: motion.speed)
+    functions = [np.ones_like(speed), speed]
+    if Needs.ANGULAR_VELOCITY in problem.available:
+        functions.append(problem.sampled(lambda motion: motion.turn_rate[:, 2]))
+    return np.column_stack(functions)
+
+
+def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, mask: Mask) -> float:
+    """log p of what functions of motion (M, c), within a place, explain of the whitened residual."""
+    columns = np.zeros((len(mask), 3, functions.shape[1]))
+    columns[mask, axis] = functions[mask]
+    return explained(q, noise.whiten(columns), white, 1.0)[0]
 
 
 def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:
@@ -142,6 +128,6 @@ def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:
     total = max(float(energy.sum()), 1e-300)
     return [
         (low, high, float((gap**2).sum()) * float(energy[(frequency >= low) & (frequency < high)].sum()) / total)
-        for low, high in zip(BANDS_HZ[:-1], BANDS_HZ[1:], strict=True)
+        for low, high in itertools.pairwise(BANDS_HZ)
         if low < nyquist
     ]
