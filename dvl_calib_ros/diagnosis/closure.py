@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from .problem import PRIOR_STD, Problem
 BLOCK_S = 20.0
 FOLDS = 5
 RESAMPLES = 1000
-Integers = NDArray[np.integer[Any]]
+Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -62,9 +61,10 @@ class HeldOut:
 
     def squares(self) -> tuple[Array, Array, Array]:
         """Squares of before, after and floor summed over each block (B,), (m/s)²."""
-        parts = (self.before**2, self.after**2, self.floor)
-        before, after, floor = (np.asarray(np.bincount(self.block, part.sum(axis=1))) for part in parts)
-        return before, after, floor
+        return self._summed(self.before**2), self._summed(self.after**2), self._summed(self.floor)
+
+    def _summed(self, squares: Array) -> Array:
+        return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
 def held_out(fitter: Fitter, fit: Fit, dictionary: Array) -> HeldOut:

@@ -18,7 +18,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
-from scipy.signal import convolve
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.frames import Array, skew
@@ -32,7 +31,7 @@ Values = Mapping[str, float]
 # scale of sway and heave: else these would take in much of a lever arm. Std of φ (rad) and δk
 PRIOR_STD: Array = np.array([0.1] * 3 + [0.02] * 3)
 # The velocity at a time is told by samples that are this far away: delays within it do not bring its own noise back
-OWN_S, NEIGHBOURS_S = 0.6, 1.6
+OWN_S, NEIGHBOURS_S = 0.6, 4.0
 _ITERATIONS = 6
 
 
@@ -125,8 +124,8 @@ class Problem:
         parts = []
         for recording in self.recordings:
             velocity = recording.velocity_dvl @ matrix
-            reference = recording.reference_body - _interpolation_error(recording, velocity)
-            parts.append(recording.averaged(velocity - reference))
+            cut_off = _cut_off(recording, velocity)
+            parts.append(recording.averaged(velocity - recording.reference_body + cut_off))
         return self.joined(parts)
 
     @cached_property
@@ -228,33 +227,55 @@ def _middles(recording: Recording) -> NDArray[np.intp]:
 
 
 def _from_neighbours(time: Array, velocity: Array, own: int) -> Array:
-    """Velocity (N, 3) of each sample as those around it tell, `own` or more samples away.
+    """Velocity (N, 3) of each sample as those around it tell best, `own` or more samples away; raw at ends.
 
-    The parabola through those nearby, fitted by least squares; raw at the ends of a stretch.
+    The symmetric filter that predicts a sample from its neighbours with the least error, fitted to the samples
+    themselves: their noise is no help in it, so it passes what the vehicle does, waves and turns, and little else.
     """
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     own = max(own, 2, int(np.ceil(OWN_S / interval)))
-    half = max(own + 1, round(NEIGHBOURS_S / interval))
-    offset = np.arange(-half, half + 1)
-    used = np.abs(offset) >= own
-    weights = np.zeros(len(offset))
-    weights[used] = np.linalg.pinv(np.vander(offset[used], 3))[2]
+    reach = max(own + 3, round(NEIGHBOURS_S / interval))
+    stretches = [part for part in segments_of([time]) if part.stop - part.start > 2 * reach]
     out = velocity.copy()
-    for part in segments_of([time]):
-        if part.stop - part.start > 2 * half:
-            inner = convolve(velocity[part], weights[:, None], mode="valid")
-            out[part.start + half : part.stop - half] = inner
+    if not stretches:
+        return out
+    for axis in range(3):
+        series = [velocity[part, axis] for part in stretches]
+        mean = float(np.mean(np.concatenate(series)))
+        pairs = [_pairs_around(one - mean, own, reach) for one in series]
+        middle = np.concatenate([one[reach:-reach] - mean for one in series])
+        around = np.concatenate(pairs)
+        weights = np.linalg.lstsq(around, middle, rcond=1e-6)[0]
+        for part, pair in zip(stretches, pairs, strict=True):
+            out[part.start + reach : part.stop - reach, axis] = mean + pair @ weights
     return out
 
 
-def _interpolation_error(recording: Recording, velocity_body: Array) -> Array:
+def _pairs_around(series: Array, own: int, reach: int) -> Array:
+    """(N - 2 reach, reach - own + 1): for each sample but the outermost, means of the two k before and after it."""
+    n = len(series)
+    pairs = [series[reach - k : n - reach - k] + series[reach + k : n - reach + k] for k in range(own, reach + 1)]
+    return 0.5 * np.column_stack(pairs)
+
+
+def _cut_off(recording: Recording, velocity_body: Array) -> Array:
     """(N, 3) m/s: what a straight line between two reference samples cuts off turns and waves.
 
-    It is known, because the DVL says how the velocity (N, 3) went between them.
+    The DVL says how the velocity (N, 3) went between them, with its noise, which is worth it only if that is smaller
+    than what is cut off: it would be in the residual several times over.
     """
     around = recording.reference_around
-    if around is None or len(recording.time) < 4:
+    if around is None or not around.any() or len(recording.time) < 4:
         return np.zeros_like(velocity_body)
+    smooth = _from_neighbours(recording.time, velocity_body, 1)
+    noise = 1.4826 * np.median(np.abs(velocity_body - smooth), axis=0)
+    size = np.sqrt(np.mean(_straight_line_error(recording, around, smooth) ** 2, axis=0))
+    if np.linalg.norm(size) < np.linalg.norm(noise):
+        return np.zeros_like(velocity_body)
+    return _straight_line_error(recording, around, velocity_body)
+
+
+def _straight_line_error(recording: Recording, around: Array, velocity_body: Array) -> Array:
     time = recording.time
     rotation = None if recording.reference_frame is VelocityFrame.BODY else recording.rotation_enu_from_body
     velocity = velocity_body if rotation is None else np.einsum("nij,nj->ni", rotation, velocity_body)

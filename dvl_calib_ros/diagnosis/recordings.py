@@ -142,7 +142,7 @@ def _means(values: Array, bins: NDArray[np.intp]) -> Array:
 
 def _bins(time: Array, interval: float, rate: float) -> NDArray[np.intp]:
     """Where groups begin (and the last ends) whose means come at no more than a rate, or at the samples' own rate."""
-    every = round(1.0 / (rate * interval))
+    every = int(np.ceil(1.0 / (rate * interval) - 0.05))
     if every <= 1:
         return np.arange(len(time) + 1)
     index = np.floor((time - time[0]) / (every * interval) + 1e-6)
