@@ -49,7 +49,7 @@ def explanation(fitter: Fitter, fit: Fit) -> Explanation:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutResiduals:
     """before, after: residuals (M, 3) m/s of calibrations without and with the effects that have not seen them.
     floor: (M, 3) (m/s)², the square of the noise in both. block: (M,) index, for resampling.
     """
@@ -67,7 +67,7 @@ class HeldOut:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
-def held_out(fitter: Fitter, fit: Fit, dictionary: Array) -> HeldOut:
+def held_out(fitter: Fitter, fit: Fit, dictionary: Array) -> HeldOutResiduals:
     """What is left before and after the effects of a fit, on held-out data.
 
     Calibration and effects are fitted on all folds but one and judged on that. The noise floor is what is left by
@@ -89,7 +89,7 @@ def held_out(fitter: Fitter, fit: Fit, dictionary: Array) -> HeldOut:
         np.concatenate([full.prior, np.full(dictionary.shape[2], 1e-3)]),
     )
     floor = _floor(everything, noise.whiten(everything.columns), noise.whiten(everything.series))
-    return HeldOut(before, after, floor, block)
+    return HeldOutResiduals(before, after, floor, block)
 
 
 def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
-from .closure import HeldOut, held_out
+from .closure import HeldOutResiduals, held_out
 from .fitting import Fit, Fitter
 from .unexplained import Unexplained
 from .where import regimes
@@ -29,7 +29,7 @@ class DiagnosisSeries:
     recording_of: NDArray[np.intp]
     time: Array
     segments: tuple[slice, ...]
-    held_out: HeldOut
+    held_out: HeldOutResiduals
     regimes: Mapping[str, NDArray[np.bool_]]
     traces: Mapping[str, Array]
     phi: Array

@@ -220,10 +220,10 @@ def _detectable_table(d: Diagnosis) -> Table:
             spec = specs.get(parameter)
             unit = "" if spec is None else f" {spec.unit}"
             worth = "–" if spec is None else f"{spec.typical:g}{unit}"
-            kind = "" if spec is None else "good" if size <= spec.typical else "far"
+            kind = "text" if spec is None else "text good" if size <= spec.typical else "text far"
             rows.append((name if i == 0 else "", Cell(f"{parameter} {_three(size)}{unit}", kind), worth))
     return Table(
-        ("effect", "smallest size found", "worth knowing of"),
+        ("effect", Cell("smallest size found", "text"), "worth knowing of"),
         rows,
         notes=(
             "The size that this data would show four times in five at the level of the tests; green where that is no "
@@ -326,7 +326,8 @@ def _regimes(series: DiagnosisSeries, residuals: Mapping[str, Array]) -> Picture
     )
     return picture(
         "Gap by regime of motion", alt, figures.gap_bars, names, gaps,
-        caption="Held out. Slow and fast: the lowest and the highest third of the speeds.",
+        caption="Held out."
+        + (" Slow and fast: the lowest and the highest third of the speeds." if "slow" in series.regimes else ""),
     )  # fmt: skip
 
 
