@@ -21,7 +21,7 @@ from .noise_findings import noise_findings
 from .problem import PRIOR_STD, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
-from .selection import LEVEL, Selected, Selection, refined, robust_fitter, select
+from .selection import LEVEL, Selected, Selection, refined, select
 from .series import collect_series
 from .unexplained import Unexplained, unexplained
 from .where import places
@@ -31,9 +31,9 @@ __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 # Fewer samples or less time than this say nothing
 MIN_SAMPLES, MIN_SECONDS = 60, 60.0
 # An effect could have been seen if one of its parameters could at so many times its typical size ...
-VISIBLE_TIMES_TYPICAL = 5.0
+VISIBLE_TIMES_TYPICAL = 3.0
 # ... and a recording can only be cleared if that share of the effects could have been seen
-MIN_VISIBLE_SHARE = 1.0 / 3.0
+MIN_VISIBLE_SHARE = 0.5
 # The rest, as a share of the gap, from which a combination of effects does not explain it
 UNEXPLAINED_SHARE = 0.25
 POWER = 0.8
@@ -79,6 +79,11 @@ def diagnose_recordings(
     selection = _about_its_answer(select(problem, testable))
     rest = unexplained(selection.fitter, selection.fit)
     gap = measure_gap(selection.fitter, selection.fit, rest.columns)
+    if selection.selected and not gap.after < gap.before:
+        # what does not shrink the error on held-out data is no explanation, however unlikely it is to be chance
+        selection = selection.withdrawn()
+        rest = unexplained(selection.fitter, selection.fit)
+        gap = measure_gap(selection.fitter, selection.fit, rest.columns)
     detectable = {
         name: _minimum_detectable(selection.fitter, selection.fit, effect, len(testable))
         for name, effect in testable.items()
@@ -164,7 +169,7 @@ def _check_mountings(recordings: Sequence[Recording], rotation_dvl_from_body: Ar
 
 def _about_its_answer(selection: Selection) -> Selection:
     """The selection with the problem made linear about its calibration, and the times of its effects made fine."""
-    fitter, fit = robust_fitter(selection)
+    fitter, fit = selection.fitter, selection.fit
     for each in selection.selected:
         fit = refined(fitter, fit, each.effect)
     base = fitter.fit([], fit.noise, {})

@@ -18,6 +18,8 @@ from ..calibration.frames import Array
 
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)
 HUBER = 2.5
+# Time constant, s, of the slowest noise of a receiver; an effect that comes and goes within a run is slower
+LONGEST_S = 40.0
 ORDERS = ((0, 0), (1, 0), (1, 1), (2, 1), (3, 1))
 _STARTS = (0.0, 0.9)
 
@@ -50,13 +52,15 @@ class Noise:
     """Noise of M samples on three axes.
 
     segments: the stretches without a gap. rotation: (M, 3, 3), frame of the noise from body, None if it is the body.
-    level: (M, 3), relative standard deviation. axes: one ARMA each.
+    level: (M, 3), relative standard deviation. axes: one ARMA each. memory: largest partial autocorrelation: what lasts
+    longer than that is no noise.
     """
 
     segments: tuple[slice, ...]
     rotation: Array | None
     level: Array
     axes: tuple[Arma, ...]
+    memory: float = 0.998
 
     def whiten(self, values: Array) -> Array:
         """Body-frame values (M, 3, ...) as white noise of unit variance would be, flattened to (3 M, ...)."""
@@ -85,7 +89,9 @@ class Noise:
     def refitted(self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS) -> Noise:
         """The same with the ARMA of each axis fitted to a residual (M, 3), of the order that BIC takes."""
         scaled = self._scaled(residual)
-        return replace(self, axes=tuple(_fit_arma(scaled[:, axis], self.segments, orders) for axis in range(3)))
+        return replace(
+            self, axes=tuple(_fit_arma(scaled[:, axis], self.segments, self.memory, orders) for axis in range(3))
+        )
 
     def updated(self, residual: Array) -> Noise:
         """`refitted` at the orders as they are."""
@@ -93,10 +99,30 @@ class Noise:
         return replace(
             self,
             axes=tuple(
-                _fit_arma(scaled[:, axis], self.segments, [(len(arma.ar), int(arma.ma != 0.0))], arma)
+                _fit_arma(scaled[:, axis], self.segments, self.memory, [(len(arma.ar), int(arma.ma != 0.0))], arma)
                 for axis, arma in enumerate(self.axes)
             ),
         )
+
+    @property
+    def is_coloured(self) -> bool:
+        """Whether any axis is more than white."""
+        return any(arma.ratio > 1.0 for arma in self.axes)
+
+    @property
+    def white(self) -> Noise:
+        """The same, as large but white."""
+        axes = tuple(Arma(np.zeros(0), 0.0, arma.std * arma.ratio, 1.0) for arma in self.axes)
+        return replace(self, axes=axes)
+
+    def like(self, residual: Array) -> Noise:
+        """`refitted` at the orders as they are, from scratch."""
+        scaled = self._scaled(residual)
+        axes = tuple(
+            _fit_arma(scaled[:, axis], self.segments, self.memory, [(len(arma.ar), int(arma.ma != 0.0))])
+            for axis, arma in enumerate(self.axes)
+        )
+        return replace(self, axes=axes)
 
     def deviance(self, residual: Array) -> float:
         """-2 log likelihood of a residual (M, 3), but for a constant."""
@@ -130,16 +156,20 @@ def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:
     return tuple(parts)
 
 
-def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None) -> Noise:
-    """White noise with the standard deviation per axis that a residual (M, 3) has, robustly."""
+def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:
+    """White noise with the standard deviation per axis that a residual (M, 3) has, robustly. interval: s."""
     scaled = residual if rotation is None else np.einsum("mij,mj->mi", rotation, residual)
     stds = np.maximum(1.4826 * np.median(np.abs(scaled), axis=0), 1e-9)
     axes = tuple(Arma(np.zeros(0), 0.0, float(std), 1.0) for std in stds)
-    return Noise(segments, rotation, np.ones_like(residual), axes)
+    return Noise(segments, rotation, np.ones_like(residual), axes, float(np.exp(-interval / LONGEST_S)))
 
 
 def _fit_arma(
-    series: Array, segments: Sequence[slice], orders: Sequence[tuple[int, int]], start: Arma | None = None
+    series: Array,
+    segments: Sequence[slice],
+    memory: float,
+    orders: Sequence[tuple[int, int]],
+    start: Arma | None = None,
 ) -> Arma:
     """ARMA of the order with the smallest BIC, by conditional least squares."""
     n = len(series)
@@ -149,7 +179,7 @@ def _fit_arma(
             candidates: list[Array] = [np.zeros(0)]
         else:
             starts = [_encoded(start, q)] if start is not None else [_start(p, q, value) for value in _STARTS]
-            candidates = [_fitted(series, segments, p, at) for at in starts]
+            candidates = [_fitted(series, segments, memory, p, at) for at in starts]
         for encoded in candidates:
             ar, ma = _decoded(encoded, p)
             squares = float(np.mean(_innovations(series, segments, ar, ma) ** 2))
@@ -161,13 +191,15 @@ def _fit_arma(
     return best
 
 
-def _fitted(series: Array, segments: Sequence[slice], p: int, start: Array) -> Array:
+def _fitted(series: Array, segments: Sequence[slice], memory: float, p: int, start: Array) -> Array:
     std = float(np.std(series)) or 1.0
+    bound = float(np.arctanh(memory))
+    start = np.clip(start, -0.999 * bound, 0.999 * bound)
 
     def residual(encoded: Array) -> Array:
         return _innovations(series, segments, *_decoded(encoded, p)) / std
 
-    return np.asarray(least_squares(residual, start, xtol=1e-4, ftol=1e-6, max_nfev=25, bounds=(-3.5, 3.5)).x)
+    return np.asarray(least_squares(residual, start, xtol=1e-4, ftol=1e-6, max_nfev=25, bounds=(-bound, bound)).x)
 
 
 def _innovations(series: Array, segments: Sequence[slice], ar: Array, ma: float) -> Array:

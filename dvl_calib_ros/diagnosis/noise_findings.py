@@ -82,8 +82,10 @@ def _coloured(noise: Noise, residual: Array, problem: Problem) -> NoiseFinding |
     drop = noise.refitted(residual, [(0, 0)]).deviance(residual) - noise.deviance(residual)
     dof = sum(len(arma.ar) + (arma.ma != 0.0) for arma in noise.axes)
     clearest = max(noise.axes, key=lambda arma: arma.ratio)
-    interval = float(np.median(np.concatenate([np.diff(r.bin_time) for r in problem.recordings])))
+    interval = problem.interval
     constant = _time_constant(clearest, interval)
+    if constant < 2.0 * interval:
+        return None  # neighbours share samples of the reference, which is the pairing's doing
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
     parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
     return NoiseFinding("coloured_reference_noise", parameters, float(chi2.sf(max(drop, 0.0), dof)))

@@ -33,6 +33,7 @@ PRIOR_STD: Array = np.array([0.1] * 3 + [0.02] * 3)
 # The velocity at a time is told by samples that are this far away: delays within it do not bring its own noise back
 OWN_S, NEIGHBOURS_S = 0.6, 4.0
 _ITERATIONS = 6
+SHAKES = 2
 
 
 @dataclass(frozen=True)
@@ -66,12 +67,13 @@ class Problem:
     """Recordings seen with a calibration. M is the number of averaged samples of all of them.
 
     added: per recording (N, 3) m/s in the body frame, traces that are known to be in the DVL velocity: the motion is
-    made without them.
+    made without them. shake: per recording (N, 3) m/s, added to the motion.
     """
 
     recordings: tuple[Recording, ...]
     calibration: Calibration
     added: tuple[Array, ...] | None = None
+    shake: tuple[Array, ...] | None = None
 
     @cached_property
     def available(self) -> frozenset[Needs]:
@@ -94,10 +96,38 @@ class Problem:
         velocities = [recording.velocity_dvl @ matrix for recording in self.recordings]
         if self.added is not None:
             velocities = [velocity - added for velocity, added in zip(velocities, self.added, strict=True)]
-        return tuple(
-            _from_neighbours(recording.time, velocity, recording.every)
+        predicted = [
+            predict(velocity) for predict, velocity in zip(self._predictors(velocities), velocities, strict=True)
+        ]
+        if self.shake is not None:
+            predicted = [one + shake for one, shake in zip(predicted, self.shake, strict=True)]
+        return tuple(predicted)
+
+    def _predictors(self, velocities: Sequence[Array]) -> list[_Predictor]:
+        return [
+            _Predictor.fitted(recording.time, velocity, recording.every)
             for recording, velocity in zip(self.recordings, velocities, strict=True)
-        )
+        ]
+
+    @cached_property
+    def shaken(self) -> tuple[tuple[Array, Problem], ...]:
+        """Noise like the DVL's, made up, as it is in the residual (M, 3), and the problem with it in the motion.
+
+        What noise that is in both can seem to explain of itself (`selection.own_doing`).
+        """
+        rng = np.random.default_rng(0)
+        matrix = self.calibration.body_from_measured.T
+        predictors = self._predictors([recording.velocity_dvl @ matrix for recording in self.recordings])
+        made_up = []
+        for _ in range(SHAKES):
+            noise = [
+                predict.std * rng.standard_normal((len(r.time), 3))
+                for predict, r in zip(predictors, self.recordings, strict=True)
+            ]
+            seen = tuple(predict(one, np.zeros(3)) for predict, one in zip(predictors, noise, strict=True))
+            in_residual = self.joined([r.averaged(one) for r, one in zip(self.recordings, noise, strict=True)])
+            made_up.append((in_residual, replace(self, shake=seen)))
+        return tuple(made_up)
 
     def _motion(self, recording: Recording, velocity: Array) -> EffectInput:
         time = recording.time
@@ -185,6 +215,11 @@ class Problem:
         return self.joined(parts)
 
     @cached_property
+    def interval(self) -> float:
+        """Median time, s, between neighbours of the M samples."""
+        return float(np.median(np.concatenate([np.diff(recording.bin_time) for recording in self.recordings])))
+
+    @cached_property
     def recording_of(self) -> NDArray[np.intp]:
         """(M,) index of the recording that a sample belongs to."""
         return np.repeat(np.arange(len(self.recordings)), [len(r.bin_time) for r in self.recordings])
@@ -226,29 +261,48 @@ def _middles(recording: Recording) -> NDArray[np.intp]:
     return middles
 
 
-def _from_neighbours(time: Array, velocity: Array, own: int) -> Array:
-    """Velocity (N, 3) of each sample as those around it tell best, `own` or more samples away; raw at ends.
+@dataclass(frozen=True)
+class _Predictor:
+    """Velocity of each sample as those around it tell best, `own` to `reach` samples away.
 
     The symmetric filter that predicts a sample from its neighbours with the least error, fitted to the samples
     themselves: their noise is no help in it, so it passes what the vehicle does, waves and turns, and little else.
+    weights: (3, reach - own + 1), per axis. mean: (3,) m/s. std: (3,) m/s, of what it does not predict.
     """
-    interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    own = max(own, 2, int(np.ceil(OWN_S / interval)))
-    reach = max(own + 3, round(NEIGHBOURS_S / interval))
-    stretches = [part for part in segments_of([time]) if part.stop - part.start > 2 * reach]
-    out = velocity.copy()
-    if not stretches:
+
+    stretches: tuple[slice, ...]
+    own: int
+    reach: int
+    weights: Array
+    mean: Array
+    std: Array
+
+    @staticmethod
+    def fitted(time: Array, velocity: Array, own: int) -> _Predictor:
+        """Fit to a velocity (N, 3); own: number of samples whose noise must stay out, at least."""
+        interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+        own = max(own, 2, int(np.ceil(OWN_S / interval)))
+        reach = max(own + 3, round(NEIGHBOURS_S / interval))
+        stretches = tuple(part for part in segments_of([time]) if part.stop - part.start > 2 * reach)
+        weights, mean, std = np.zeros((3, reach - own + 1)), velocity.mean(axis=0), np.zeros(3)
+        if stretches:
+            for axis in range(3):
+                series = [velocity[part, axis] - mean[axis] for part in stretches]
+                around = np.concatenate([_pairs_around(one, own, reach) for one in series])
+                middle = np.concatenate([one[reach:-reach] for one in series])
+                weights[axis] = np.linalg.lstsq(around, middle, rcond=1e-6)[0]
+                std[axis] = 1.4826 * np.median(np.abs(middle - around @ weights[axis]))
+        return _Predictor(stretches, own, reach, weights, mean, std)
+
+    def __call__(self, velocity: Array, mean: Array | None = None) -> Array:
+        """Predicted (N, 3) of a velocity (N, 3), by default about the mean of the fit; as it is at the ends."""
+        mean = self.mean if mean is None else mean
+        out = velocity.copy()
+        for part in self.stretches:
+            for axis in range(3):
+                pairs = _pairs_around(velocity[part, axis] - mean[axis], self.own, self.reach)
+                out[part.start + self.reach : part.stop - self.reach, axis] = mean[axis] + pairs @ self.weights[axis]
         return out
-    for axis in range(3):
-        series = [velocity[part, axis] for part in stretches]
-        mean = float(np.mean(np.concatenate(series)))
-        pairs = [_pairs_around(one - mean, own, reach) for one in series]
-        middle = np.concatenate([one[reach:-reach] - mean for one in series])
-        around = np.concatenate(pairs)
-        weights = np.linalg.lstsq(around, middle, rcond=1e-6)[0]
-        for part, pair in zip(stretches, pairs, strict=True):
-            out[part.start + reach : part.stop - reach, axis] = mean + pair @ weights
-    return out
 
 
 def _pairs_around(series: Array, own: int, reach: int) -> Array:
@@ -267,8 +321,8 @@ def _cut_off(recording: Recording, velocity_body: Array) -> Array:
     around = recording.reference_around
     if around is None or not around.any() or len(recording.time) < 4:
         return np.zeros_like(velocity_body)
-    smooth = _from_neighbours(recording.time, velocity_body, 1)
-    noise = 1.4826 * np.median(np.abs(velocity_body - smooth), axis=0)
+    predict = _Predictor.fitted(recording.time, velocity_body, 1)
+    smooth, noise = predict(velocity_body), predict.std
     size = np.sqrt(np.mean(_straight_line_error(recording, around, smooth) ** 2, axis=0))
     if np.linalg.norm(size) < np.linalg.norm(noise):
         return np.zeros_like(velocity_body)

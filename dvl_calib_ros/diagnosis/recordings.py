@@ -123,7 +123,7 @@ def make_recording(
         time=time,
         velocity_dvl=velocity_dvl,
         reference_body=reference_body,
-        bins=_bins(time, interval, min(MAX_TEST_RATE_HZ, reference_rate)),
+        bins=_bins(time, interval, min(MAX_TEST_RATE_HZ, _independent_rate(reference_around, reference_rate))),
         reported_variance=reported_variance,
         rotation_enu_from_body=rotation_enu_from_body,
         angular_velocity=angular_velocity,
@@ -132,6 +132,16 @@ def make_recording(
         repeats=repeats,
         received=received,
     )
+
+
+def _independent_rate(reference_around: Array | None, reference_rate: float) -> float:
+    """Rate, Hz, at which means of the reference have noise of their own.
+
+    Between two samples it is a mean of both, so neighbours share their noise, in a way that has next to none at the
+    reference's own rate; a whitened residual would then hold little else than what was neglected there.
+    """
+    interpolated = reference_around is not None and reference_around.any()
+    return reference_rate / 2.0 if interpolated else reference_rate
 
 
 def _means(values: Array, bins: NDArray[np.intp]) -> Array:
