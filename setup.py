@@ -6,6 +6,7 @@ from setuptools import find_packages, setup
 
 NAME = "dvl_calib_ros"
 ROS_FREE = ["numpy>=1.26", "scipy>=1.11", "pyyaml>=6.0", "rich>=13.7", "rosbags>=0.10", "mcap>=1.2", "joblib>=1.3"]
+STATISTICS = ["statsmodels>=0.14"]
 REPORT = ["matplotlib>=3.6", "jinja2>=3.1"]
 DASK = ["distributed>=2023.9"]
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
@@ -26,7 +27,7 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["report/templates/*"]},
     python_requires=">=3.10",
-    install_requires=[*ROS_FREE, *REPORT],
+    install_requires=[*ROS_FREE, *STATISTICS, *REPORT],
     extras_require={"ros": ROS, "dask": DASK, "test": TEST},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

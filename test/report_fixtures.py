@@ -1,4 +1,4 @@
-"""Reports for the tests: a replay's and an evaluation's, from little data, and how to read them."""
+"""Reports for the tests: a replay's, an evaluation's and a diagnosis's, from little data, and how to read them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,12 @@ from io_fixtures import run, write_bag
 
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
+from dvl_calib_ros.diagnosis.noise_findings import NoiseFinding
+from dvl_calib_ros.diagnosis.results import Diagnosis, FoundEffect, Verdict
+from dvl_calib_ros.diagnosis.series import DiagnosisSeries
+from dvl_calib_ros.diagnosis.unexplained import Unexplained
+from dvl_calib_ros.diagnosis.where import Place
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,
     CalibrationRun,
@@ -24,6 +30,9 @@ from dvl_calib_ros.evaluation.results import (
 )
 from dvl_calib_ros.io.replay import Replayed, replay
 from dvl_calib_ros.report.replay_report import write_replay_report
+
+# Of a plug-in: the installed library does not know it
+OWN_EFFECT = "own_<b>$effect$</b>"
 
 
 class Page(HTMLParser):
@@ -133,3 +142,39 @@ def evaluation(**changes: Any) -> Evaluation:
         "held_out": (HeldOut("E1", "M3", "accept", 0.12, 0.03, 0.031),),
     }  # fmt: skip
     return Evaluation(**{**values, **changes})
+
+
+def diagnosis(**changes: Any) -> Diagnosis:
+    """A diagnosis of two recordings with made-up numbers: a lever arm, and an effect of the user's own."""
+    rng = np.random.default_rng(2)
+    n = 1500
+    time = np.tile(np.arange(n // 2) * 0.2, 2)
+    turning = np.sin(time / 8.0) > 0.3
+    traces = {
+        "lever_arm": 0.03 * turning[:, None] * np.array([0.0, 1.0, 0.5]),
+        OWN_EFFECT: 0.01 * np.sin(time / 20.0)[:, None] * np.array([1.0, 0.0, 0.0]),
+    }
+    noise = rng.normal(0.0, 0.02, (n, 3))
+    held_out = HeldOutResiduals(noise + sum(traces.values()), noise, noise**2, np.arange(n) // 100)
+    series = DiagnosisSeries(
+        ("first", "<b>$second$</b>"), np.repeat([0, 1], n // 2), time, (slice(0, n // 2), slice(n // 2, n)), held_out,
+        {"turning": turning, "straight": ~turning}, traces, np.deg2rad([1.0, -2.0, 3.0]), np.array([0.01, 0.0, -0.02]),
+        Unexplained(-1.0, 0.0, "turn rate", np.zeros((n, 3, 1))),
+    )  # fmt: skip
+    values: dict[str, Any] = {
+        "verdict": Verdict.AMBIGUOUS,
+        "sentence": "The gap is explained by <i>two</i> effects.",
+        "gap": Gap(0.0321, 0.0043, 0.0346, 0.982, (0.91, 1.0)),
+        "effects": (
+            FoundEffect("lever_arm", ("sideslip",), {"x_m": (0.3, 0.25, 0.35), "z_m": (-0.1, -0.3, 0.1)}, 0.85, 1e-20),
+            FoundEffect(OWN_EFFECT, (), {"gain": (1500.0, 1200.0, 1800.0)}, -0.02, 1e-9),
+        ),
+        "noise": (NoiseFinding("outliers", {"share": (0.02, 0.01, 0.03)}, 1e-12),),
+        "where": (Place("y", "turning", (0.0, 150.0), (0.0, 2.5), 0.7, 1e-15),),
+        "untestable": {"water_lock": "attitude"},
+        "minimum_detectable": {"lever_arm": {"x_m": 0.11, "z_m": 0.9}, OWN_EFFECT: {"gain": 3.0}},
+        "next_manoeuvre": "turns to both sides at two speeds",
+        "notes": ("first: <u>gaps</u>",),
+        "series": series,
+    }  # fmt: skip
+    return Diagnosis(**{**values, **changes})

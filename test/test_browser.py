@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from report_fixtures import evaluation, replay_page
+from report_fixtures import diagnosis, evaluation, replay_page
 
-from dvl_calib_ros.report import write_evaluation_report
+from dvl_calib_ros.report import write_diagnosis_report, write_evaluation_report
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PHONE, DESKTOP = (375, 740), (1280, 900)
@@ -33,12 +33,14 @@ def reports(tmp_path_factory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("reports")
     hostile = folder / "<img src=x onerror=alert(1)>"
     hostile.mkdir()
-    made = {"replay": replay_page(hostile)[0], "evaluation": folder / "evaluation.html"}
+    made = {"replay": replay_page(hostile)[0]}
+    made |= {name: folder / f"{name}.html" for name in ("evaluation", "diagnosis")}
     write_evaluation_report(made["evaluation"], evaluation())
+    write_diagnosis_report(made["diagnosis"], diagnosis())
     return made
 
 
-@pytest.fixture(params=["replay", "evaluation"])
+@pytest.fixture(params=["replay", "evaluation", "diagnosis"])
 def report(request, reports) -> Path:
     return reports[request.param]
 

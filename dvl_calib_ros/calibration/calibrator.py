@@ -70,6 +70,7 @@ class _Paired(NamedTuple):
     weight: float
     frame: VelocityFrame
     orientation: Quaternion | None
+    around_s: tuple[float, float]  # since the reference sample before, until the one after
 
 
 class _Block(NamedTuple):
@@ -405,7 +406,10 @@ class Calibrator:
             if orientation is None:
                 self._tally["pairing"]["without_attitude"] += 1
                 return None
-        return _Paired(sample, velocity, covariance, weight, after.frame, orientation)
+        around_s = (0.0, 0.0)
+        if fraction != 1.0 and before is not None:
+            around_s = (1e-9 * (sample.stamp_ns - before.stamp_ns), 1e-9 * (after.stamp_ns - sample.stamp_ns))
+        return _Paired(sample, velocity, covariance, weight, after.frame, orientation, around_s)
 
     def _orientation(self, stamp_ns: int) -> Quaternion | None:
         if stamp_ns in self._orientation_at:
@@ -458,7 +462,12 @@ class Calibrator:
         rotation = _body_from_reference(block)
         if rotation is not None:
             velocity = np.einsum("nij,nj->ni", rotation, velocity)
-        seen = self._observations(samples, reference_body=velocity, noise=self._paired_covariance(block, rotation))
+        seen = self._observations(
+            samples,
+            reference_body=velocity,
+            noise=self._paired_covariance(block, rotation),
+            reference_around=np.array([each.around_s for each in block]),
+        )
         return _block(samples, seen, weight=np.array([each.weight for each in block]))
 
     def _observations(self, samples: list[_Moving], **paired_with: Any) -> Observations:

@@ -7,7 +7,7 @@ order in which they finish changes anything.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -57,19 +57,27 @@ def run_all(
 def _on_cores(
     work: Callable[[Item], Outcome], items: Sequence[Item], jobs: int, on_progress: Callable[[float], None]
 ) -> list[Outcome]:
+    outcomes = []
+    for done in outcomes_on_cores(work, items, jobs):
+        outcomes.append(done)
+        on_progress(len(outcomes) / len(items))
+    return outcomes
+
+
+def outcomes_on_cores(work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int) -> Iterator[Outcome]:
+    """`work` of every item in order, each as soon as it and those before it are done. jobs: processes, 0: one per core.
+
+    Exceptions of `work` go through. Raises InputError for a worker that died.
+    """
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    outcomes = []
     try:
         # one thread of linear algebra per worker: the matrices are tiny, and the workers fill the cores
         with parallel_config(backend="loky", inner_max_num_threads=1):
-            for done in Parallel(n_jobs=jobs or -1, return_as="generator")(delayed(work)(item) for item in items):
-                outcomes.append(done)
-                on_progress(len(outcomes) / len(items))
+            yield from Parallel(n_jobs=jobs or -1, return_as="generator")(delayed(work)(item) for item in items)
     except TerminatedWorkerError as error:
         raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs") from error
-    return outcomes
 
 
 def _on_dask(

@@ -71,6 +71,11 @@ class MessageFeed:
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, VelocityFrame | None] = {}
 
+    @property
+    def reference_frame(self) -> VelocityFrame | None:
+        """Frame of the reference's messages, of the first that were taken; None before."""
+        return next((frame for frame in self._reference_frames.values() if frame is not None), None)
+
     def dvl(self, message: Any, received_ns: int) -> DvlSample | None:
         """Feed a TwistWithCovarianceStamped from the DVL; the sample if it is valid and in order."""
         frame_id = message.header.frame_id

@@ -53,13 +53,14 @@ def _spelled(name: str, present: dict[str, str]) -> str:
 class Replayed:
     """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id.
 
-    history: the run over time, if it was asked for.
+    history: the run over time, if it was asked for. reference_frame: of the reference's messages, None without any.
     """
 
     result: Result
     notes: tuple[str, ...]
     dvl_frame: str
     history: RunHistory | None = None
+    reference_frame: VelocityFrame | None = None
 
 
 def replay(
@@ -105,7 +106,7 @@ def replay(
     result = calibrator.result()
     notes += _warnings(result, topics, feed)
     history = recorder.history(calibrator) if recorder else None
-    return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link", history)
+    return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link", history, feed.reference_frame)
 
 
 def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:

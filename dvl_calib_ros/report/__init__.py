@@ -1,9 +1,10 @@
-"""Reports that people read: one self-contained HTML file from a replay or an evaluation.
+"""Reports that people read: one self-contained HTML file from a replay, an evaluation or a diagnosis.
 
 Needs matplotlib and jinja2; nothing else in the package imports this, the commands do so when a report is asked for.
 """
 
+from .diagnosis_report import write_diagnosis_report
 from .evaluation_report import write_evaluation_report
 from .replay_report import write_replay_report
 
-__all__ = ["write_evaluation_report", "write_replay_report"]
+__all__ = ["write_diagnosis_report", "write_evaluation_report", "write_replay_report"]

@@ -1,0 +1,160 @@
+"""Diagnose the sim-to-real gap of recorded bags: where the DVL differs from its simulation, and which effect does it.
+
+One sentence with the answer comes first. Several bags must be of one vehicle; whole bags are then held out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import common, trial
+from .reporting import add_report_option, report_writer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.table import Table
+
+    from ..diagnosis.results import Diagnosis
+
+NAME = "diagnose"
+HELP = "find what a simulation lacks beside recorded bags, and how much it explains"
+EXAMPLE = "dvl-calib diagnose my_bag --apply compensated.yaml"
+COLOURS = {"no_gap": "green", "known": "green", "ambiguous": "yellow", "unknown": "red"}
+# At rest a bias shows that looks like scale at speed
+DEFAULTS = {"min_speed": 0.0}
+MAX_PLACES = 8
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the diagnosis as JSON")
+    parser.add_argument(
+        "--apply", type=Path, metavar="FILE",
+        help="write a parameter file for node and replay that compensates what was found, over --params and -p",
+    )  # fmt: skip
+    add_report_option(parser)
+    common.add_parameter_options(parser)
+    common.add_topic_options(parser)
+    parser.add_argument("--trial", action="store_true", help="try the diagnosis itself, blindly, on simulated bags")
+    trial.add_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Diagnose, print, save; or run the trial."""
+    from ..io.errors import InputError
+
+    if arguments.trial:
+        if arguments.bags:
+            raise InputError("--trial makes its own bags; name none")
+        trial.run(arguments)
+        return
+    if not arguments.bags:
+        raise InputError("name a bag, or try --trial")
+    from ..diagnosis.compensation import compensated, parameter_file
+    from ..diagnosis.diagnose import diagnose
+    from ..diagnosis.results import diagnosis_document
+    from ..io.replay import Topics
+    from ..io.result_file import save_text
+
+    parameters = common.load(arguments)
+    common.check_outputs(arguments, "json", "apply", "report")
+    write_report = report_writer(arguments, "write_diagnosis_report")
+    topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
+    with common.progress("diagnosing") as on_progress:
+        diagnosis = diagnose(
+            arguments.bags,
+            common.load(arguments, DEFAULTS),
+            topics,
+            on_progress,
+            with_series=write_report is not None,
+        )
+    if arguments.json is not None:
+        common.write_json(arguments.json, diagnosis_document(diagnosis))
+    if arguments.apply is not None:
+        save_text(arguments.apply, parameter_file(compensated(parameters, diagnosis)))
+    if write_report is not None:
+        write_report(arguments.report, diagnosis)
+    _print(diagnosis)
+
+
+def _print(diagnosis: Diagnosis) -> None:
+    from rich.markup import escape
+
+    errors = common.console(stderr=True)
+    for note in diagnosis.notes:
+        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+    out = common.console()
+    verdict = diagnosis.verdict.value
+    out.print(f"[bold {COLOURS.get(verdict, 'yellow')}]{verdict}[/]: {escape(diagnosis.sentence)}", soft_wrap=True)
+    if diagnosis.effects:
+        out.print(_effects(diagnosis))
+    if diagnosis.where:
+        out.print(_where(diagnosis))
+    if diagnosis.noise:
+        out.print(_noise(diagnosis))
+    if diagnosis.minimum_detectable:
+        out.print(_detectable(diagnosis))
+    for name, needs in diagnosis.untestable.items():
+        out.print(f"not testable: {name}, which needs {needs}")
+    out.print(f"next: {escape(diagnosis.next_manoeuvre)}", soft_wrap=True)
+
+
+def _table(title: str, *columns: str) -> Table:
+    from rich.table import Table as RichTable
+
+    table = RichTable(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column)
+    return table
+
+
+def _effects(diagnosis: Diagnosis) -> Table:
+    gap = diagnosis.gap
+    title = (
+        f"gap {1e3 * gap.before:.1f} mm/s before, {1e3 * gap.after:.1f} after, over a noise floor of "
+        f"{1e3 * gap.noise_floor:.0f}; closure {_share(gap.closure)} ({_share(gap.interval[0])} to "
+        f"{_share(gap.interval[1])}), held out"
+    )
+    table = _table(title, "effect", "or else", "parameters (95 %)", "closure", "p")
+    for effect in diagnosis.effects:
+        table.add_row(
+            effect.name, ", ".join(effect.equivalent_to) or "-", _values(effect.parameters), _share(effect.closure),
+            f"{effect.p:.1g}",
+        )  # fmt: skip
+    return table
+
+
+def _where(diagnosis: Diagnosis) -> Table:
+    table = _table("where the gap lies", "axis", "when", "time s", "band Hz", "share", "p")
+    for place in diagnosis.where[:MAX_PLACES]:
+        table.add_row(
+            place.axis, place.regime, "{:.0f} .. {:.0f}".format(*place.segment_s),
+            "{:.2g} .. {:.2g}".format(*place.band_hz), _share(place.share), f"{place.p:.1g}",
+        )  # fmt: skip
+    return table
+
+
+def _noise(diagnosis: Diagnosis) -> Table:
+    table = _table("the noise is not what it should be", "finding", "parameters (95 %)", "p")
+    for finding in diagnosis.noise:
+        table.add_row(finding.name, _values(finding.parameters), f"{finding.p:.1g}")
+    return table
+
+
+def _detectable(diagnosis: Diagnosis) -> Table:
+    table = _table("smallest sizes that would be found (4 times in 5)", "effect", "sizes")
+    for name, sizes in diagnosis.minimum_detectable.items():
+        table.add_row(name, ", ".join(f"{key} {size:.2g}" for key, size in sizes.items()))
+    return table
+
+
+def _values(parameters: Mapping[str, tuple[float, float, float]]) -> str:
+    return ", ".join(f"{name} {value:.3g} ({low:.3g} .. {high:.3g})" for name, (value, low, high) in parameters.items())
+
+
+def _share(value: float) -> str:
+    return f"{100.0 * value:.0f} %"

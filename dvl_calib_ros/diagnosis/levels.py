@@ -1,0 +1,69 @@
+"""How the noise's level follows the vehicle: louder at speed, in turns, or where the messages say so."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from ..calibration.frames import Array
+from ..effects.base import Needs
+from .noise import Noise
+from .problem import Problem
+
+SIGNIFICANT = 1e-4
+
+
+@dataclass(frozen=True)
+class Level:
+    """log standard deviation = const + Σ slope · (covariate - mean). p: of all slopes together, p_of: of each."""
+
+    names: tuple[str, ...]
+    slopes: Array
+    p: float
+    p_of: Array
+    values: Array
+
+
+def covariates(problem: Problem) -> dict[str, Array]:
+    """(M,) each: speed m/s, turn rate rad/s where there is an IMU, log of the reported std where it varies."""
+    found = {"speed": problem.sampled(lambda motion: motion.speed)}
+    if Needs.ANGULAR_VELOCITY in problem.available:
+        found["turn_rate"] = problem.sampled(lambda motion: np.linalg.norm(motion.turn_rate, axis=1))
+    if all(recording.reported_variance is not None for recording in problem.recordings):
+        reported = problem.joined([r.averaged(r.reported_variance.mean(axis=1)) for r in problem.recordings])  # type: ignore[union-attr]
+        found["reported"] = 0.5 * np.log(np.maximum(reported, 1e-12))
+    return {name: values for name, values in found.items() if np.std(values) > 1e-3 * max(1.0, abs(np.mean(values)))}
+
+
+def fit_level(problem: Problem, innovations: Array) -> Level | None:
+    """Gamma regression with a log link of squared innovations (M, 3) on the covariates; None without any."""
+    from statsmodels.genmod.families import Gamma, links
+    from statsmodels.genmod.generalized_linear_model import GLM
+
+    found = covariates(problem)
+    if not found:
+        return None
+    x = np.column_stack([values - values.mean() for values in found.values()])
+    square = np.clip((innovations**2).mean(axis=1), 1e-6, 30.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with_constant = np.column_stack([np.ones(len(x)), x])
+        result = GLM(square, with_constant, family=Gamma(links.Log())).fit(scale="X2")
+    slopes, covariance = result.params[1:], result.cov_params()[1:, 1:]
+    wald = float(slopes @ np.linalg.solve(covariance, slopes))
+    p_of = chi2.sf(slopes**2 / np.diag(covariance), 1)
+    level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
+    return Level(tuple(found), 0.5 * slopes, float(chi2.sf(wald, len(slopes))), p_of, level)
+
+
+def with_levels(problem: Problem, noise: Noise) -> Noise:
+    """The noise with the level that its innovations call for, if they do so clearly."""
+    innovations = noise.whiten(problem.residual).reshape(-1, 3)
+    level = fit_level(problem, innovations)
+    if level is None or level.p > SIGNIFICANT:
+        return noise
+    changed = replace(noise, level=noise.level * level.values[:, None])
+    return changed.refitted(changed.robust(problem.residual))

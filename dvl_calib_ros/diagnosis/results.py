@@ -1,0 +1,101 @@
+"""What a diagnosis says, as data, and as the JSON of `diagnose --json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from .closure import Gap
+from .noise_findings import NoiseFinding
+from .series import DiagnosisSeries
+from .where import Place
+
+
+class Verdict(str, Enum):
+    """The answer in a word."""
+
+    NO_GAP = "no_gap"
+    KNOWN = "known"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+    INSUFFICIENT_EXCITATION = "insufficient_excitation"
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect that was found. equivalent_to: others that this data cannot tell from it. parameters: value, low, high
+    (95 per cent) by name. closure: of the gap by this effect alone. p: adjusted over the library.
+    """
+
+    name: str
+    equivalent_to: tuple[str, ...]
+    parameters: Mapping[str, tuple[float, float, float]]
+    closure: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any."""
+
+    verdict: Verdict
+    sentence: str
+    gap: Gap
+    effects: tuple[FoundEffect, ...]
+    noise: tuple[NoiseFinding, ...]
+    where: tuple[Place, ...]
+    untestable: Mapping[str, str]
+    minimum_detectable: Mapping[str, Mapping[str, float]]
+    next_manoeuvre: str
+    notes: tuple[str, ...]
+    series: DiagnosisSeries | None = None
+
+
+def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The JSON of diagnosis.md."""
+    gap = diagnosis.gap
+    return {
+        "verdict": diagnosis.verdict.value,
+        "gap": {
+            "before_mps": gap.before,
+            "after_mps": gap.after,
+            "noise_floor_mps": gap.noise_floor,
+            "closure": gap.closure,
+            "closure_ci95": list(gap.interval),
+            "held_out": True,
+        },
+        "effects": [
+            {
+                "name": effect.name,
+                "equivalent_to": list(effect.equivalent_to),
+                "parameters": _parameters(effect.parameters),
+                "closure": effect.closure,
+                "p_adjusted": effect.p,
+            }
+            for effect in diagnosis.effects
+        ],
+        "noise": [
+            {"name": finding.name, "parameters": _parameters(finding.parameters), "p_adjusted": finding.p}
+            for finding in diagnosis.noise
+        ],
+        "where": [
+            {
+                "axis": place.axis,
+                "regime": place.regime,
+                "segment_s": list(place.segment_s),
+                "band_hz": list(place.band_hz),
+                "share": place.share,
+                "p_adjusted": place.p,
+            }
+            for place in diagnosis.where
+        ],
+        "untestable": [{"name": name, "needs": needs} for name, needs in diagnosis.untestable.items()],
+        "minimum_detectable": {name: dict(sizes) for name, sizes in diagnosis.minimum_detectable.items()},
+        "next_manoeuvre": diagnosis.next_manoeuvre,
+    }
+
+
+def _parameters(parameters: Mapping[str, tuple[float, float, float]]) -> dict[str, Any]:
+    return {name: {"value": value, "ci95": [low, high]} for name, (value, low, high) in parameters.items()}

@@ -1,0 +1,137 @@
+"""What is left after the best combination of effects: does it still follow the vehicle's motion, or time?
+
+A dictionary of what a vehicle's error could follow, each with a free vector in the body frame. Noise of the sky does
+not know the vehicle's motion, so what follows it is systematic, whatever its cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from ..calibration.frames import Array
+from .fitting import Fit, Fitter
+from .problem import Problem
+
+LEVEL = 0.002
+TIME_KNOTS = 7
+# Directions of the dictionary that hold less of their length than this beside the others are left out
+INDEPENDENT = 1e-3
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
+    variance, beyond what chance brings. about: what the rest follows. columns: (M, 3, f), the dictionary.
+    """
+
+    log_p: float
+    energy: float
+    about: str
+    columns: Array
+
+    @property
+    def found(self) -> bool:
+        """Whether something is left."""
+        return self.log_p < np.log(LEVEL)
+
+
+def dictionary(problem: Problem) -> dict[str, Array]:
+    """Name -> (M, c) functions of motion or time, without unit."""
+    parts = [_of_motion(problem, index) for index in range(len(problem.recordings))]
+    return {name: problem.joined([part[name] for part in parts]) for name in parts[0]}
+
+
+def _of_motion(problem: Problem, index: int) -> dict[str, Array]:
+    recording, motion = problem.recordings[index], problem.motions[index]
+    velocity, speed = motion.velocity_body, motion.speed
+    acceleration = np.gradient(velocity[:, 0], motion.time)
+    typical = max(float(np.median(speed)), 0.1)
+    hats = _hats(motion.time, TIME_KNOTS)
+    s = speed / typical
+    found: dict[str, Array] = {
+        "speed": np.column_stack([np.ones_like(s), s, s**2, s**3, np.maximum(s - 1.0, 0.0)]),
+        "acceleration": np.column_stack([acceleration, np.abs(acceleration)]),
+        "sway and heave": np.column_stack([velocity[:, 1:], np.abs(velocity[:, 1:])]),
+        "time": np.column_stack([hats, hats * s[:, None]]),
+    }
+    if motion.rotation_enu_from_body is not None:
+        rotation = motion.rotation_enu_from_body
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
+        once = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        found["heading"] = np.column_stack([once, once * s[:, None], np.cos(2 * yaw), np.sin(2 * yaw)])
+        found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
+        steps = np.diff(motion.time, prepend=motion.time[0])
+        up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
+        found["depth"] = np.cumsum(up * steps)[:, None]
+    if motion.angular_velocity is not None:
+        rate = motion.angular_velocity
+        turning = rate[:, 2]
+        found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
+        found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
+    return {name: recording.averaged(values[:: recording.finer]) for name, values in found.items()}
+
+
+def _hats(time: Array, knots: int) -> Array:
+    """Piecewise linear functions (N, knots) that are one at one knot and zero at the others."""
+    at = np.linspace(time[0], time[-1], knots)
+    return np.column_stack([np.interp(time, at, row) for row in np.eye(knots)])
+
+
+def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
+    """Look for what the residual of a fit still follows."""
+    problem, noise = fitter.problem, fit.noise
+    known = np.concatenate(
+        [problem.base, *(fitter.jacobian(effect, fit.values[effect.name])[1] for effect in fit.effects)], axis=2
+    )
+    q = _orthonormal(noise.whiten(known))
+    white = noise.whiten(fit.residual)
+    white = white - q @ (q.T @ white)
+    variance = float(white @ white) / (len(white) - q.shape[1])
+    tests: list[tuple[float, str]] = []
+    columns = []
+    for name, functions in dictionary(problem).items():
+        raw = _along_axes(functions)
+        columns.append(raw)
+        for block in _per_axis(raw):
+            tests.append((explained(q, noise.whiten(block), white, variance)[0], name))
+    raw = np.concatenate(columns, axis=2)
+    log_p, energy = explained(q, noise.whiten(raw), white, variance)
+    best, name = min(tests)
+    best = best + np.log(len(tests) + 1)
+    together = log_p + np.log(len(tests) + 1)
+    return Unexplained(min(best, together, 0.0), max(0.0, energy), name, raw)
+
+
+def _along_axes(functions: Array) -> Array:
+    """(M, c) -> (M, 3, 3 c): every function on every body axis."""
+    m, c = functions.shape
+    return np.einsum("mc,ij->mijc", functions, np.eye(3)).reshape(m, 3, 3 * c)
+
+
+def _per_axis(raw: Array) -> Sequence[Array]:
+    c = raw.shape[2] // 3
+    return [raw, *(raw[:, :, axis * c : (axis + 1) * c] for axis in range(3))]
+
+
+def _orthonormal(white: Array) -> Array:
+    lengths = np.linalg.norm(white, axis=0)
+    white = white[:, lengths > 0.0] / lengths[lengths > 0.0]
+    u, s, _ = np.linalg.svd(white, full_matrices=False)
+    return u[:, s > INDEPENDENT]
+
+
+def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
+    """log p of what columns explain of a whitened series, and their energy beyond chance."""
+    lengths = np.linalg.norm(white_columns, axis=0)
+    left = white_columns - q @ (q.T @ white_columns)
+    keep = np.linalg.norm(left, axis=0) > 0.02 * np.maximum(lengths, 1e-300)
+    if not keep.any():
+        return 0.0, 0.0
+    u = _orthonormal(left[:, keep])
+    energy = float(np.sum((u.T @ white) ** 2)) / variance
+    return float(chi2.logsf(energy, u.shape[1])), energy - u.shape[1]

@@ -1,0 +1,129 @@
+"""The figures of a diagnosis: functions from plain arrays to a matplotlib Figure, units on every axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from ..calibration.frames import Array
+from .replay_figures import AFTER, BAD
+from .series import running_mean
+from .style import FAINT, INK, legend_above, new_figure, plain_log_ticks
+from .time_axis import TimeAxis
+
+# Points of a line: running means are smooth, so more cannot be seen
+LINE_POINTS = 300
+# Groups of equally many samples in which the measured is compared with the effect
+GROUPS = 12
+MM = 1e3
+MEASURED_COLOUR = "#555b61"
+_STYLES = {
+    "before": (BAD, 1.3),
+    "after": (AFTER, 1.3),
+    "measured": (MEASURED_COLOUR, 1.1),
+    "residual": (MEASURED_COLOUR, 1.3),
+}
+
+
+def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], points: int, label: str) -> Figure:
+    """Running means over so many samples of one body axis of series (M,), m/s, by name; the last in front."""
+    figure, axes = new_figure()
+    t = time(stamps_ns)
+    for (name, values), (colour, width) in zip(series.items(), _lines(list(series)), strict=True):
+        where, mean = running_mean(t, MM * values, points)
+        kept = slice(None, None, max(1, len(where) // LINE_POINTS))
+        axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    axes.set_ylabel(label)
+    time.dress(axes)
+    legend_above(axes)
+    return figure
+
+
+def _lines(names: Sequence[str]) -> list[tuple[str, float]]:
+    """Colour and width of lines by what they show; names of effects are not among them."""
+    return [_STYLES.get(name, (AFTER, 2.0)) for name in names]
+
+
+def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure:
+    """Amplitude spectral densities (F,) m/s/√Hz of one body axis, by name, over frequency (F,) Hz."""
+    figure, axes = new_figure()
+    for (name, values), (colour, width) in zip(series.items(), _lines(list(series)), strict=True):
+        axes.plot(frequency, MM * values, color=colour, linewidth=width, label=name)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(*_a_decade(MM * np.concatenate(list(series.values()))))
+    plain_log_ticks(axes.xaxis)
+    plain_log_ticks(axes.yaxis)
+    axes.set_xlabel("frequency, Hz")
+    axes.set_ylabel(label)
+    legend_above(axes)
+    return figure
+
+
+def _a_decade(values: Array) -> tuple[float, float]:
+    """Limits about positive values, a decade apart at least: a logarithmic axis has few plain numbers in less."""
+    low, high = 0.8 * float(values.min()), 1.25 * float(values.max())
+    widen = max(1.0, np.sqrt(10.0 * low / high))
+    return low / widen, high * widen
+
+
+def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
+    """The gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
+    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    height = 0.8 / len(gaps)
+    for i, ((name, values), (colour, _)) in enumerate(zip(gaps.items(), _lines(list(gaps)), strict=True)):
+        rows = np.arange(len(names)) + (i - 0.5 * (len(gaps) - 1)) * height
+        value, low, high = MM * values.T
+        axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
+        axes.hlines(rows, low, high, color=INK, linewidth=1.0)
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("gap beyond the noise, mm/s rms (95 %)")
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def closure_bars(names: Sequence[str], closures: Array, together: tuple[float, float, float]) -> Figure:
+    """Share of the gap that each effect closes alone (E,), and all together: value and 95 per cent interval."""
+    labels = [*names, "together"] if len(names) > 1 else list(names)
+    values = [*closures, together[0]] if len(names) > 1 else [together[0]]
+    colours = [FAINT] * len(names) + [AFTER] if len(names) > 1 else [AFTER]
+    figure, axes = new_figure(height=1.1 + 0.36 * len(labels))
+    rows = np.arange(len(labels))
+    axes.barh(rows, 100.0 * np.asarray(values), color=colours, height=0.6)
+    axes.hlines(rows[-1], 100.0 * together[1], 100.0 * together[2], color=INK, linewidth=1.4)
+    axes.axvline(100.0, color=INK, linewidth=0.7, linestyle=":")
+    axes.set_yticks(rows, labels)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    axes.set_xlim(min(0.0, 100.0 * float(np.min([*values, together[1]]))), 105.0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+    axes.set_xlabel("share of the gap closed on held-out data, %")
+    axes.grid(False, axis="y")
+    return figure
+
+
+def measured_against_effect(effect: Array, measured: Array) -> Figure:
+    """What was measured (K,) against what an effect adds there (K,), m/s: means of groups with 95 per cent intervals.
+
+    Points on the diagonal: the effect is what was measured.
+    """
+    figure, axes = new_figure(height=3.2)
+    groups = np.array_split(np.argsort(effect), GROUPS)
+    at = MM * np.array([effect[group].mean() for group in groups])
+    mean = MM * np.array([measured[group].mean() for group in groups])
+    error = 1.96 * MM * np.array([measured[group].std() / np.sqrt(len(group)) for group in groups])
+    ends = np.array([at.min(), at.max()])
+    axes.plot(ends, ends, color=AFTER, linewidth=2.0, label="as the effect says")
+    axes.errorbar(at, mean, error, fmt="o", markersize=4.0, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(6))
+    axes.set_xlabel("the effect's trace, mm/s")
+    axes.set_ylabel("measured, mm/s")
+    legend_above(axes)
+    return figure

@@ -1,0 +1,5 @@
+"""The blind trial: bags from a generator of its own, diagnosed without the truth, and scored afterwards.
+
+`motion`, `vehicle` and `strength` repeat physics on purpose: a diagnosis that is tested with the code it was built on
+would be tested for nothing. They share no code with `effects`, `simulation` and `diagnosis`.
+"""

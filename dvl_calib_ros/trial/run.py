@@ -1,0 +1,132 @@
+"""Run a trial: record each case, diagnose its bags without the truth, note the answer; go on where it was stopped.
+
+A trial's folder holds ``trial.json`` (its seed), ``sealed/`` (the truth of each case, which the diagnosis is not told
+of), ``answers.jsonl`` (one answer a line) and, while a case is worked on, its bags in ``bags/``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..calibration.parameters import Parameters
+from ..evaluation.parallel import outcomes_on_cores
+from ..io.errors import InputError
+from ..io.result_file import save_text
+from .cases import Case
+from .generator import record
+from .truth import seal
+
+Document = dict[str, Any]
+Answerer = Callable[[Sequence[Path], Parameters], Document]
+"""Bags of one vehicle, and what is known of its mounting -> the diagnosis as in its JSON."""
+
+# The draws or the physics of the generator have changed: answers to older cases are answers to others
+GENERATOR_VERSION = 1
+
+
+def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
+    """What `dvl-calib diagnose` says of the bags."""
+    from ..diagnosis.diagnose import diagnose, diagnosis_document
+
+    return diagnosis_document(diagnose(paths, parameters))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial in a folder. jobs: processes, 0: one per core. keep_bags: leave the bags in the folder."""
+
+    folder: Path
+    seed: int = 0
+    jobs: int = 0
+    keep_bags: bool = False
+    answerer: Answerer = diagnose_bags
+
+    @property
+    def sealed(self) -> Path:
+        """Folder of the truths."""
+        return self.folder / "sealed"
+
+    @property
+    def answers(self) -> Path:
+        """File of the answers."""
+        return self.folder / "answers.jsonl"
+
+    def run(self, cases: Sequence[Case], on_progress: Callable[[float], None] = lambda _: None) -> dict[str, Document]:
+        """Answers to the cases by their id, asked for where they are not in the folder yet. Raises InputError."""
+        self._prepare()
+        done = read_answers(self.answers)
+        left = [case for case in cases if case.id not in done]
+        with self.answers.open("a", encoding="utf-8") as file:
+            for number, answer in enumerate(self._answered(left), start=len(cases) - len(left) + 1):
+                done[answer["id"]] = answer
+                file.write(json.dumps(answer, sort_keys=True) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+                on_progress(number / len(cases))
+        return {case.id: done[case.id] for case in cases}
+
+    def _answered(self, cases: Sequence[Case]) -> Any:
+        work = partial(_answer, trial=self)
+        return map(work, cases) if self.jobs == 1 else outcomes_on_cores(work, cases, self.jobs)
+
+    def _prepare(self) -> None:
+        """Make the folder, or check that what is in it is of this trial."""
+        self.sealed.mkdir(parents=True, exist_ok=True)
+        header = {"seed": self.seed, "generator": GENERATOR_VERSION}
+        path = self.folder / "trial.json"
+        if not path.exists():
+            save_text(path, json.dumps(header) + "\n")
+            return
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            found = None
+        if found != header:
+            raise InputError(f"{path}: holds a trial of {found}, not {header}; give another folder or the same seed")
+
+
+def _answer(case: Case, trial: Trial) -> Document:
+    """Record a case, seal its truth, and ask."""
+    bags = trial.folder / "bags" / case.id
+    shutil.rmtree(bags, ignore_errors=True)  # half written when the trial was stopped
+    recorded = record(case, trial.seed, bags)
+    seal(recorded.truth, trial.sealed)
+    began = time.process_time()
+    document = _asked(trial.answerer, recorded.bags, Parameters(mounting_rpy=recorded.mounting_rpy))
+    seconds = time.process_time() - began
+    if not trial.keep_bags:
+        shutil.rmtree(bags)
+    return {"id": case.id, "document": document, "cpu_s": round(seconds, 2)}
+
+
+def _asked(answerer: Answerer, bags: Sequence[Path], parameters: Parameters) -> Document:
+    try:
+        return answerer(bags, parameters)
+    except InputError as error:  # it says that the bags cannot tell
+        return {"verdict": "insufficient_excitation", "message": str(error)}
+    except Exception as error:  # one case that breaks the diagnosis must not end the trial: it is scored as wrong
+        return {"verdict": "failed", "message": f"{type(error).__name__}: {error}"}
+
+
+def read_answers(path: Path) -> dict[str, Document]:
+    """Answers of a file by the id of their case; a last line that was cut off is removed from the file."""
+    if not path.exists():
+        return {}
+    text = path.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        with path.open("r+", encoding="utf-8") as file:
+            file.truncate(len(whole.encode()))
+    try:
+        answers: list[Mapping[str, Any]] = [json.loads(line) for line in whole.splitlines()]
+        return {answer["id"]: dict(answer) for answer in answers}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the answers of a trial ({error}); remove it or give another folder") from error

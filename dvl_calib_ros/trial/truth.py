@@ -1,0 +1,63 @@
+"""What is true of a case: kept sealed from the diagnosis, and joined with its answer by the scorer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from ..io.errors import InputError
+from ..io.result_file import save_text
+
+
+class Category(str, Enum):
+    """What a case tests."""
+
+    NULL = "null"
+    HARD_NULL = "hard_null"
+    SINGLE = "single"
+    PAIR = "pair"
+    UNKNOWN = "unknown"
+    UNIDENTIFIABLE = "unidentifiable"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The sealed truth of a case.
+
+    id: as in the name of the bag, says nothing. faults: name -> parameters. q: of each fault alone. distances: name of
+    another fault of the library -> norm of what it leaves of the truth's trace at best. correlation: of a pair, at
+    most. outside_share: of an unknown fault, what the library together does not explain. hardness: of a hard null.
+    """
+
+    id: str
+    category: Category
+    kind: str
+    faults: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    q: Mapping[str, float] = field(default_factory=dict)
+    q_wanted: float = 0.0
+    distances: Mapping[str, float] = field(default_factory=dict)
+    correlation: float | None = None
+    outside_share: float | None = None
+    hardness: str | None = None
+    scene: Mapping[str, Any] = field(default_factory=dict)
+
+
+def seal(truth: Truth, folder: Path) -> None:
+    """Write a truth to its file in a folder."""
+    save_text(folder / f"{truth.id}.json", json.dumps(asdict(truth), indent=1) + "\n")
+
+
+def unseal(folder: Path) -> dict[str, Truth]:
+    """All truths of a folder by the id of their case. Raises InputError for a file that is none."""
+    truths = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            truths[path.stem] = Truth(**{**document, "category": Category(document["category"])})
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise InputError(f"{path}: no truth of a trial ({error}); remove it, the trial writes it anew") from error
+    return truths
