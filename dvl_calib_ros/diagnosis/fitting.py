@@ -94,7 +94,7 @@ class Fitter:
             span = 1e-3 * (high - low)
             found = least_squares(
                 left, np.clip(x0, low + span, high - span), bounds=(low, high), x_scale=1.0,
-                diff_step=[1e-3] * len(smooth), xtol=1e-6, ftol=1e-9, max_nfev=40,
+                diff_step=[1e-3] * len(smooth), xtol=1e-4, ftol=1e-7, max_nfev=20,
             )  # fmt: skip
             for (effect, spec), value in zip(smooth, found.x, strict=True):
                 values[effect.name][spec.name] = float(value * spec.typical)
@@ -141,6 +141,13 @@ class Fitter:
         for effect in {effect.name: effect for effect, _ in smooth}.values():
             residual = residual - self.problem.trace(effect, values[effect.name])
         return residual
+
+    def misfit(self, effects: Sequence[Effect], noise: Noise, start: Mapping[str, Mapping[str, float]]) -> float:
+        """Square of what is left with the values at start, linear parameters solved for: where to fit from."""
+        values = {effect.name: dict(start.get(effect.name, effect.defaults)) for effect in effects}
+        smooth = [(effect, spec) for effect in effects for spec in smooth_parameters(effect)]
+        left = self._fixed(effects, values, noise).left(noise.whiten(self._less(smooth, values, None)))
+        return float(left @ left)
 
     # ------------------------------------------------------------------ starts
 

@@ -24,7 +24,7 @@ from ..io.replay import Topics, replay
 # and five hours must fit. Traces are computed at the third at least, so that delays and lags are exact.
 MAX_RATE_HZ = 10.0
 MAX_TEST_RATE_HZ = 5.0
-MIN_TRACE_RATE_HZ = 12.0
+MIN_TRACE_RATE_HZ = 8.0
 # Share of the DVL's samples that must have attitude and angular velocity for them to be used at all
 MIN_ORIENTED_SHARE = 0.5
 

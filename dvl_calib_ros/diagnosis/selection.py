@@ -9,7 +9,7 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..effects.base import ActsOn, Effect
-from .fitting import WINDOW_STEPS, Fit, Fitter, is_time_of_run, log_p_value
+from .fitting import WINDOW_STEPS, Fit, Fitter, is_time_of_run, log_p_value, smooth_parameters
 from .levels import with_levels
 from .noise import Noise, white_noise
 from .problem import Problem
@@ -23,6 +23,10 @@ GHOST_SHARE = 0.05
 # Effects whose evidence (log p) is within this of the best could be the cause as well: with truth j and a rival that it
 # takes for better by d = 2 · this, the odds are at most those of a normal variable beyond √d.
 INDISTINGUISHABLE = 3.0
+# Deviance behind the best at which no noise of its own will bring a rival back
+OUT_OF_THE_QUESTION = 40.0
+# Starts of an effect with several from which a fit goes on
+BEST_STARTS = 2
 # log p beyond which a hypothesis is worth an estimate of its own noise
 WORTH_A_LOOK = -3.0
 
@@ -135,12 +139,13 @@ def own_doing(fitter: Fitter, fit: Fit, effect: Effect) -> float:
 
 
 def _best_start(fitter: Fitter, fit: Fit, effects: list[Effect], noise: Noise, deviance: float) -> tuple[Fit, float]:
-    """The most significant fit from all starts of the last of the effects, and how many starts were like it."""
+    """The most significant fit from the starts of the last of the effects, and how many starts were like it."""
     effect = effects[-1]
-    trials = [
-        (fitter.fit(effects, noise, {**fit.values, effect.name: start}), tried)
-        for start, tried in fitter.starts(effect)
-    ]
+    starts = fitter.starts(effect)
+    if smooth_parameters(effect) and len(starts) > BEST_STARTS:
+        starts.sort(key=lambda start: fitter.misfit(effects, noise, {**fit.values, effect.name: start[0]}))
+        starts = starts[:BEST_STARTS]
+    trials = [(fitter.fit(effects, noise, {**fit.values, effect.name: start}), tried) for start, tried in starts]
     return min(trials, key=lambda trial: log_p_value(deviance - trial[0].deviance, trial[0].dof - fit.dof, trial[1]))
 
 
@@ -168,13 +173,21 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     rest = _without(fitter, fit, effect)
     drop = rest.deviance - fit.deviance
     log_p = log_p_value(drop, fit.dof - rest.dof, fitter.tried(effect, fit.values[effect.name]))
-    rivals = {name: added(fitter, rest, other) for name, other in effects.items() if other not in fit.effects}
-    equivalent = [
-        name
-        for name, rival in rivals.items()
-        if rival.log_p - log_p < INDISTINGUISHABLE or drop - rival.drop < 2.0 * INDISTINGUISHABLE
-    ]
-    return Selected(effect, log_p, tuple(sorted(equivalent, key=lambda name: rivals[name].log_p)))
+    found: list[tuple[float, str]] = []
+    for name, other in effects.items():
+        if other in fit.effects:
+            continue
+        # with the noise that is left when the cause is known: it is the same for all that could be the cause
+        effects_then = [*rest.effects, other]
+        rival, tried = _best_start(fitter, rest, effects_then, fit.noise, fit.noise.deviance(rest.residual))
+        if rival.deviance - fit.deviance > OUT_OF_THE_QUESTION:
+            continue
+        rival = fitter.fit_with_noise(effects_then, fit.noise, rival.values, rounds=1)
+        behind = rival.deviance - fit.deviance
+        rival_log_p = log_p_value(drop - behind, rival.dof - rest.dof, tried)
+        if rival_log_p - log_p < INDISTINGUISHABLE or behind < 2.0 * INDISTINGUISHABLE:
+            found.append((rival_log_p, name))
+    return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
 def _robust_about(fitter: Fitter, fit: Fit, problem: Problem) -> Array:

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from ..calibration.frames import Array
 from .fitting import Fit, Fitter
+from .noise import Noise
 from .problem import Problem
 
 LEVEL = 0.002
@@ -93,18 +94,36 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     white = white - q @ (q.T @ white)
     variance = float(white @ white) / (len(white) - q.shape[1])
     tests: list[tuple[float, str]] = []
-    columns = []
+    columns, energies = [], [0.0]
     for name, functions in dictionary(problem).items():
         raw = _along_axes(functions)
         columns.append(raw)
         for block in _per_axis(raw):
             tests.append((explained(q, noise.whiten(block), white, variance)[0], name))
+        if noise.is_coloured and name != "time":  # what changes with time alone may as well be noise
+            recoloured = _recoloured(noise, known, raw, fit.residual)
+            tests.append((recoloured[0], name))
+            energies.append(recoloured[1])
     raw = np.concatenate(columns, axis=2)
     log_p, energy = explained(q, noise.whiten(raw), white, variance)
     best, name = min(tests)
     best = best + np.log(len(tests) + 1)
     together = log_p + np.log(len(tests) + 1)
-    return Unexplained(min(best, together, 0.0), max(0.0, energy), name, raw)
+    return Unexplained(min(best, together, 0.0), max(energy, *energies), name, raw)
+
+
+def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:
+    """As `explained`, with the noise estimated anew from what the columns (M, 3, c) leave: else it has their colour."""
+    joined = np.concatenate([known, raw], axis=2)
+    joined = joined / np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
+    left, colour = residual, noise.white
+    for _ in range(2):
+        white = colour.whiten(joined)
+        left = residual - joined @ np.linalg.lstsq(white, colour.whiten(residual), rcond=INDEPENDENT)[0]
+        colour = noise.like(left)
+    rank = _orthonormal(white).shape[1] - known.shape[2]
+    drop = noise.deviance(residual) - colour.deviance(left)
+    return float(chi2.logsf(max(drop, 0.0), max(rank, 1))), drop - rank
 
 
 def _along_axes(functions: Array) -> Array:
