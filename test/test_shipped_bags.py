@@ -55,6 +55,9 @@ def test_the_estimates_of_a_shipped_bag_are_the_committed_ones(golden, tmp_path,
     for name, model in then["models"].items():
         for key in ("state", "covariance"):
             np.testing.assert_allclose(now["models"][name].pop(key), model.pop(key), rtol=1e-9, atol=1e-12)
+    for name, verification in then["verification"].items():
+        errors, expected = now["verification"][name].pop("held_out"), verification.pop("held_out")
+        assert errors == pytest.approx(expected, rel=1e-9)
     assert now == then
 
 
