@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,13 @@ from ..effects.registry import EFFECTS
 from ..io.errors import InputError
 from ..io.replay import Topics
 from .closure import Gap, measure_gap
-from .fitting import Fit, Fitter, is_time_of_run
+from .dictionary import is_time_of_run
+from .fitting import Fit, Fitter
 from .noise_findings import noise_findings
 from .problem import PRIOR_STD, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
-from .selection import LEVEL, Selected, Selection, refined, select
+from .selection import LEVEL, Selected, Selection, dictionary_about, refined, select
 from .series import collect_series
 from .unexplained import Unexplained, unexplained
 from .where import places
@@ -78,12 +80,12 @@ def diagnose_recordings(
     }
     selection = _about_its_answer(select(problem, testable))
     rest = unexplained(selection.fitter, selection.fit)
-    gap = measure_gap(selection.fitter, selection.fit, rest.columns)
+    gap = measure_gap(selection, rest.columns)
     if selection.selected and not gap.after < gap.before:
         # what does not shrink the error on held-out data is no explanation, however unlikely it is to be chance
         selection = selection.withdrawn()
         rest = unexplained(selection.fitter, selection.fit)
-        gap = measure_gap(selection.fitter, selection.fit, rest.columns)
+        gap = measure_gap(selection, rest.columns)
     detectable = {
         name: _minimum_detectable(selection.fitter, selection.fit, effect, len(testable))
         for name, effect in testable.items()
@@ -108,7 +110,7 @@ def diagnose_recordings(
         minimum_detectable=detectable,
         next_manoeuvre=next_manoeuvre,
         notes=tuple(notes),
-        series=collect_series(selection.fitter, selection.fit, rest) if with_series else None,
+        series=collect_series(selection, rest) if with_series else None,
     )
 
 
@@ -173,7 +175,8 @@ def _about_its_answer(selection: Selection) -> Selection:
     for each in selection.selected:
         fit = refined(fitter, fit, each.effect)
     base = fitter.fit([], fit.noise, {})
-    return Selection(selection.selected, base, fit, fitter)
+    dictionary = dictionary_about(fitter, fit, selection.dictionary.effects)
+    return replace(selection, base=base, fit=fit, dictionary=dictionary)
 
 
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
@@ -206,7 +209,7 @@ def _covariance(
 def _minimum_detectable(fitter: Fitter, fit: Fit, effect: Effect, n_tested: int) -> dict[str, float]:
     """Size of each parameter that is found with a power of 80 per cent at the level of the tests."""
     others = [other for other in fit.effects if other is not effect]
-    values = {**fit.values, effect.name: fitter.starts(effect)[0][0]}
+    values = {**fit.values, effect.name: effect.defaults}
     specs, _ = fitter.jacobian(effect, values[effect.name])
     covariance = _covariance(fitter, fit, [*others, effect], values)
     std = np.sqrt(np.diag(covariance))[-len(specs) :]
@@ -235,8 +238,7 @@ def _found(selection: Selection, selected: Selected, n_tested: int, gap: Gap, di
             parameters[spec.name] = fitter.time_interval(fit, effect, spec)
     closure = gap.closure
     if len(fit.effects) > 1:
-        alone = fitter.fit([effect], fit.noise, fit.values)
-        closure = measure_gap(fitter, alone, dictionary).closure
+        closure = measure_gap(selection, dictionary, only=effect).closure
     ordered = {spec.name: parameters[spec.name] for spec in effect.parameters}
     p = min(1.0, float(np.exp(selected.log_p)) * n_tested)
     return FoundEffect(effect.name, selected.equivalent, ordered, closure, p)

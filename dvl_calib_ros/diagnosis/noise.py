@@ -20,7 +20,7 @@ from ..calibration.frames import Array
 HUBER = 2.5
 # Time constant, s, of the slowest noise of a receiver; an effect that comes and goes within a run is slower
 LONGEST_S = 40.0
-ORDERS = ((0, 0), (1, 0), (1, 1), (2, 1), (3, 1))
+ORDERS = ((0, 0), (1, 0), (1, 1))
 _STARTS = (0.0, 0.9)
 
 

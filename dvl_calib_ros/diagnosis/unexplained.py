@@ -19,6 +19,7 @@ from .problem import Problem
 
 LEVEL = 0.002
 TIME_KNOTS = 7
+HEADING_HARMONICS = 4
 # Directions of the dictionary that hold less of their length than this beside the others are left out
 INDEPENDENT = 1e-3
 
@@ -64,7 +65,8 @@ def _of_motion(problem: Problem, index: int) -> dict[str, Array]:
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
         once = np.column_stack([np.cos(yaw), np.sin(yaw)])
-        found["heading"] = np.column_stack([once, once * s[:, None], np.cos(2 * yaw), np.sin(2 * yaw)])
+        more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
+        found["heading"] = np.column_stack([once, once * s[:, None], *more])
         found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
         steps = np.diff(motion.time, prepend=motion.time[0])
         up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
