@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,7 @@ from .noise_findings import noise_findings
 from .problem import PRIOR_STD, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
-from .selection import LEVEL, Selected, Selection, dictionary_about, refined, select
+from .selection import LEVEL, Selected, Selection, select
 from .series import collect_series
 from .unexplained import Unexplained, unexplained
 from .where import places
@@ -78,7 +77,7 @@ def diagnose_recordings(
         for name, effect in effects.items()
         if name not in testable
     }
-    selection = _about_its_answer(select(problem, testable))
+    selection = select(problem, testable)
     rest = unexplained(selection.fitter, selection.fit)
     gap = measure_gap(selection, rest.columns)
     if selection.selected and not gap.after < gap.before:
@@ -167,16 +166,6 @@ def _check_mountings(recordings: Sequence[Recording], rotation_dvl_from_body: Ar
                 f"{np.degrees(abs(a - b)[axis]):.1f}° about {'xyz'[axis]}, so the DVL was mounted differently; "
                 "diagnose them one at a time, or give each its mounting_rpy"
             )
-
-
-def _about_its_answer(selection: Selection) -> Selection:
-    """The selection with the problem made linear about its calibration, and the times of its effects made fine."""
-    fitter, fit = selection.fitter, selection.fit
-    for each in selection.selected:
-        fit = refined(fitter, fit, each.effect)
-    base = fitter.fit([], fit.noise, {})
-    dictionary = dictionary_about(fitter, fit, selection.dictionary.effects)
-    return replace(selection, base=base, fit=fit, dictionary=dictionary)
 
 
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:

@@ -216,7 +216,7 @@ class Problem:
             quick, slow = self._for_delays(effect.name if is_late else "")
             if is_late:  # what the DVL says now the vehicle did before
                 quick, slow = (tuple(advanced(each, delay) for each in those) for those in (quick, slow))
-            traces = [
+            traces: list[Array] = [
                 effect.trace(one, values) + _shift(effect, other, delay) - _shift(effect, one, delay)
                 for one, other in zip(slow, quick, strict=True)
             ]

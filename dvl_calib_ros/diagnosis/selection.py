@@ -33,6 +33,8 @@ MAX_TESTED = 3
 MAX_SWAPS = 2
 # Times that the noise is estimated anew from what a fit leaves
 ROUNDS = 2
+# A time of the run is told to this share of it
+FINEST = 500.0
 # log p beyond which a hypothesis is worth an estimate of its own noise
 WORTH_A_LOOK = -3.0
 
@@ -93,7 +95,7 @@ def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
         if set(fit.effects) == set(before):
             break
     selected = [_selected(fitter, fit, number, dictionary) for number in range(len(fit.effects))]
-    base = fitter.fit_with_noise([], fit.noise, {}) if fit.effects else fit
+    base = fitter.fit([], fit.noise, {})
     return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter, dictionary)
 
 
@@ -134,13 +136,13 @@ class Tested:
 def _best_added(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Tested | None:
     """The most significant effect on top of a fit, of those that look like it; None if none does.
 
-    They are looked for with the noise that the fit leaves, and with that which all effects together leave: the first
-    may have taken an effect's colour, which then looks small.
+    They are looked for with the noise that the fit leaves, with that which all effects together leave, and as if it
+    had no colour: the noise may have taken an effect's colour, which then looks small.
     """
     chosen = list(range(dictionary.n_present))
     beyond = fit.noise.like(dictionary.beyond(fit.noise, fitter.residual))
     worth: dict[str, tuple[float, Candidate, Noise]] = {}
-    for noise in (fit.noise, beyond):
+    for noise in (fit.noise, beyond, *([fit.noise.white] if fit.noise.is_coloured else [])):
         candidates = sorted(dictionary.seen(noise, fitter.residual).candidates(chosen).values(), key=lambda c: c.log_p)
         for candidate in candidates[:MAX_TESTED]:
             name = candidate.effect.name
@@ -153,7 +155,8 @@ def _best_added(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Tested | No
 def _added(fitter: Fitter, fit: Fit, candidate: Candidate, noise: Noise) -> Tested:
     """Test an effect on top of a fit, each with the noise of its own."""
     effects = [*fit.effects, candidate.effect]
-    best = fitter.fit_with_noise(effects, noise, {**fit.values, candidate.effect.name: candidate.values})
+    best = fitter.fit(effects, noise, {**fit.values, candidate.effect.name: candidate.values})
+    best = fitter.fit_with_noise(effects, fit.noise.like(best.residual), best.values, rounds=1)
     # a better optimum of the noise must not count for the effect
     without = fitter.fit_with_noise(fit.effects, best.noise, fit.values, rounds=1)
     drop = min(fit.deviance, without.deviance) - best.deviance
@@ -246,6 +249,7 @@ def about(problem: Problem, fit: Fit) -> tuple[Fitter, Fit]:
     fitter = Fitter(problem, problem.residual)
     fit = fitter.fit(fit.effects, fit.noise, fit.values)
     for _ in range(ROUNDS):
+        fit = refined(fitter, fit)
         explained = fitter.residual - fit.residual
         noise, left = estimated(problem, problem.residual - explained, fit.noise.rotation)
         fitter = fitter.with_residual(explained + left)
@@ -253,20 +257,22 @@ def about(problem: Problem, fit: Fit) -> tuple[Fitter, Fit]:
     return fitter, fit
 
 
-def refined(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
-    """A fit with the times at which an effect begins and ends made finer than the grid they were found on."""
-    times = [spec for spec in effect.parameters if is_time_of_run(spec)]
-    if all(fit.values[effect.name][spec.name] == spec.default for spec in times):
-        return fit
+def refined(fitter: Fitter, fit: Fit) -> Fit:
+    """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
+    moving = [
+        (effect.name, spec.name)
+        for effect in fit.effects
+        for spec in effect.parameters
+        if is_time_of_run(spec) and np.isfinite(fit.values[effect.name][spec.name])
+    ]
     step = seconds / WINDOW_STEPS
-    while step > seconds / 500.0:
+    while moving and step > seconds / FINEST:
         step /= 2.0
-        for spec in times:
+        for name, time in moving:
             for sign in (-1.0, 1.0):
-                values = dict(fit.values[effect.name])
-                values[spec.name] = float(np.clip(values[spec.name] + sign * step, 0.0, seconds))
-                trial = fitter.fit(fit.effects, fit.noise, {**fit.values, effect.name: values})
+                at = float(np.clip(fit.values[name][time] + sign * step, 0.0, seconds))
+                trial = fitter.fit(fit.effects, fit.noise, {**fit.values, name: {**fit.values[name], time: at}})
                 if trial.deviance < fit.deviance:
                     fit = trial
     return fit

@@ -20,6 +20,8 @@ from .problem import Problem
 LEVEL = 0.002
 TIME_KNOTS = 7
 HEADING_HARMONICS = 4
+# Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
+SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
 # Directions of the dictionary that hold less of their length than this beside the others are left out
 INDEPENDENT = 1e-3
 
@@ -106,12 +108,53 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
             recoloured = _recoloured(noise, known, raw, fit.residual)
             tests.append((recoloured[0], name))
             energies.append(recoloured[1])
+    for line in _lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
+        tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
+        columns.append(_along_axes(line.waves))
     raw = np.concatenate(columns, axis=2)
     log_p, energy = explained(q, noise.whiten(raw), white, variance)
     best, name = min(tests)
     best = best + np.log(len(tests) + 1)
     together = log_p + np.log(len(tests) + 1)
     return Unexplained(min(best, together, 0.0), max(energy, *energies), name, raw)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """The clearest line in the spectrum of one recording. log_p: adjusted for all frequencies looked at, up to a
+    factor. waves: (M, 2) cosine and sine, zero in other recordings.
+    """
+
+    period_s: float
+    log_p: float
+    waves: Array
+
+
+def _lines(problem: Problem, innovations: Array) -> list[_Line]:
+    """Lines in the innovations (M, 3), of unit variance, of each recording that is long enough.
+
+    Noise of the sky has no period, coloured as it may be. Waves have: what is left of them at the pairing of two
+    sensors is no finding, so only periods longer than theirs count.
+    """
+    found = []
+    for index, recording in enumerate(problem.recordings):
+        at = problem.recording_of == index
+        step = SHORTEST_PERIOD_S / 5.0
+        position = ((problem.time[at] - problem.time[at][0]) / step).astype(int)
+        sums = np.stack([np.bincount(position, series) for series in innovations[at].T])
+        n = 2 * sums.shape[1]  # twice as fine as independent frequencies are
+        frequency = np.fft.rfftfreq(n, step)
+        power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(at)  # chi-square of 2 degrees of freedom
+        inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
+        if not inside.any():
+            continue
+        log_p = np.vstack([chi2.logsf(power, 2), chi2.logsf(power.sum(axis=0), 6)])[:, inside]
+        best = int(np.argmin(log_p.min(axis=0)))
+        period = 1.0 / float(frequency[inside][best])
+        phase = 2.0 * np.pi * problem.time / period
+        waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
+        found.append(_Line(period, float(log_p.min() + np.log(log_p.size)), waves))
+    return found
 
 
 def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:
