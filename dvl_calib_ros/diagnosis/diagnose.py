@@ -80,8 +80,8 @@ def diagnose_recordings(
     selection = select(problem, testable)
     rest = unexplained(selection.fitter, selection.fit)
     gap = measure_gap(selection, rest.columns)
-    if selection.selected and not gap.after < gap.before:
-        # what does not shrink the error on held-out data is no explanation, however unlikely it is to be chance
+    if selection.selected and not gap.interval[0] > 0.0:
+        # what does not surely shrink the error on held-out data is no explanation, however unlikely it is to be chance
         selection = selection.withdrawn()
         rest = unexplained(selection.fitter, selection.fit)
         gap = measure_gap(selection, rest.columns)

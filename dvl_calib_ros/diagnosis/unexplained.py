@@ -110,7 +110,8 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
             energies.append(recoloured[1])
     for line in _lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
         tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
-        columns.append(_along_axes(line.waves))
+        if line.log_p < np.log(LEVEL):  # the best of many would always explain some of the noise
+            columns.append(_along_axes(line.waves))
     raw = np.concatenate(columns, axis=2)
     log_p, energy = explained(q, noise.whiten(raw), white, variance)
     best, name = min(tests)
