@@ -53,14 +53,16 @@ def held_out(selection: Selection, dictionary: Array, only: Effect | None = None
     """What is left before and after the effects of a selection, on held-out data.
 
     Effects are selected, and fitted with the calibration, on all folds but one, and judged on that; `only`: that one
-    effect in all folds. The noise floor is what is left by everything together, the dictionary of `unexplained` too,
-    with the degrees of freedom given back: so it shares the noise of before and after, and their differences are exact
-    to the size of the gap rather than of the noise.
+    effect in all folds. The noise floor is what is left by everything together, the dictionary of `unexplained` too if
+    given, with the degrees of freedom given back: so it shares the noise of before and after, and their differences are
+    exact to the size of the gap rather than of the noise. A simulator that lacks nothing would still be calibrated on
+    the other folds: what that costs belongs to the floor.
     """
     fitter, fit = selection.fitter, selection.fit
     block, fold = blocks_of(fitter.problem)
     seen = selection.dictionary.seen(fit.noise, fitter.residual)
     before, after = np.empty_like(fitter.residual), np.empty_like(fitter.residual)
+    floor = _floor(fitter, fit, dictionary)
     for held in np.unique(fold):
         test = fold[block] == held
         train = seen.without(test)
@@ -69,7 +71,9 @@ def held_out(selection: Selection, dictionary: Array, only: Effect | None = None
         if fit.effects:
             chosen = [fit.effects.index(only)] if only is not None else selected_again(train)
             after[test] = train.left(train.solved(chosen), chosen)[test]
-    return HeldOutResiduals(before, after, _floor(fitter, fit, dictionary), block)
+        base = fitter.problem.base[test]
+        floor[test] += np.einsum("mip,pq,miq->mi", base, train.covariance([]), base, optimize=True)
+    return HeldOutResiduals(before, after, floor, block)
 
 
 def measure_gap(selection: Selection, dictionary: Array, only: Effect | None = None) -> Gap:

@@ -231,6 +231,11 @@ class Seen:
         normal = self.gram[np.ix_(columns, columns)] + np.diag(prior)
         return np.asarray(solve(normal, self.gram[columns] @ self._target(chosen), assume_a="pos"))
 
+    def covariance(self, chosen: Sequence[int]) -> Array:
+        """(6 + p, 6 + p) of the steps of `solved`."""
+        columns, prior = self._columns(chosen)
+        return np.asarray(np.linalg.inv(self.gram[np.ix_(columns, columns)] + np.diag(prior)))
+
     def left(self, steps: Array, chosen: Sequence[int]) -> Array:
         """(M, 3) m/s of the residual that is left with steps (6 + p,) of the chosen variants."""
         columns, _ = self._columns(chosen)

@@ -7,7 +7,7 @@ not know the vehicle's motion, so what follows it is systematic, whatever its ca
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -29,7 +29,8 @@ INDEPENDENT = 1e-3
 @dataclass(frozen=True)
 class Unexplained:
     """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
-    variance, beyond what chance brings. about: what the rest follows. columns: (M, 3, f), the dictionary.
+    variance, beyond what chance brings. about: what the rest follows. columns: (M, 3, f), the dictionary; empty if
+    nothing is left, since it would only explain noise.
     """
 
     log_p: float
@@ -117,7 +118,8 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     best, name = min(tests)
     best = best + np.log(len(tests) + 1)
     together = log_p + np.log(len(tests) + 1)
-    return Unexplained(min(best, together, 0.0), max(energy, *energies), name, raw)
+    found = Unexplained(min(best, together, 0.0), max(energy, *energies), name, raw)
+    return found if found.found else replace(found, columns=raw[:, :, :0])
 
 
 @dataclass(frozen=True)
