@@ -28,8 +28,8 @@ from rosbags.typesys.store import Typestore
 
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from .attachments import attach
+from .drivers import IMU_TYPE, TWIST_TYPE, VELOCITY_TYPES
 from .errors import InputError
-from .messages import IMU_TYPE, TWIST_TYPE
 from .salvage import MCAP_MAGIC, SQLITE_MAGIC, DamagedError, Salvaged, salvage_mcap, salvage_sqlite
 from .yaml_files import load_yaml
 
@@ -80,19 +80,40 @@ class _Source:
         self.span_ns = span_ns
         self.messages = messages
         self._definitions = definitions
-        self._stores: dict[str, Typestore] = {}
+        self._stores: dict[str, list[Typestore]] = {}
 
-    def typestore(self, msgtype: str) -> Typestore:
-        """Types for a message: from the definition embedded in the bag, else Jazzy's."""
+    def decode(self, msgtype: str, data: bytes) -> Any:
+        """A message, by the definition embedded in the bag, else by Jazzy's or those of `VELOCITY_TYPES`."""
         if msgtype not in self._stores:
-            definition = self._definitions.get(msgtype)
-            if definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip():
-                self._stores[msgtype] = get_typestore(Stores.ROS2_JAZZY)
-            else:
-                store = get_typestore(Stores.EMPTY)
-                store.register(_parse_definition(definition, msgtype))
-                self._stores[msgtype] = store
-        return self._stores[msgtype]
+            self._stores[msgtype] = self._typestores(msgtype)
+        stores = self._stores[msgtype]
+        for store in stores[:-1]:  # of several versions, the one that a message fits from beginning to end
+            with suppress(Exception):
+                message = store.deserialize_cdr(data, msgtype)
+                self._stores[msgtype] = [store]
+                return message
+        return stores[-1].deserialize_cdr(data, msgtype)
+
+    def embeds(self, msgtype: str) -> bool:
+        """Whether the bag says how messages of a type are laid out; those of before ROS 2 Iron do not."""
+        definition = self._definitions.get(msgtype)
+        return not (
+            definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
+        )
+
+    def _typestores(self, msgtype: str) -> list[Typestore]:
+        if self.embeds(msgtype):
+            store = get_typestore(Stores.EMPTY)
+            store.register(_parse_definition(self._definitions[msgtype], msgtype))
+            return [store]
+        known = VELOCITY_TYPES[msgtype].definitions if msgtype in VELOCITY_TYPES else ()
+        stores = []
+        for text in known or ("",):
+            store = get_typestore(Stores.ROS2_JAZZY)
+            if text:
+                store.register(get_types_from_msg(text, msgtype))
+            stores.append(store)
+        return stores
 
 
 def _parse_definition(definition: _Definition, msgtype: str) -> Any:
@@ -138,6 +159,18 @@ class BagReader:
         """Topic -> message type."""
         return {topic: msgtype for source in self._sources for topic, msgtype in source.topics.items()}
 
+    def types_of(self, topic: str) -> set[str]:
+        """All types that the recordings hold on a topic; one, if all is well."""
+        return {source.topics[topic] for source in self._sources if topic in source.topics}
+
+    def lacks_definition(self, topic: str) -> bool:
+        """Whether a recording has a topic of a type that is not Jazzy's, without its definition."""
+        return any(
+            msgtype in VELOCITY_TYPES and VELOCITY_TYPES[msgtype].definitions and not source.embeds(msgtype)
+            for source in self._sources
+            for msgtype in [source.topics.get(topic, "")]
+        )
+
     @property
     def message_counts(self) -> Counter[str]:
         """Topic -> number of messages, as the recordings' indexes say."""
@@ -155,7 +188,7 @@ class BagReader:
         """Messages of these topics."""
         for log_ns, source, topic, msgtype, data in self._merged(topics):
             try:
-                message, why = self._sources[source].typestore(msgtype).deserialize_cdr(data, msgtype), ""
+                message, why = self._sources[source].decode(msgtype, data), ""
             except SerdeError as error:
                 message, why = None, str(error)
             except Exception as error:  # a damaged definition or message can break the generated decoder anyhow

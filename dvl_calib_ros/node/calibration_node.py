@@ -27,11 +27,13 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..calibration.screening import usable_covariance
+from ..io.drivers import REFERENCE_TYPES, VELOCITY_TYPES, velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
 from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
 from .diagnostics import diagnose
+from .message_types import message_class
 from .parameters import declare_parameters
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
@@ -47,6 +49,9 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
         parameters = declare_parameters(self)
+        dvl_type = velocity_type("dvl_type", parameters.dvl_type, VELOCITY_TYPES)
+        gnss_type = velocity_type("gnss_type", parameters.gnss_type, REFERENCE_TYPES)
+        dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
         if parameters.result_file:
             check_writable(Path(parameters.result_file))
         initial = None
@@ -55,7 +60,7 @@ class CalibrationNode(Node):
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
-        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._feed = MessageFeed(self._calibrator, self._warn, dvl_type, gnss_type)
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
@@ -75,8 +80,8 @@ class CalibrationNode(Node):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
-        self._subscribe(TwistWithCovarianceStamped, "dvl/twist", self._on_dvl)
-        self._subscribe(TwistWithCovarianceStamped, "gnss/twist", self._on_reference)
+        self._subscribe(dvl_class, "dvl/twist", self._on_dvl)
+        self._subscribe(gnss_class, "gnss/twist", self._on_reference)
         self._subscribe(Imu, "imu/data", self._on_imu)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
@@ -145,14 +150,14 @@ class CalibrationNode(Node):
         stamp = message.header.stamp
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
-    def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
+    def _on_dvl(self, message: Any) -> None:
         self._last_dvl = time.monotonic()
         sample = self._feed.dvl(message, self._received_ns(message))
         if sample is not None:
             self._publish_corrected(sample)
         self._publish_if_updated()
 
-    def _on_reference(self, message: TwistWithCovarianceStamped) -> None:
+    def _on_reference(self, message: Any) -> None:
         self._feed.reference(message, self._received_ns(message))
         self._publish_if_updated()
 
@@ -216,11 +221,25 @@ class CalibrationNode(Node):
 
     def _publish_diagnostics(self) -> None:
         silent = None if self._last_dvl is None else time.monotonic() - self._last_dvl
-        problems = list(self._feed.problems.values())
+        problems = [*self._feed.problems.values(), *self._unheard()]
         status = diagnose(self._calibrator, problems, silent, time.monotonic() - self._started)
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
+
+    def _unheard(self) -> list[str]:
+        """Publishers of other types than the topic is subscribed with: the middleware does not even mention them."""
+        names = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
+        sentences = []
+        for topic, parameter in names.items():
+            own = getattr(self._feed, parameter).name
+            for publisher in self.get_publishers_info_by_topic(self._inputs[topic].topic_name):
+                if publisher.topic_type != own:
+                    sentences.append(
+                        f"{topic}: {publisher.node_name} publishes {publisher.topic_type}, which is not heard; set "
+                        f"{parameter} to it if it is the right one ({own} is expected)"
+                    )
+        return sentences
 
     # ------------------------------------------------------------------ services, parameters
 
@@ -250,7 +269,8 @@ class CalibrationNode(Node):
         save_text(path, self._result_text())
 
     def _result_text(self) -> str:
-        return result_text(result_document(self._calibrator.result(), self._feed.dvl_frame or "dvl_link"))
+        feed = self._feed
+        return result_text(result_document(self._calibrator.result(), feed.dvl_frame or "dvl_link", feed.turns_dvl))
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
