@@ -39,8 +39,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Check everything, then write everything; or roll back."""
     from ..io.errors import InputError
 
-    if arguments.output is not None and arguments.urdf is None:
-        raise InputError("--output is where --urdf is written to; name that, too")
+    if arguments.urdf is None and (arguments.output is not None or arguments.joint is not None):
+        raise InputError("--output and --joint go with --urdf; name that, too")
     if arguments.rollback:
         _roll_back(arguments)
         return

@@ -25,6 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Print."""
+    if arguments.joint is not None and arguments.urdf is None:
+        from ..io.errors import InputError
+
+        raise InputError("--joint goes with --urdf; name that, too")
     if arguments.effects:
         from ..effects.table import effect_table
 
