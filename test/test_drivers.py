@@ -191,7 +191,7 @@ def test_the_transform_of_the_result_is_of_the_drivers_frame_and_the_mounting_of
     frame = rotation_from_quaternion([float(words[words.index(f"--{name}") + 1]) for name in ("qx", "qy", "qz", "qw")])
     calibrated = rotation_from_rpy(mounting["corrected_rpy"])
     np.testing.assert_allclose(frame, calibrated @ np.diag([1.0, -1.0, -1.0]), atol=1e-8)
-    assert mounting["dvl_data_axes"] == "forward-right-down"
+    assert mounting["dvl_data_axes"] == "frd"
 
 
 # ---------------------------------------------------------------- invalid data

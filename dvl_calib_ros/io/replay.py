@@ -147,7 +147,7 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         name = getattr(topics, role)
         types = bag.types_of(name)
         if types - wanted:
-            held, expected = " and ".join(sorted(types)), " or ".join(sorted(wanted))
+            held, expected = " and ".join(sorted(types)), " or ".join(wanted)
             raise InputError(f"{where}: topic {name} holds {held}, expected {expected}; set --{role}-topic")
         if len(types) > 1:
             raise InputError(
