@@ -57,11 +57,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(replayed: Replayed, models: Sequence[str]) -> None:
-    from rich.markup import escape
-
-    errors, result = common.console(stderr=True), replayed.result
-    for note in replayed.notes:
-        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+    result = replayed.result
+    common.print_warnings(replayed.notes)
     out = common.console()
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
