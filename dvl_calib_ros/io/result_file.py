@@ -132,7 +132,7 @@ def save_text(path: Path, text: str) -> None:
             os.replace(backup, target.with_name(f"{target.name}.bak"))
             backup = ""
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         remedy = "free some space, or name a file on another disk" if full else "name another place"
         raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
     finally:
