@@ -94,6 +94,15 @@ def console(stderr: bool = False) -> Console:
     return Console(stderr=stderr, width=wide, highlight=False, emoji=False)
 
 
+def print_warnings(notes: Sequence[str]) -> None:
+    """What the user should know, on standard error."""
+    from rich.markup import escape
+
+    errors = console(stderr=True)
+    for note in notes:
+        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+
+
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[float], None]]:
     """A progress bar for a share of 0..1, on standard error and only if that is a terminal."""

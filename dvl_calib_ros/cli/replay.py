@@ -49,11 +49,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(notes, result, models) -> None:  # type: ignore[no-untyped-def]
-    from rich.markup import escape
-
-    errors = common.console(stderr=True)
-    for note in notes:
-        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+    common.print_warnings(notes)
     out = common.console()
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     seconds = 1e-9 * (result.last_ns - result.first_ns)

@@ -97,6 +97,12 @@ def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
+def changed_parameters(parameters: Parameters) -> dict[str, Any]:
+    """Name -> value of what is not at its default, as `Parameters.as_dict`."""
+    default = Parameters().as_dict()
+    return {name: value for name, value in parameters.as_dict().items() if value != default[name]}
+
+
 def parameter_file_text() -> str:
     """`config/calibration.yaml`: every parameter at its default, described."""
     lines = [
