@@ -69,29 +69,20 @@ class Silence:
     def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, str]:
         """Stream -> what is wrong, and the remedy. counts: the calibrator's, as of now."""
         newest_ns = calibrator.newest_ns
-        coming = set()
         for stream in newest_ns:
             taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in _NOT_TAKEN)
             if stream not in self._seen or self._seen[stream].taken != taken:
                 self._seen[stream] = _Seen(taken, now_s)
-                coming.add(stream)
-        faults = {
-            stream: fault
-            for stream in _STREAMS
-            if stream not in coming and (fault := self._silent(stream, counts, newest_ns, now_s))
-        }
+        silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
+        faults = {}
+        for stream, (name, remedy) in _STREAMS.items():
+            if not counts[stream]["received"]:
+                if stream == "dvl" and now_s - self._started_s > SILENCE_S:
+                    faults[stream] = f"no {name} message yet: {remedy}"
+            elif silent_s[stream] > SILENCE_S:
+                faults[stream] = f"no usable {name} message for {silent_s[stream]:.0f} s: {remedy}"
+        coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
         return faults | _other_times(newest_ns, coming, calibrator.parameters.max_time_jump)
-
-    def _silent(self, stream: str, counts: Counts, newest_ns: Mapping[str, int | None], now_s: float) -> str | None:
-        name, remedy = _STREAMS[stream]
-        newest = newest_ns[stream]
-        if not counts[stream]["received"]:
-            waited = now_s - self._started_s > SILENCE_S
-            return f"no {name} message yet: {remedy}" if waited and stream == "dvl" else None
-        latest = max((ns for ns in newest_ns.values() if ns is not None), default=0)
-        behind_s = 0.0 if newest is None else 1e-9 * (latest - newest)  # a bag may be played fast
-        silent_s = max(now_s - self._seen[stream].since_s, behind_s)
-        return f"no usable {name} message for {silent_s:.0f} s: {remedy}" if silent_s > SILENCE_S else None
 
 
 def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump_s: float) -> dict[str, str]:
