@@ -13,6 +13,7 @@ from ..calibration.advice import consistency_advice, data_advice, gate_advice, m
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate
+from .status import STATUS_NAME
 
 # A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0
@@ -117,12 +118,13 @@ def diagnose(
     warnings = [*silent.values(), *problems, *_restart_advice(grown), *message_advice(grown), *data_advice(grown)]
     warnings += gate_advice(estimate) + consistency_advice(estimate)
     level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-    status = DiagnosticStatus(level=level, name="dvl_calibration: calibration", hardware_id="dvl")
+    status = DiagnosticStatus(level=level, name=STATUS_NAME, hardware_id="dvl")
     status.message = "; ".join(faults + warnings) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
         "why": selection.reason(calibrator.parameters),
         "gnss": selection.gnss.reason,
+        "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
         **_estimate_values(estimate),
         **_count_values(estimate, counts),
@@ -151,6 +153,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
         factor, unit = (math.degrees(1.0), "deg") if name.startswith("phi") else (100.0, "%")
         values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
         values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
+        values[f"progress {name} [%]"] = f"{100.0 * entry.progress:.1f}"
         values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"
     for index, nuisance in enumerate(model.nuisance, start=model.n_errors):
         values[f"{nuisance.name} [{nuisance.unit}]"] = f"{estimate.state[index]:.4f}"
@@ -158,6 +161,9 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     low, high = estimate.nis_bounds
     rows = model.n_measurement
     values["mean NIS"] = f"{estimate.mean_nis:.3f} of {rows} (99 %: {low:.3f} .. {high:.3f})"
+    # the same once more as bare numbers, 1 where noise is what it is taken for: plotters read no words
+    values["NIS ratio"] = f"{estimate.mean_nis / rows:.4f}"
+    values["NIS ratio low"], values["NIS ratio high"] = f"{low / rows:.4f}", f"{high / rows:.4f}"
     return values
 
 
