@@ -71,7 +71,7 @@ def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):
             "the diagnostics to name it",
         )
         said = diagnostics[-1].status[0].message
-        assert "test_client publishes nav_msgs/msg/Odometry" in said
+        assert "test_client publishes nav_msgs/msg/Odometry, where" in said
         world.node.destroy_publisher(publisher)
         count = len(diagnostics)
         until(lambda: len(diagnostics) > count + 1, "diagnostics after it")

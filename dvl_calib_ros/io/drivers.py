@@ -28,14 +28,13 @@ ENOUGH_BEAMS = 3
 class Rule(NamedTuple):
     """When a message's velocity is not to be believed, however plausible it looks.
 
-    counter: under which such messages are counted. says: what is wrong with them, in words. advice: what to do about
-    it, where that is not part of every dive.
+    counter: under which such messages are counted. says: what is wrong with them, in words. remedy: what to do.
     """
 
     counter: str
     says: str
     broken: Callable[[Any, Parameters], bool]
-    advice: str = ""
+    remedy: str
 
     @property
     def in_words(self) -> str:
@@ -74,6 +73,14 @@ class VelocityType:
                 return rule
         return None
 
+    def advice(self, counts: Mapping[str, int]) -> list[str]:
+        """What is wrong with the messages that were not used for breaking rules; from `Calibrator.counts` of dvl."""
+        return [
+            f"{counts[rule.counter]} DVL messages are not used: {rule.in_words}; {rule.remedy}"
+            for rule in self.rules
+            if counts.get(rule.counter)
+        ]
+
 
 def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
     def broken(message: Any, _: Parameters) -> bool:
@@ -81,17 +88,21 @@ def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
         return bool(velocity.x == 0.0 and velocity.y == 0.0 and velocity.z == 0.0)
 
     # no sensor measures exactly nothing on three axes, but drivers send it for want of a measurement
-    return Rule("zero_velocity", "exactly zero on all three axes", broken)
+    return Rule("zero_velocity", "exactly zero on all three axes", broken, "check bottom lock, and the driver")
 
 
-def _flagged(field: str, advice: str = "") -> Rule:
+def _flagged(field: str) -> Rule:
     flag = attrgetter(field)
-    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: not flag(message), advice)
+    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: not flag(message), _CHECK_LOCK)
 
 
+_CHECK_LOCK = "check that the bottom is in range and nothing is before the beams"
 # the sensor sends altitude -1 without bottom lock; 0 is what a driver leaves that does not fill it
 _NO_BOTTOM = Rule(
-    "no_bottom", "`altitude` is negative or not finite", lambda message, _: not 0.0 <= message.altitude < math.inf
+    "no_bottom",
+    "`altitude` is negative or not finite",
+    lambda message, _: not 0.0 <= message.altitude < math.inf,
+    _CHECK_LOCK,
 )
 
 
@@ -218,6 +229,7 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
                     "few_beams",
                     f"`num_good_beams` below {ENOUGH_BEAMS}",
                     lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
+                    _CHECK_LOCK,
                 ),
                 _NO_BOTTOM,
                 _zero_velocity(_VELOCITY),
@@ -234,12 +246,15 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             points_down=True,  # the sensor's axes (docs.waterlinked.com/dvl/axes), handed on as they are
             rules=(
                 _flagged("velocity_valid"),
-                Rule("few_beams", f"fewer than {ENOUGH_BEAMS} of its `beams` are `valid`", _few_beams_listed),
+                Rule(
+                    "few_beams", f"fewer than {ENOUGH_BEAMS} of its `beams` are `valid`", _few_beams_listed, _CHECK_LOCK
+                ),
                 _NO_BOTTOM,
                 Rule(
                     "poor_fom",
                     "`fom` (m/s) above `max_fom`, negative or not finite",
                     lambda message, parameters: not 0.0 <= message.fom <= parameters.max_fom,
+                    _CHECK_LOCK,
                 ),
                 _zero_velocity(_VELOCITY),
             ),
@@ -253,10 +268,13 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
     )
 }
 REFERENCE_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
+# what the parameters of these names may name
+TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": VELOCITY_TYPES, "gnss_type": REFERENCE_TYPES}
 
 
-def velocity_type(parameter: str, name: str, types: Mapping[str, VelocityType]) -> VelocityType:
-    """The type that a parameter names, ``package/msg/Name`` or ``package/Name``. Raises InputError."""
+def velocity_type(parameter: str, name: str) -> VelocityType:
+    """The type that parameter dvl_type or gnss_type names, as package/msg/Name or package/Name. Raises InputError."""
+    types = TYPES_OF[parameter]
     package, _, rest = name.partition("/")
     found = types.get(f"{package}/msg/{rest.removeprefix('msg/')}")
     if found is None:

@@ -15,7 +15,10 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.frames import FLU_FROM_FRD, Array, Vector
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from .drivers import TWIST_TYPE, VELOCITY_TYPES, Rule, VelocityType
+from .drivers import TWIST_TYPE, VELOCITY_TYPES, VelocityType
+
+# Different frame_ids of the reference that are remembered.
+MAX_FRAMES = 64
 
 EARTH_FRAMES = {
     "enu": VelocityFrame.ENU,
@@ -93,14 +96,17 @@ class MessageFeed:
         reference_type: VelocityType = VELOCITY_TYPES[TWIST_TYPE],
     ) -> None:
         self.calibrator = calibrator
-        self.problems: dict[str, str] = {}
-        self.zero_stamps = 0
-        self.dvl_type = dvl_type
-        self._dvl_reader: _Reader | None = None
-        self.gnss_type = reference_type
+        self.dvl_type, self.gnss_type = dvl_type, reference_type
         self._reference_reader = _Reader(reference_type)
         self._on_problem = on_problem
-        self.dvl_frame: str | None = calibrator.parameters.dvl_frame or None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the problems and the frames seen."""
+        self.problems: dict[str, str] = {}
+        self.zero_stamps = 0
+        self.dvl_frame: str | None = self.calibrator.parameters.dvl_frame or None
+        self._dvl_reader: _Reader | None = None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, VelocityFrame | None] = {}
 
@@ -119,7 +125,7 @@ class MessageFeed:
                 return None
             broken = kind.broken_rule(message, calibrator.parameters)
             if broken is not None:
-                self._note_broken_rule(broken)
+                calibrator.refuse("dvl", broken.counter)
                 return None
             velocity, covariance = (self._dvl_reader or self._make_dvl_reader(frame_id))(message)
             stamp = self._stamp_ns("dvl", message.header, received_ns)
@@ -134,6 +140,8 @@ class MessageFeed:
         try:
             frame_id = self.gnss_type.frame_id(message)
             if frame_id not in self._reference_frames:
+                if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
+                    self._reference_frames.clear()
                 self._reference_frames[frame_id] = self._reference_frame(frame_id)
             frame = self._reference_frames[frame_id]
             if frame is None:
@@ -212,11 +220,6 @@ class MessageFeed:
                 "that of a frame whose z points down, set dvl_axes to flu, which takes the data as they are.",
             )
         return self._dvl_reader
-
-    def _note_broken_rule(self, rule: Rule) -> None:
-        self.calibrator.refuse("dvl", rule.counter)
-        if rule.advice:
-            self._problem(f"dvl {rule.counter}", f"dvl: {rule.in_words}: such messages are not used; {rule.advice}")
 
     def _is_body_or_earth(self, frame_id: str) -> bool:
         name = frame_id.lstrip("/")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice
+from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
 from ..calibration.observations import Observations
@@ -243,7 +243,7 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    notes = data_advice(result.counts)
+    notes = message_advice(result.counts) + feed.dvl_type.advice(dvl) + data_advice(result.counts)
     if feed.zero_stamps:
         notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
     for estimate in result.estimates.values():
@@ -254,9 +254,8 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
 def _remedy(feed: MessageFeed) -> str:
     """What is known of the DVL's messages that were refused."""
     known = [sentence for kind, sentence in feed.problems.items() if kind.startswith("dvl")]
-    refused = feed.calibrator.counts["dvl"]
-    broken = [f"{rule.counter}: {rule.in_words}." for rule in feed.dvl_type.rules if rule.counter in refused]
-    return " ".join(broken + known) or "Valid is finite, with variances that are not negative, and not above max_speed."
+    known += feed.dvl_type.advice(feed.calibrator.counts["dvl"])
+    return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 
 def _counted(counts: Any) -> str:

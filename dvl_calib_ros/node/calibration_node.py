@@ -27,12 +27,13 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..calibration.screening import usable_covariance
-from ..io.drivers import REFERENCE_TYPES, VELOCITY_TYPES, velocity_type
+from ..io.drivers import velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
 from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
-from .diagnostics import diagnose
+from .diagnostics import RecentCounts, Silence, diagnose
+from .graph import input_problems, output_problems
 from .message_types import message_class
 from .parameters import declare_parameters
 
@@ -49,8 +50,8 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
         parameters = declare_parameters(self)
-        dvl_type = velocity_type("dvl_type", parameters.dvl_type, VELOCITY_TYPES)
-        gnss_type = velocity_type("gnss_type", parameters.gnss_type, REFERENCE_TYPES)
+        dvl_type = velocity_type("dvl_type", parameters.dvl_type)
+        gnss_type = velocity_type("gnss_type", parameters.gnss_type)
         dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
         if parameters.result_file:
             check_writable(Path(parameters.result_file))
@@ -64,8 +65,8 @@ class CalibrationNode(Node):
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
-        self._started = time.monotonic()
-        self._last_dvl: float | None = None
+        self._silence, self._recent = Silence(time.monotonic()), RecentCounts()
+        self._save_problem: str | None = None
 
         self._estimate = self._output_message()
         self._corrected = self._output_message()
@@ -125,11 +126,6 @@ class CalibrationNode(Node):
                 self.get_logger().info(f"{topic}: a publisher is best effort; subscribing as best effort")
                 assert self.executor is not None  # it runs this callback
                 self.executor.create_task(resubscribe)
-            else:
-                self._feed.problems[f"{topic} qos"] = (
-                    f"{topic}: a publisher offers an incompatible QoS ({event.last_policy_kind.name}) and is not heard"
-                )
-                self._warn(self._feed.problems[f"{topic} qos"])
 
         def resubscribe() -> None:
             old = self._inputs[topic]
@@ -151,7 +147,6 @@ class CalibrationNode(Node):
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
     def _on_dvl(self, message: Any) -> None:
-        self._last_dvl = time.monotonic()
         sample = self._feed.dvl(message, self._received_ns(message))
         if sample is not None:
             self._publish_corrected(sample)
@@ -220,32 +215,30 @@ class CalibrationNode(Node):
         self._corrected_publisher.publish(message)
 
     def _publish_diagnostics(self) -> None:
-        silent = None if self._last_dvl is None else time.monotonic() - self._last_dvl
-        problems = [*self._feed.problems.values(), *self._unheard()]
-        status = diagnose(self._calibrator, problems, silent, time.monotonic() - self._started)
+        feed = self._feed
+        problems = [*feed.problems.values(), *self._topic_problems()]
+        if self._save_problem:
+            problems.append(self._save_problem)
+        status = diagnose(self._calibrator, feed.dvl_type, problems, self._silence, self._recent, time.monotonic())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
 
-    def _unheard(self) -> list[str]:
-        """Publishers of other types than the topic is subscribed with: the middleware does not even mention them."""
-        names = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
-        sentences = []
-        for topic, parameter in names.items():
-            own = getattr(self._feed, parameter).name
-            for publisher in self.get_publishers_info_by_topic(self._inputs[topic].topic_name):
-                if publisher.topic_type != own:
-                    sentences.append(
-                        f"{topic}: {publisher.node_name} publishes {publisher.topic_type}, which is not heard; set "
-                        f"{parameter} to it if it is the right one ({own} is expected)"
-                    )
-        return sentences
+    def _topic_problems(self) -> list[str]:
+        type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
+        problems = []
+        for topic, subscription in self._inputs.items():
+            problems += input_problems(self, subscription, type_parameters.get(topic))
+        for publisher in (self._estimate_publisher, self._corrected_publisher):
+            problems += output_problems(self, publisher)
+        return problems
 
     # ------------------------------------------------------------------ services, parameters
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
-        self._feed.problems.clear()
+        self._feed.forget()
+        self._recent = RecentCounts()
         self._correction = None
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"
@@ -266,7 +259,12 @@ class CalibrationNode(Node):
         return response
 
     def _save(self, path: Path) -> None:
-        save_text(path, self._result_text())
+        try:
+            save_text(path, self._result_text())
+        except InputError as error:
+            self._save_problem = f"the result was not saved: {error}"
+            raise
+        self._save_problem = None
 
     def _result_text(self) -> str:
         feed = self._feed
