@@ -18,6 +18,8 @@ PIECES = (
     "check the sensor, its driver and the topic dvl/twist",
     "the models that need attitude learn nothing; check its driver and the topic imu/data",
     "the DVL's own frame (dvl_link)",
+    "set … to it, or remap one of the two",
+    "remap one of the two, or convert",
     "dvl longest dropout [s]",
     "NIS ratio low",
     "NIS ratio high",
