@@ -1,11 +1,12 @@
-"""List every parameter, model and effect as the code defines them: the README's tables, and config/calibration.yaml."""
+"""List all parameters, models, effects and drivers of the code: the README's tables, and parameter files."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 NAME = "parameters"
-HELP = "list every parameter, model or effect, or write a parameter file"
+HELP = "list every parameter, model, effect or driver, or write a parameter file"
 EXAMPLE = "dvl-calib parameters --yaml > calibration.yaml"
 
 
@@ -14,15 +15,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--yaml", action="store_true", help="a ROS 2 parameter file with every default")
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
+    what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
+    what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
+    parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
+    parser.add_argument(
+        "--base-frame", default="base_link", metavar="LINK", help="body in the URDF; default: %(default)s"
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Print."""
+    if arguments.joint is not None and arguments.urdf is None:
+        from ..io.errors import InputError
+
+        raise InputError("--joint goes with --urdf; name that, too")
     if arguments.effects:
         from ..effects.table import effect_table
 
         print(effect_table(), end="")
+        return
+    if arguments.drivers:
+        from ..io.drivers import driver_table
+
+        print(driver_table(), end="")
+        return
+    if arguments.urdf is not None:
+        from ..io.mounting import urdf_parameters
+        from ..io.urdf import read_urdf
+
+        print(urdf_parameters(read_urdf(arguments.urdf), arguments.base_frame, "dvl_link", arguments.joint), end="")
         return
     from ..io.parameter_files import model_table, parameter_file_text, parameter_table
 

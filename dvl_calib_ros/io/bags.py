@@ -1,6 +1,7 @@
 """rosbag2 recordings: folders and single files, MCAP and SQLite, compressed or not, several at once, damaged ones.
 
-Reading and decoding is rosbags'; what rosbags gives up on goes to `salvage`.
+SQLite is read by rosbags, MCAP by its index with `salvage_mcap`, which bounds the memory; both until the first damage,
+where the salvaging readers take over. Decoding is rosbags'.
 """
 
 from __future__ import annotations
@@ -11,26 +12,30 @@ import sqlite3
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from enum import Enum
 from operator import itemgetter
 from pathlib import Path, PurePath
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any
 
+import apsw
 import numpy as np
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, ReaderError, StoragePlugin, Writer
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from .attachments import attach
+from .definitions import Definition, DefinitionError, is_empty, known_typestores, typestore
+from .drivers import IMU_TYPE, TWIST_TYPE, VELOCITY_TYPES
 from .errors import InputError
-from .messages import IMU_TYPE, TWIST_TYPE
-from .salvage import MCAP_MAGIC, SQLITE_MAGIC, DamagedError, Salvaged, salvage_mcap, salvage_sqlite
+from .salvage import LARGEST_RECORD, DamagedError, Salvaged
+from .salvage_mcap import MCAP_MAGIC, indexed_messages, read_summary, salvage_mcap
+from .salvage_sqlite import SQLITE_MAGIC, salvage_sqlite
 from .yaml_files import load_yaml
 
 if sys.version_info >= (3, 14):
@@ -41,18 +46,19 @@ else:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 ROS1_MAGIC = b"#ROSBAG"
 STORAGE_SUFFIXES = (".mcap", ".db3")
-
+# A compressed file that unpacks to more than this and so many times its size is no recording.
+LARGEST_RATIO, SMALL_FILE = 100, 1 << 30
+FORMATS = {
+    "ros2msg": MessageDefinitionFormat.MSG,
+    "ros2idl": MessageDefinitionFormat.IDL,
+    "omgidl": MessageDefinitionFormat.IDL,
+}
 
 # Plain tuples: there is one per message, and a named one would cost as much as a third of its decoding.
 BagMessage = tuple[str, int, Any, str]
 """Topic, log time (ns), decoded message (None if it cannot be decoded), and then why."""
 _Raw = tuple[int, int, str, str, bytes]
 """Log time (ns), index of the source, topic, type, CDR bytes; topic '' marks where a source begins."""
-
-
-class _Definition(NamedTuple):
-    format: MessageDefinitionFormat
-    text: str
 
 
 Messages = Callable[[set[str]], Iterator[tuple[int, str, str, bytes]]]
@@ -68,7 +74,7 @@ class _Source:
         path: Path,
         topics: dict[str, str],
         counts: dict[str, int],
-        definitions: dict[str, _Definition],
+        definitions: dict[str, Definition],
         span_ns: tuple[int, int],
         messages: Messages,
         damage_noted: bool = False,
@@ -80,31 +86,34 @@ class _Source:
         self.span_ns = span_ns
         self.messages = messages
         self._definitions = definitions
-        self._stores: dict[str, Typestore] = {}
+        self._stores: dict[str, list[Typestore] | DefinitionError] = {}
 
-    def typestore(self, msgtype: str) -> Typestore:
-        """Types for a message: from the definition embedded in the bag, else Jazzy's."""
+    def definition(self, topic: str) -> Definition | None:
+        """The embedded definition of a topic's messages."""
+        return self._definitions.get(self.topics[topic])
+
+    def decode(self, msgtype: str, data: bytes) -> Any:
+        """A message, by the definition embedded in the bag, else by those known here. Raises DefinitionError."""
+        stores = self._typestores(msgtype)
+        for store in stores[:-1]:  # of several versions, the one that a message fits from beginning to end
+            with suppress(Exception):
+                message = store.deserialize_cdr(data, msgtype)
+                self._stores[msgtype] = [store]
+                return message
+        return stores[-1].deserialize_cdr(data, msgtype)
+
+    def _typestores(self, msgtype: str) -> list[Typestore]:
         if msgtype not in self._stores:
             definition = self._definitions.get(msgtype)
-            if definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip():
-                self._stores[msgtype] = get_typestore(Stores.ROS2_JAZZY)
-            else:
-                store = get_typestore(Stores.EMPTY)
-                store.register(_parse_definition(definition, msgtype))
-                self._stores[msgtype] = store
-        return self._stores[msgtype]
-
-
-def _parse_definition(definition: _Definition, msgtype: str) -> Any:
-    if definition.format is MessageDefinitionFormat.MSG:
-        return get_types_from_msg(definition.text, msgtype)
-    separator = "=" * 80 + "\n"
-    types: dict[str, Any] = {}
-    for part in definition.text.split(separator):
-        idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
-        if idl.strip():
-            types.update(get_types_from_idl(idl))
-    return types
+            try:
+                known = is_empty(definition)
+                self._stores[msgtype] = known_typestores(msgtype) if known else [typestore(definition, msgtype)]
+            except DefinitionError as error:  # once, not for every message
+                self._stores[msgtype] = error
+        stores = self._stores[msgtype]
+        if isinstance(stores, DefinitionError):
+            raise stores
+        return stores
 
 
 class BagReader:
@@ -138,6 +147,20 @@ class BagReader:
         """Topic -> message type."""
         return {topic: msgtype for source in self._sources for topic, msgtype in source.topics.items()}
 
+    def types_of(self, topic: str) -> set[str]:
+        """All types that the recordings hold on a topic; one, if all is well."""
+        return {source.topics[topic] for source in self._sources if topic in source.topics}
+
+    def lacks_definition(self, topic: str) -> bool:
+        """Whether a recording has a topic of a driver's type that is not Jazzy's, without its definition."""
+        sources = [source for source in self._sources if topic in source.topics]
+        own = [source for source in sources if getattr(VELOCITY_TYPES.get(source.topics[topic]), "definitions", ())]
+        return any(is_empty(source.definition(topic)) for source in own)
+
+    def definition(self, topic: str) -> Definition | None:
+        """The embedded definition of a topic's messages, None if there is none."""
+        return next((source.definition(topic) for source in self._sources if topic in source.topics), None)
+
     @property
     def message_counts(self) -> Counter[str]:
         """Topic -> number of messages, as the recordings' indexes say."""
@@ -155,8 +178,8 @@ class BagReader:
         """Messages of these topics."""
         for log_ns, source, topic, msgtype, data in self._merged(topics):
             try:
-                message, why = self._sources[source].typestore(msgtype).deserialize_cdr(data, msgtype), ""
-            except SerdeError as error:
+                message, why = self._sources[source].decode(msgtype, data), ""
+            except (SerdeError, DefinitionError) as error:
                 message, why = None, str(error)
             except Exception as error:  # a damaged definition or message can break the generated decoder anyhow
                 message, why = None, f"{type(error).__name__}: {error}"
@@ -180,27 +203,33 @@ class BagReader:
         start_ns = newest_ns = source.span_ns[0]
         # a marker where it begins: merging opens a recording only when its time has come
         yield start_ns, index, "", "", b""
-        read = 0
+        read = lost = 0
         try:
             for log_ns, topic, msgtype, data in source.messages(topics):
+                newest_ns = log_ns
                 if data[:4] == ZSTD_MAGIC:  # message compression; CDR begins otherwise
-                    data = zstd.decompress(data)
+                    unpacked = _unpacked_message(data)
+                    if unpacked is None:
+                        lost += 1
+                        continue
+                    data = unpacked
                 yield log_ns, index, topic, msgtype, data
                 read += 1
-                newest_ns = log_ns
         except Exception as error:  # the readers raise all sorts of things on damaged bytes
             if not source.damage_noted:
                 self.notes.append(
-                    f"{source.path}: damaged ({_said(error)}); read up to the damage: {read} messages, "
+                    f"{source.path}: damaged ({_said(error)}); read {read} whole messages, "
                     f"{1e-9 * (newest_ns - start_ns):.1f} s"
                 )
+        if lost:
+            self.notes.append(f"{source.path}: {lost} compressed messages are damaged and left out")
 
     # ------------------------------------------------------------------ opening
 
     def _open(self, path: Path) -> list[_Source]:
         try:
             if path.is_dir():
-                return [self._open_file(file, file) for file in self._files_of(path)]
+                return self._open_folder(path)
             if not path.exists():
                 raise InputError(f"{path}: no such file or folder")
             if not path.is_file():
@@ -208,6 +237,19 @@ class BagReader:
             return [self._open_file(path, path)]
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check name, permissions and disk") from error
+
+    def _open_folder(self, folder: Path) -> list[_Source]:
+        """The recordings in a folder. One that gives nothing costs a note, not the others."""
+        sources, errors = [], []
+        for file in self._files_of(folder):
+            try:
+                sources.append(self._open_file(file, file))
+            except InputError as error:
+                errors.append(error)
+        if not sources:
+            raise errors[0]
+        self.notes += [f"{error}; the rest is read" for error in errors]
+        return sources
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The recordings in a folder: those that its metadata.yaml lists, or all if that is missing or damaged."""
@@ -249,25 +291,31 @@ class BagReader:
             magic = file.read(16)
         if magic.startswith(ZSTD_MAGIC) and path == shown:
             return self._open_file(self._decompressed(path), shown)
-        if magic.startswith(MCAP_MAGIC):
-            salvage = salvage_mcap
-        elif magic.startswith(SQLITE_MAGIC):
-            salvage = salvage_sqlite
+        # of a file whose first block was never written, the name has to do
+        kind = _storage_suffix(shown) if magic == bytes(16) else ""
+        if magic.startswith(MCAP_MAGIC) or kind == ".mcap":
+            open_source, salvage = self._mcap, salvage_mcap
+        elif magic.startswith(SQLITE_MAGIC) or kind == ".db3":
+            open_source, salvage = self._sqlite, salvage_sqlite
         elif magic.startswith(ROS1_MAGIC):
             raise InputError(f"{shown}: a ROS 1 bag; convert it first: rosbags-convert --src {shown.name} --dst NEW")
         else:
             raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap or .db3 file")
         try:
-            return self._with_rosbags(path, shown, salvage)
+            source = open_source(path, shown)
         except Exception as error:  # damaged files raise all sorts of things
             return self._salvaged(path, shown, salvage, _said(error))
+        return source or self._salvaged(path, shown, salvage, "")
 
     def _decompressed(self, path: Path) -> Path:
         target = self._temporary_folder() / (path.stem if path.suffix == ".zstd" else path.name)
+        most = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
         try:
             with zstd.open(path, "rb") as packed, target.open("wb") as unpacked:
                 while piece := packed.read1():  # as it comes: what precedes damage must be out before the damage
                     unpacked.write(piece)
+                    if unpacked.tell() > most:
+                        raise EOFError(f"it unpacks to more than {most} bytes")
         except (zstd.ZstdError, EOFError) as error:
             self.notes.append(f"{path}: damaged ({error}); what could be unpacked is used")
         return target
@@ -293,48 +341,65 @@ class BagReader:
     def _temporary_folder(self) -> Path:
         return Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
 
-    def _with_rosbags(self, path: Path, shown: Path, salvage: Salvage) -> _Source:
+    def _mcap(self, path: Path, shown: Path) -> _Source | None:
+        """An MCAP file by its index; None if it has none."""
+        summary = read_summary(path)
+        if summary is None or summary.statistics is None:
+            return None
+        statistics, schemas = summary.statistics, summary.schemas
+        names = {number: channel.topic for number, channel in summary.channels.items()}
+        types = {
+            number: schemas[channel.schema_id].name if channel.schema_id in schemas else ""
+            for number, channel in summary.channels.items()
+        }
+        counts: Counter[str] = Counter()
+        for number, count in statistics.channel_message_counts.items():
+            counts[names[number]] += count
+
+        def messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
+            channels = {number for number, name in names.items() if name in topics}
+            for log_ns, channel, data in indexed_messages(path, summary, channels):
+                yield log_ns, names[channel], types[channel], data
+
+        definitions = {
+            schema.name: Definition(
+                FORMATS.get(schema.encoding, MessageDefinitionFormat.NONE), schema.data.decode("utf-8", "replace")
+            )
+            for schema in schemas.values()
+        }
+        topics = {name: types[number] for number, name in names.items()}
+        span_ns = (statistics.message_start_time, statistics.message_end_time)
+        return _Source(shown, topics, counts, definitions, span_ns, _until_damage(messages, path, salvage_mcap, counts))
+
+    def _sqlite(self, path: Path, shown: Path) -> _Source:
         # rosbags goes by the suffix; the content has already said what it is
         reader = Reader(path)
         reader.open()
         self._stack.callback(reader.close)
+        reader.storage.dbconn.limit(apsw.SQLITE_LIMIT_LENGTH, LARGEST_RECORD)  # type: ignore[attr-defined]
         connections = list(reader.connections)
-        # without chunk index, rosbags takes a message out of order for damage
-        indexed = bool(getattr(reader.storage, "chunks", True))
-
-        def messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
-            chosen = [connection for connection in connections if connection.topic in topics]
-            newest_ns, read = -1, 0
-            newest: list[tuple[str, bytes]] = []
-            try:
-                for connection, log_ns, data in reader.messages(connections=chosen) if chosen else ():
-                    if log_ns != newest_ns:
-                        newest_ns, newest = log_ns, []
-                    newest.append((connection.topic, data))
-                    read += 1
-                    yield log_ns, connection.topic, connection.msgtype, data
-                if read < (announced := sum(connection.msgcount for connection in chosen)):
-                    raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
-            except Exception:  # rosbags gives up the whole chunk; its beginning may be whole
-                yield from _rest(salvage(path), topics, newest_ns, newest)
-                raise
-
         counts: Counter[str] = Counter()
         for connection in connections:
             counts[connection.topic] += connection.msgcount
+
+        def messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
+            chosen = [connection for connection in connections if connection.topic in topics]
+            for connection, log_ns, data in reader.messages(connections=chosen) if chosen else ():
+                yield log_ns, connection.topic, connection.msgtype, data
+
         return _Source(
             shown,
             {c.topic: c.msgtype for c in connections},
             counts,
-            {c.msgtype: _Definition(c.msgdef.format, c.msgdef.data) for c in connections},
+            {c.msgtype: Definition(c.msgdef.format, c.msgdef.data) for c in connections},
             (reader.start_time, reader.end_time),
-            messages if indexed else _in_file_order(path, salvage),
+            _until_damage(messages, path, salvage_sqlite, counts),
         )
 
     def _salvaged(self, path: Path, shown: Path, salvage: Salvage, why: str) -> _Source:
-        formats = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+        """A recording that is read from beginning to end. why: its index cannot be used, '' if it has none."""
         topics: dict[str, str] = {}
-        definitions: dict[str, _Definition] = {}
+        definitions: dict[str, Definition] = {}
         counts: Counter[str] = Counter()
         first_ns, last_ns = 2**63 - 1, 0
         damage = ""
@@ -342,23 +407,55 @@ class BagReader:
             for message in salvage(path):
                 if message.topic not in topics:
                     topics[message.topic] = message.msgtype
-                    format_ = formats.get(message.encoding, MessageDefinitionFormat.NONE)
-                    definitions[message.msgtype] = _Definition(format_, message.definition)
+                    format_ = FORMATS.get(message.encoding, MessageDefinitionFormat.NONE)
+                    definitions[message.msgtype] = Definition(format_, message.definition)
                 counts[message.topic] += 1
                 first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
         except DamagedError as error:
             damage = str(error)
         total = sum(counts.values())
-        if not total:
+        if not total and (damage or why):
             raise InputError(f"{shown}: damaged, and no whole message in it ({damage or why}); use another recording")
         read = f"{total} whole messages, {1e-9 * (last_ns - first_ns):.1f} s"
-        self.notes.append(
-            f"{shown}: damaged or cut off ({damage}); read up to the damage: {read}"
-            if damage
-            else f"{shown}: has no usable index ({why}); read from beginning to end: {read}"
-        )
+        if damage:
+            self.notes.append(f"{shown}: damaged or cut off ({damage}); read {read}")
+        elif why:
+            self.notes.append(f"{shown}: has no usable index ({why}); read from beginning to end: {read}")
         messages = _in_file_order(path, salvage)
         return _Source(shown, topics, counts, definitions, (first_ns, last_ns), messages, damage_noted=True)
+
+
+def _unpacked_message(data: bytes) -> bytes | None:
+    """A message that was compressed by itself; None if it is damaged, or claims to be larger than messages are."""
+    try:
+        decompressor = zstd.ZstdDecompressor()
+        unpacked = decompressor.decompress(data, max_length=LARGEST_RECORD)
+    except zstd.ZstdError:
+        return None
+    return unpacked if decompressor.eof else None
+
+
+def _until_damage(messages: Messages, path: Path, salvage: Salvage, counts: Mapping[str, int]) -> Messages:
+    """Messages as an index leads to them, after damage those that salvaging finds. counts: what the index announces."""
+
+    def all_messages(topics: set[str]) -> Iterator[tuple[int, str, str, bytes]]:
+        newest_ns, read = -1, 0
+        newest: list[tuple[str, bytes]] = []
+        try:
+            for message in messages(topics):
+                log_ns, topic, _, data = message
+                if log_ns != newest_ns:
+                    newest_ns, newest = log_ns, []
+                newest.append((topic, data))
+                read += 1
+                yield message
+            if read < (announced := sum(counts[topic] for topic in topics if topic in counts)):
+                raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
+        except Exception as error:  # damaged files raise all sorts of things
+            damage = yield from _rest(salvage(path), topics, newest_ns, newest)
+            raise DamagedError(damage or _said(error)) from error
+
+    return all_messages
 
 
 def _in_file_order(path: Path, salvage: Salvage) -> Messages:
@@ -372,17 +469,23 @@ def _in_file_order(path: Path, salvage: Salvage) -> Messages:
 
 def _rest(
     salvaged: Iterator[Salvaged], topics: set[str], newest_ns: int, newest: list[tuple[str, bytes]]
-) -> Iterator[tuple[int, str, str, bytes]]:
-    """What of a damaged recording comes after the messages that its index led to (at newest_ns: `newest`)."""
-    rest = []
-    with suppress(DamagedError):
+) -> Generator[tuple[int, str, str, bytes], None, str]:
+    """What of a damaged recording comes after the messages that its index led to (at newest_ns: `newest`).
+
+    Returns what is damaged.
+    """
+    rest, damage = [], ""
+    try:
         for message in salvaged:
             is_later = message.log_ns > newest_ns or (
                 message.log_ns == newest_ns and (message.topic, message.data) not in newest
             )
             if is_later and message.topic in topics:
                 rest.append((message.log_ns, message.topic, message.msgtype, message.data))
-    yield from sorted(rest, key=lambda message: message[0])
+    except DamagedError as error:
+        damage = str(error)
+    yield from sorted(rest, key=itemgetter(0))
+    return damage
 
 
 def _said(error: Exception) -> str:
@@ -424,6 +527,9 @@ _COMPRESSION = {
     Compression.MESSAGE: CompressionMode.MESSAGE,
     Compression.FILE: CompressionMode.FILE,
 }
+
+
+UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
 
 
 class BagWriter:
@@ -499,6 +605,17 @@ class BagWriter:
             linear_acceleration_covariance=unknown,
         )
         self._write(topic, IMU_TYPE, sample.stamp_ns, message)
+
+    def raw(self, topic: str, msgtype: str, definition: Definition | None, log_ns: int, data: bytes) -> None:
+        """Write a message as it was recorded, its definition with it."""
+        if topic not in self._connections:
+            try:
+                type_hash = typestore(definition, msgtype).hash_rihs01(msgtype)
+            except Exception:  # unknown types and damaged definitions raise all sorts of things; the messages are whole
+                type_hash = UNKNOWN_HASH
+            text = "" if definition is None else definition.text
+            self._connections[topic] = self._writer.add_connection(topic, msgtype, msgdef=text, rihs01=type_hash)
+        self._writer.write(self._connections[topic], log_ns, data)
 
     def _twist(self, sample: DvlSample | ReferenceSample, frame_id: str) -> Any:
         types = self._store.types

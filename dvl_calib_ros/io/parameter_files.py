@@ -11,6 +11,7 @@ import yaml
 
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
+from .drivers import TYPES_OF, velocity_type
 from .errors import InputError
 from .yaml_files import load_yaml, parse_scalar
 
@@ -39,9 +40,12 @@ def load_parameters(
         if not is_ros_parameter(name):
             values[name] = "" if value is None else value
     try:
-        return Parameters.from_mapping(values)
+        parameters = Parameters.from_mapping(values)
     except ParameterError as error:
         raise InputError(f"-p {error}") from error
+    for name in TYPES_OF:
+        velocity_type(name, getattr(parameters, name))
+    return parameters
 
 
 def _node_parameters(path: Path) -> dict[str, Any]:
@@ -95,6 +99,12 @@ def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
         name = f"{prefix}{key}"
         values |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return values
+
+
+def changed_parameters(parameters: Parameters) -> dict[str, Any]:
+    """Name -> value of what is not at its default, as `Parameters.as_dict`."""
+    default = Parameters().as_dict()
+    return {name: value for name, value in parameters.as_dict().items() if value != default[name]}
 
 
 def parameter_file_text() -> str:

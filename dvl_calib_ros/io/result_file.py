@@ -18,9 +18,10 @@ import numpy as np
 import yaml
 
 from .. import __version__
-from ..calibration.frames import quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.frames import FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.parameters import FLU, FRD
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
 from .errors import InputError
@@ -41,14 +42,20 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, Any]:
-    """A result as plain data for the result file."""
+def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = False) -> dict[str, Any]:
+    """A result as plain data for the result file.
+
+    turned: the driver's data are forward-right-down and were turned. The mounting is that of the forward-left-up axes,
+    as mounting_rpy is; the transform is that of dvl_frame itself, for those who use the driver's data as they come.
+    """
     estimate = result.estimate
     parameters = result.parameters
     nominal = rotation_from_rpy(parameters["mounting_rpy"])
     corrected = estimate.rotation_body_from_dvl(nominal.T)
     rpy, quaternion = rpy_from_rotation(corrected), quaternion_from_rotation(corrected)
+    to_frame = quaternion_from_rotation(corrected @ FLU_FROM_FRD) if turned else quaternion
     verification = result.verifications.get(result.selected)
+    parent, child = parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
     return {
         "format": FORMAT,
         "software": f"dvl_calib_ros {__version__}",
@@ -64,9 +71,10 @@ def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, An
             "corrected_rpy": rpy.tolist(),
             "corrected_quaternion_xyzw": list(quaternion),
             "scale_error_xyz": estimate.scale.tolist(),
-            "static_transform_publisher": _static_transform_publisher(
-                parameters["lever_arm"], quaternion, parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
-            ),
+            "dvl_data_axes": FRD if turned else FLU,
+            "frame_id": parent,
+            "child_frame_id": child,
+            "static_transform_publisher": _static_transform_publisher(parameters["lever_arm"], to_frame, parent, child),
         },
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
@@ -85,10 +93,17 @@ def _std_in_words(estimate: Estimate) -> dict[str, str]:
 
 
 def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str:
+    return (
+        f"ros2 run tf2_ros static_transform_publisher {static_transform_arguments(position, quaternion, parent, child)}"
+    )
+
+
+def static_transform_arguments(position: Any, quaternion: Any, parent: str, child: str) -> str:
+    """Arguments of tf2's static_transform_publisher: position (3,) m and quaternion (x, y, z, w) of child in parent."""
     numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
     arguments = " ".join(f"--{name} {value:.9g}" for name, value in numbers)
     frames = f"--frame-id {shlex.quote(parent)} --child-frame-id {shlex.quote(child)}"  # a bag may name any frame
-    return f"ros2 run tf2_ros static_transform_publisher {arguments} {frames}"
+    return f"{arguments} {frames}"
 
 
 def result_text(document: Mapping[str, Any]) -> str:
@@ -111,6 +126,11 @@ def check_writable(path: Path) -> None:
 
 
 def save_text(path: Path, text: str) -> None:
+    """Write a text as `save_bytes` does."""
+    save_bytes(path, text.encode())
+
+
+def save_bytes(path: Path, content: bytes) -> None:
     """Write a file so that it is always the old or the new one, whole; the old one is kept as ``.bak``.
 
     Raises InputError; then the old file is untouched.
@@ -121,7 +141,7 @@ def save_text(path: Path, text: str) -> None:
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=".dvl_calib.", suffix=".tmp")
         with os.fdopen(handle, "wb") as file:
             os.fchmod(file.fileno(), 0o644)
-            file.write(text.encode())
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         if target.exists():
@@ -129,10 +149,10 @@ def save_text(path: Path, text: str) -> None:
         os.replace(temporary, target)
         temporary = ""
         if backup:
-            os.replace(backup, target.with_name(f"{target.name}.bak"))
+            os.replace(backup, backup_of(target))
             backup = ""
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         remedy = "free some space, or name a file on another disk" if full else "name another place"
         raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
     finally:
@@ -141,6 +161,12 @@ def save_text(path: Path, text: str) -> None:
                 os.unlink(left)
     with suppress(OSError):  # the file is there; not every file system can sync a folder
         _sync_folder(target.parent)
+
+
+def backup_of(path: Path) -> Path:
+    """Where the file is that `save_bytes` last replaced; beside what a link points to."""
+    target = Path(os.path.realpath(path))
+    return target.with_name(f"{target.name}.bak")
 
 
 def _second_name(path: Path, name: str) -> str:
@@ -165,6 +191,13 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
 
     mounting_rpy: the nominal mounting to go on with. The file's angles are relative to its own, which must be that.
     """
+    content, known = load_result(path)
+    _check_mounting(path, content, mounting_rpy)
+    return known
+
+
+def load_result(path: Path) -> tuple[dict[str, Any], dict[str, GaussianState]]:
+    """A result file's document, and its states and covariances by model name. Raises InputError."""
     content = load_yaml(path, "result file")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
@@ -176,10 +209,9 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
     known = {
         name: _gaussian(f"{path}: models: {name}", name, saved) for name, saved in models.items() if name in MODELS
     }
-    _check_mounting(path, content, mounting_rpy)
     if not known:
         raise InputError(f"{path}: none of its models {', '.join(map(str, models))} is one of {', '.join(MODELS)}")
-    return known
+    return content, known
 
 
 def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequence[float] | None) -> None:

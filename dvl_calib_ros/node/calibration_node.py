@@ -27,11 +27,14 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..calibration.screening import usable_covariance
+from ..io.drivers import velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
 from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
-from .diagnostics import diagnose
+from .diagnostics import RecentCounts, Silence, diagnose
+from .graph import input_problems, output_problems
+from .message_types import message_class
 from .parameters import declare_parameters
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
@@ -47,6 +50,9 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
         parameters = declare_parameters(self)
+        dvl_type = velocity_type("dvl_type", parameters.dvl_type)
+        gnss_type = velocity_type("gnss_type", parameters.gnss_type)
+        dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
         if parameters.result_file:
             check_writable(Path(parameters.result_file))
         initial = None
@@ -55,12 +61,12 @@ class CalibrationNode(Node):
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
-        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._feed = MessageFeed(self._calibrator, self._warn, dvl_type, gnss_type)
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
-        self._started = time.monotonic()
-        self._last_dvl: float | None = None
+        self._silence, self._recent = Silence(time.monotonic()), RecentCounts()
+        self._save_problem: str | None = None
 
         self._estimate = self._output_message()
         self._corrected = self._output_message()
@@ -75,8 +81,8 @@ class CalibrationNode(Node):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
-        self._subscribe(TwistWithCovarianceStamped, "dvl/twist", self._on_dvl)
-        self._subscribe(TwistWithCovarianceStamped, "gnss/twist", self._on_reference)
+        self._subscribe(dvl_class, "dvl/twist", self._on_dvl)
+        self._subscribe(gnss_class, "gnss/twist", self._on_reference)
         self._subscribe(Imu, "imu/data", self._on_imu)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
@@ -120,11 +126,6 @@ class CalibrationNode(Node):
                 self.get_logger().info(f"{topic}: a publisher is best effort; subscribing as best effort")
                 assert self.executor is not None  # it runs this callback
                 self.executor.create_task(resubscribe)
-            else:
-                self._feed.problems[f"{topic} qos"] = (
-                    f"{topic}: a publisher offers an incompatible QoS ({event.last_policy_kind.name}) and is not heard"
-                )
-                self._warn(self._feed.problems[f"{topic} qos"])
 
         def resubscribe() -> None:
             old = self._inputs[topic]
@@ -145,14 +146,13 @@ class CalibrationNode(Node):
         stamp = message.header.stamp
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
-    def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
-        self._last_dvl = time.monotonic()
+    def _on_dvl(self, message: Any) -> None:
         sample = self._feed.dvl(message, self._received_ns(message))
         if sample is not None:
             self._publish_corrected(sample)
         self._publish_if_updated()
 
-    def _on_reference(self, message: TwistWithCovarianceStamped) -> None:
+    def _on_reference(self, message: Any) -> None:
         self._feed.reference(message, self._received_ns(message))
         self._publish_if_updated()
 
@@ -215,18 +215,30 @@ class CalibrationNode(Node):
         self._corrected_publisher.publish(message)
 
     def _publish_diagnostics(self) -> None:
-        silent = None if self._last_dvl is None else time.monotonic() - self._last_dvl
-        problems = list(self._feed.problems.values())
-        status = diagnose(self._calibrator, problems, silent, time.monotonic() - self._started)
+        feed = self._feed
+        problems = [*feed.problems.values(), *self._topic_problems()]
+        if self._save_problem:
+            problems.append(self._save_problem)
+        status = diagnose(self._calibrator, feed.dvl_type, problems, self._silence, self._recent, time.monotonic())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
+
+    def _topic_problems(self) -> list[str]:
+        type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
+        problems = []
+        for topic, subscription in self._inputs.items():
+            problems += input_problems(self, subscription, type_parameters.get(topic))
+        for publisher in (self._estimate_publisher, self._corrected_publisher):
+            problems += output_problems(self, publisher)
+        return problems
 
     # ------------------------------------------------------------------ services, parameters
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
-        self._feed.problems.clear()
+        self._feed.forget()
+        self._recent = RecentCounts()
         self._correction = None
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"
@@ -247,10 +259,16 @@ class CalibrationNode(Node):
         return response
 
     def _save(self, path: Path) -> None:
-        save_text(path, self._result_text())
+        try:
+            save_text(path, self._result_text())
+        except InputError as error:
+            self._save_problem = f"the result was not saved: {error}"
+            raise
+        self._save_problem = None
 
     def _result_text(self) -> str:
-        return result_text(result_document(self._calibrator.result(), self._feed.dvl_frame or "dvl_link"))
+        feed = self._feed
+        return result_text(result_document(self._calibrator.result(), feed.dvl_frame or "dvl_link", feed.turns_dvl))
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:

@@ -1,0 +1,45 @@
+"""Write what is whole in damaged recordings, all topics, to a new bag that every tool reads; say how much it is."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from pathlib import Path
+
+from . import common
+
+NAME = "salvage"
+HELP = "write what is whole in damaged recordings to a new bag"
+PROGRESS_EVERY = 1000
+EXAMPLE = "dvl-calib salvage cut_off_bag -o whole_bag"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write")
+    common.add_storage_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Read everything, write it, say what was lost."""
+    from ..io.bags import BagReader, BagWriter, Compression, Storage
+    from ..io.errors import InputError
+
+    counts: Counter[str] = Counter()
+    with BagReader(arguments.bags) as reader:
+        topics, total = reader.topics, max(sum(reader.message_counts.values()), 1)
+        if not topics:
+            raise InputError(f"{', '.join(map(str, arguments.bags))}: there is no message in it; record it again")
+        definitions = {topic: reader.definition(topic) for topic in topics}
+        writer = BagWriter(arguments.output, Storage(arguments.storage), Compression(arguments.compression))
+        with common.progress("salvaging") as on_progress, writer:
+            for number, (topic, log_ns, data) in enumerate(reader.raw_messages(topics)):
+                writer.raw(topic, topics[topic], definitions[topic], log_ns, data)
+                counts[topic] += 1
+                if number % PROGRESS_EVERY == 0:
+                    on_progress(number / total)
+        common.print_warnings(reader.notes)
+    for topic, count in sorted(counts.items()):
+        print(f"{topic}: {count} messages")
+    print(f"{arguments.output}: {counts.total()} messages")
