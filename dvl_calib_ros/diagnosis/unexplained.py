@@ -99,6 +99,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     white = white - q @ (q.T @ white)
     variance = float(white @ white) / (len(white) - q.shape[1])
     tests: list[tuple[float, str]] = []
+    recoloured: list[tuple[float, str]] = []
     columns, energies = [], [0.0]
     for name, functions in dictionary(problem).items():
         raw = _along_axes(functions)
@@ -106,19 +107,21 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
         for block in _per_axis(raw):
             tests.append((explained(q, noise.whiten(block), white, variance)[0], name))
         if noise.is_coloured and name != "time":  # what changes with time alone may as well be noise
-            recoloured = _recoloured(noise, known, raw, fit.residual)
-            tests.append((recoloured[0], name))
-            energies.append(recoloured[1])
+            log_p, energy = _recoloured(noise, known, raw, fit.residual)
+            recoloured.append((log_p, name))
+            energies.append(energy)
     for line in _lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
         tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
         if line.log_p < np.log(LEVEL):  # the best of many would always explain some of the noise
             columns.append(_along_axes(line.waves))
     raw = np.concatenate(columns, axis=2)
     log_p, energy = explained(q, noise.whiten(raw), white, variance)
+    looked_at = float(np.log(len(tests) + len(recoloured) + 1))
     best, name = min(tests)
-    best = best + np.log(len(tests) + 1)
-    together = log_p + np.log(len(tests) + 1)
-    found = Unexplained(min(best, together, 0.0), max(energy, *energies), name, raw)
+    if best + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
+        best, name = min([*tests, *recoloured])
+    log_p = min(best, *(each for each, _ in recoloured), log_p) + looked_at
+    found = Unexplained(min(log_p, 0.0), max(energy, *energies), name, raw)
     return found if found.found else replace(found, columns=raw[:, :, :0])
 
 
