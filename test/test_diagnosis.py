@@ -123,11 +123,11 @@ def test_the_noise_of_a_dvl_at_constant_speed_is_not_taken_for_a_delay():
 
 def test_what_comes_and_goes_with_a_period_of_its_own_is_unknown():
     def bursts(seen):
-        return np.outer(seen.time % 22.0 < 9.0, [0.03, 0.03, 0.0])
+        return np.outer(seen.time % 34.0 < 15.0, [0.03, 0.03, 0.0])
 
-    diagnosis = diagnosed(unknown=bursts)
+    diagnosis = diagnosed("figure8", unknown=bursts)
     assert diagnosis.verdict is Verdict.UNKNOWN
-    assert "a period of 22 s" in diagnosis.sentence
+    assert "a period of 34 s" in diagnosis.sentence
 
 
 def test_a_gap_that_the_library_lacks_is_unknown():

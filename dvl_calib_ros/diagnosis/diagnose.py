@@ -38,6 +38,8 @@ MIN_VISIBLE_SHARE = 0.5
 # The rest, as a share of the gap, from which a combination of effects does not explain it
 UNEXPLAINED_SHARE = 0.25
 POWER = 0.8
+# p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
+WEAK = 1e-3
 # Recordings whose mounting differs by more than this (rad) are not of one vehicle
 SAME_MOUNTING = np.deg2rad(3.0)
 
@@ -80,8 +82,7 @@ def diagnose_recordings(
     selection = select(problem, testable)
     rest = unexplained(selection.fitter, selection.fit)
     gap = measure_gap(selection, rest.columns)
-    if selection.selected and not gap.interval[0] > 0.0:
-        # what does not surely shrink the error on held-out data is no explanation, however unlikely it is to be chance
+    if selection.selected and not _is_borne_out(selection, gap, len(testable)):
         selection = selection.withdrawn()
         rest = unexplained(selection.fitter, selection.fit)
         gap = measure_gap(selection, rest.columns)
@@ -166,6 +167,12 @@ def _check_mountings(recordings: Sequence[Recording], rotation_dvl_from_body: Ar
                 f"{np.degrees(abs(a - b)[axis]):.1f}° about {'xyz'[axis]}, so the DVL was mounted differently; "
                 "diagnose them one at a time, or give each its mounting_rpy"
             )
+
+
+def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
+    """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
+    p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
+    return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before
 
 
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
