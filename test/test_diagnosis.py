@@ -16,6 +16,7 @@ from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.problem import PRIOR_STD, calibrated, lowpassed
 from dvl_calib_ros.diagnosis.recordings import make_recording
 from dvl_calib_ros.diagnosis.results import Verdict, diagnosis_document
+from dvl_calib_ros.diagnosis.unexplained import lines
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.io.errors import InputError
@@ -123,11 +124,19 @@ def test_the_noise_of_a_dvl_at_constant_speed_is_not_taken_for_a_delay():
 
 def test_what_comes_and_goes_with_a_period_of_its_own_is_unknown():
     def bursts(seen):
-        return np.outer(seen.time % 34.0 < 15.0, [0.03, 0.03, 0.0])
+        return np.outer(seen.time % 22.0 < 9.0, [0.03, 0.03, 0.0])
 
-    diagnosis = diagnosed("figure8", unknown=bursts)
-    assert diagnosis.verdict is Verdict.UNKNOWN
-    assert "a period of 34 s" in diagnosis.sentence
+    assert diagnosed(unknown=bursts).verdict is Verdict.UNKNOWN
+
+
+def test_a_line_in_the_spectrum_is_found_at_its_period_and_noise_has_none(rng):
+    problem = calibrated([recording()], np.eye(3))
+    innovations = rng.standard_normal((len(problem.time), 3))
+    (chance,) = lines(problem, innovations)
+    innovations[:, 1] += 0.4 * np.sin(2.0 * np.pi * problem.time / 34.0)
+    (line,) = lines(problem, innovations)
+    assert line.period_s == pytest.approx(34.0, rel=0.03)
+    assert line.log_p < np.log(1e-6) < chance.log_p
 
 
 def test_a_gap_that_the_library_lacks_is_unknown():

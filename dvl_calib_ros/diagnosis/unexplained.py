@@ -110,7 +110,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
             log_p, energy = _recoloured(noise, known, raw, fit.residual)
             recoloured.append((log_p, name))
             energies.append(energy)
-    for line in _lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
+    for line in lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
         tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
         if line.log_p < np.log(LEVEL):  # the best of many would always explain some of the noise
             columns.append(_along_axes(line.waves))
@@ -126,7 +126,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
 
 
 @dataclass(frozen=True)
-class _Line:
+class Line:
     """The clearest line in the spectrum of one recording. log_p: adjusted for all frequencies looked at, up to a
     factor. waves: (M, 2) cosine and sine, zero in other recordings.
     """
@@ -136,7 +136,7 @@ class _Line:
     waves: Array
 
 
-def _lines(problem: Problem, innovations: Array) -> list[_Line]:
+def lines(problem: Problem, innovations: Array) -> list[Line]:
     """Lines in the innovations (M, 3), of unit variance, of each recording that is long enough.
 
     Noise of the sky has no period, coloured as it may be. Waves have: what is left of them at the pairing of two
@@ -159,7 +159,7 @@ def _lines(problem: Problem, innovations: Array) -> list[_Line]:
         period = 1.0 / float(frequency[inside][best])
         phase = 2.0 * np.pi * problem.time / period
         waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
-        found.append(_Line(period, float(log_p.min() + np.log(log_p.size)), waves))
+        found.append(Line(period, float(log_p.min() + np.log(log_p.size)), waves))
     return found
 
 
