@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -99,9 +99,17 @@ class World:
         return messages
 
     @contextmanager
-    def calibration_node(self, *ros_arguments: str, stop: signal.Signals = signal.SIGINT):
-        """The node in a process of its own, with (name:=value) parameters; stopped at the end."""
-        command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args"]
+    def calibration_node(
+        self,
+        *ros_arguments: str,
+        stop: signal.Signals = signal.SIGINT,
+        entry: Sequence[str] = ("-m", "dvl_calib_ros.node.main"),
+    ):
+        """The node in a process of its own, with (name:=value) parameters; stopped at the end.
+
+        entry: what Python is to run.
+        """
+        command = [sys.executable, *entry, "--ros-args"]
         for argument in ros_arguments:
             command += ["-p", argument]
         environment = os.environ | {"ROS_DOMAIN_ID": str(self.domain), "PYTHONPATH": str(ROOT)}

@@ -289,7 +289,7 @@ def check_sums(calibrator: Calibrator):
     dvl, pairing = counts["dvl"], counts["pairing"]
     lost = ("invalid", "wrong_frame", "duplicate", "out_of_order", "stray", "held")
     assert dvl["received"] == dvl["accepted"] + sum(dvl[key] for key in lost)
-    unused = ("slow", "turning", "no_turn_rate", "awaiting_imu")
+    unused = ("slow", "frozen", "turning", "no_turn_rate", "awaiting_imu")
     assert dvl["accepted"] == dvl["usable"] + sum(dvl[key] for key in unused)
     passed_on = dvl["accepted"] - dvl["awaiting_imu"]
     assert passed_on == pairing["paired"] + pairing["unpaired"] + pairing["awaiting_reference"]
@@ -417,3 +417,35 @@ def test_what_other_topics_still_bring_from_before_a_restart_is_not_paired_with_
     assert_same(looped, calibrate(first + rest), atol=1e-12)
     counts = looped.counts
     assert counts["reference"]["before_restart"] + counts["imu"]["before_restart"] == len(late)
+
+
+# ---------------------------------------------------------------- faults of one stream
+
+
+def test_a_reference_whose_clock_is_far_ahead_does_not_cost_the_attitude():
+    """It would say of every DVL sample that nothing can come for it any more, however late the IMU is."""
+    samples = make_samples(variant(NOISY, gnss_phase=0))
+    imu_last = sorted(samples, key=lambda s: (s.stamp_ns, isinstance(s, ImuSample)))
+    ahead = [shifted([s], 3600 * SECOND)[0] if isinstance(s, ReferenceSample) else s for s in imu_last]
+    assert_same(calibrate(ahead), calibrate(only(samples, DvlSample, ImuSample)))
+
+
+def test_a_velocity_repeated_more_than_max_repeats_times_is_not_used():
+    samples = make_samples(NOISY)
+    dvl = only(samples, DvlSample)
+    held = {s.stamp_ns for s in dvl[100:120]}
+    frozen = [s._replace(velocity=dvl[99].velocity) if isinstance(s, DvlSample) and s.stamp_ns in held else s
+              for s in samples]  # fmt: skip
+    assert calibrate(frozen).counts["dvl"]["repeated"] == 20
+    counts = calibrate(frozen, Parameters(max_repeats=2)).counts["dvl"]
+    assert (counts["repeated"], counts["frozen"], counts["usable"]) == (20, 18, len(dvl) - 18)
+
+
+def test_a_dropout_is_longer_than_a_second_and_than_the_rate_explains():
+    every_2_s = make_samples(variant(NOISY, dvl_every=200))
+    assert calibrate(every_2_s).counts["dvl"]["dropouts"] == 0
+    calibrator = calibrate([s for s in make_samples(NOISY) if not 10 < (s.stamp_ns - START_NS) / SECOND < 11])
+    assert calibrator.counts["dvl"]["dropouts"] == 0
+    calibrator = calibrate([s for s in make_samples(NOISY) if not 10 < (s.stamp_ns - START_NS) / SECOND < 11.1])
+    assert calibrator.counts["dvl"]["dropouts"] == 1
+    assert calibrator.longest_dropout_ns == 1_200_000_000

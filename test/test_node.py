@@ -20,9 +20,10 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 from conftest import ROOT
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
+from live import LATCHED, assert_agree
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros import NODE, World, until
 from std_srvs.srv import Trigger
 
@@ -37,7 +38,6 @@ from dvl_calib_ros.node.player import BagPlayer
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Bags are played much faster than recorded here, on machines that stall: topics may lag each other by minutes of
 # stamps without being given up.
 PATIENT = {"max_latency": 600.0}
@@ -81,17 +81,6 @@ def diagnosed(messages, key):
     """Latest value of a key in /diagnostics."""
     values = {item.key: item.value for message in messages[-1:] for item in message.status[0].values}
     return values.get(key)
-
-
-def assert_agree(saved: dict, result) -> None:
-    for name in MODELS:
-        live, offline = saved["models"][name], result.estimates[name]
-        np.testing.assert_allclose(live["state"], offline.state, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(live["covariance"], offline.covariance, rtol=0, atol=1e-12)
-        assert (live["used"], live["gated"]) == (offline.used, offline.gated)
-    assert saved["model"] == result.selected
-    assert [(each["from_ns"], each["model"]) for each in saved["selected"]] == list(result.segments)
-    assert saved["counts"] == result.counts
 
 
 # ---------------------------------------------------------------- a process of its own
@@ -348,7 +337,7 @@ def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
         assert diagnosed(diagnostics, "dvl wrong_frame") == diagnosed(diagnostics, "dvl invalid") == "1"
         assert diagnosed(diagnostics, "model") == "F1"
         until(lambda: diagnostics[-1].status[0].level == DiagnosticStatus.ERROR, "the DVL to be reported silent")
-        assert "no DVL message for" in diagnostics[-1].status[0].message
+        assert "no usable DVL message for" in diagnostics[-1].status[0].message
 
 
 def test_calibrated_twist_is_the_corrected_velocity_in_the_body_with_both_uncertainties(world, tmp_path):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
@@ -36,6 +36,9 @@ from .streams import Bracket, Order, S, Sequencer, Track
 from .verification import Verification, held_out_error, verify
 
 SECOND_NS = 1_000_000_000
+# A DVL that sends nothing for so long, and for so many times its shortest interval, has dropped out.
+DROPOUT_NS = SECOND_NS
+DROPOUT_INTERVALS = 3
 # How much of the past of GNSS and IMU is kept for a DVL that lags them, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS
 NEVER_NS = 2**63 - 1
@@ -120,7 +123,6 @@ class Calibrator:
         self._on_event = on_event
         self._on_block = on_block
         self._verified = verified
-        self.restarts = 0
         self._offset_ns = round(parameters.dvl_time_offset * 1e9)
         self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
         self._lever_arm: Vector | None = (
@@ -137,6 +139,7 @@ class Calibrator:
     def reset(self) -> None:
         """Forget all samples and what was learnt from them."""
         p = self.parameters
+        self.restarts = 0
         jump_ns = self._max_jump_ns = round(p.max_time_jump * 1e9)
         latency_ns = round(p.max_latency * 1e9)
         gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
@@ -174,6 +177,10 @@ class Calibrator:
         self._deadline_ns = NEVER_NS
         self._first_ns: int | None = None
         self.last_ns: int | None = None
+        self._shortest_interval_ns = NEVER_NS
+        self.longest_dropout_ns = 0
+        self._velocity_before: Vector | None = None
+        self._repeats = 0
         self._decided_ns: int | None = None
         self._prior = _PriorWindow(self.parameters, self._prior_sway_heave)
 
@@ -197,10 +204,19 @@ class Calibrator:
             self.last_ns = one.stamp_ns
             if self._first_ns is None:
                 self._first_ns = one.stamp_ns
+            else:
+                self._note_interval(interval_ns)
             self._awaiting_imu.append(_Moving(one.stamp_ns, one.velocity, one.covariance, interval_ns))
         if admitted:
             self._advance()
         return bool(admitted)
+
+    def _note_interval(self, interval_ns: int) -> None:
+        """Count it if it is a dropout. `longest_dropout_ns` is the longest since the start or the last restart."""
+        self._shortest_interval_ns = shortest_ns = min(self._shortest_interval_ns, interval_ns)
+        if interval_ns > DROPOUT_NS and interval_ns > DROPOUT_INTERVALS * shortest_ns:
+            self._tally["dvl"]["dropouts"] += 1
+            self.longest_dropout_ns = max(self.longest_dropout_ns, interval_ns)
 
     def feed_reference(self, sample: ReferenceSample) -> None:
         """Take a reference (GNSS) velocity."""
@@ -290,7 +306,7 @@ class Calibrator:
 
     def _advance(self) -> None:
         """Let DVL samples go on as far as their partners are decided; note what the next ones wait for."""
-        horizon_ns = max(self._dvl_order.last_ns or 0, self._reference.newest_ns or 0, self._imu.newest_ns or 0)
+        horizon_ns = self._horizon_ns()
         self._blocked_by = ()
         self._deadline_ns = NEVER_NS
         while self._awaiting_imu:
@@ -324,6 +340,15 @@ class Calibrator:
         if len(self._paired) >= size:
             self._update(Needs.REFERENCE)
 
+    def _horizon_ns(self) -> int:
+        """Newest stamp of any stream that keeps the DVL's time.
+
+        One whose clock is far ahead would say of every DVL sample that nothing can come for it any more.
+        """
+        dvl_ns = self._dvl_order.last_ns or 0
+        tracks_ns = (self._reference.newest_ns or 0, self._imu.newest_ns or 0)
+        return max((ns for ns in tracks_ns if dvl_ns < ns <= dvl_ns + self._max_jump_ns), default=dvl_ns)
+
     def _is_decided(self, track: Track[Any], stamp_ns: int, horizon_ns: int) -> bool:
         """Whether a DVL sample need not wait for a track any more; if it must, note for what and until when."""
         if track.decided(stamp_ns, horizon_ns):
@@ -355,6 +380,8 @@ class Calibrator:
         x, y, z = sample.velocity
         if x * x + y * y + z * z < p.min_speed * p.min_speed:
             return "slow"
+        if self._is_frozen(sample.velocity):
+            return "frozen"
         if p.max_turn_rate > 0.0:
             if sample.angular_velocity is None:
                 return "no_turn_rate"
@@ -362,6 +389,15 @@ class Calibrator:
             if x * x + y * y + z * z > p.max_turn_rate * p.max_turn_rate:
                 return "turning"
         return None
+
+    def _is_frozen(self, velocity: Vector) -> bool:
+        """Whether a velocity has been repeated, to the last bit, more often than max_repeats allows."""
+        if velocity != self._velocity_before:
+            self._velocity_before, self._repeats = velocity, 0
+            return False
+        self._repeats += 1
+        self._tally["dvl"]["repeated"] += 1
+        return 0 < self.parameters.max_repeats < self._repeats
 
     def _take_oriented(self, sample: _Moving) -> None:
         bracket = self._imu.bracket(sample.stamp_ns)
@@ -419,10 +455,9 @@ class Calibrator:
     # ------------------------------------------------------------------ models
 
     def _n_waiting(self, needs: Needs) -> int:
-        waiting: dict[Needs, Sized] = {
-            Needs.NOTHING: self._plain, Needs.ATTITUDE: self._oriented, Needs.REFERENCE: self._paired,
-        }  # fmt: skip
-        return len(waiting[needs])
+        if needs is Needs.NOTHING:
+            return len(self._plain)
+        return len(self._oriented if needs is Needs.ATTITUDE else self._paired)
 
     def _update(self, needs: Needs) -> None:
         """Give the models with these needs the samples that wait for them."""
@@ -507,7 +542,8 @@ class Calibrator:
         """Where the messages went, since the start or the last restart.
 
         dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (wrong_frame) + accepted;
-        accepted = slow + turning + no_turn_rate + usable + awaiting_imu. pairing: accepted and decided = paired +
+        accepted = slow + frozen + turning + no_turn_rate + usable + awaiting_imu; repeated and dropouts are counted
+        beside these. pairing: accepted and decided = paired +
         unpaired; awaiting_reference is the rest. usable = oriented + not_oriented (no attitude or no angular velocity)
         + awaiting_attitude. A model's used + gated (+ samples in its prior window) is what it was given: usable
         samples, for the models with GNSS those that were paired, for those with attitude the oriented ones.
@@ -519,7 +555,8 @@ class Calibrator:
             for key in ("received", "invalid", "duplicate", "out_of_order"):
                 counts[name].setdefault(key, 0)
         dvl, pairing = counts["dvl"], counts["pairing"]
-        for key in ("slow", "turning", "no_turn_rate", "wrong_frame"):
+        unused = ("slow", "frozen", "turning", "no_turn_rate")
+        for key in (*unused, "repeated", "dropouts", "wrong_frame"):
             dvl.setdefault(key, 0)
         for key in ("wrong_frame", "late"):
             counts["reference"].setdefault(key, 0)
@@ -528,11 +565,17 @@ class Calibrator:
         not_accepted = ("invalid", "duplicate", "out_of_order", "stray", "held", "wrong_frame")
         dvl["accepted"] = dvl["received"] - sum(dvl[key] for key in not_accepted)
         dvl["awaiting_imu"] = len(self._awaiting_imu)
-        dvl["usable"] = dvl["accepted"] - sum(dvl[k] for k in ("slow", "turning", "no_turn_rate", "awaiting_imu"))
+        dvl["usable"] = dvl["accepted"] - sum(dvl[key] for key in (*unused, "awaiting_imu"))
+        pairing["gnss_losses"] = self.selection.gnss.losses
         pairing["awaiting_reference"] = len(self._awaiting_reference)
         pairing["awaiting_attitude"] = len(self._awaiting_attitude)
         counts["calibration"] = {"restarts": self.restarts}
         return counts
+
+    @property
+    def newest_ns(self) -> dict[str, int | None]:
+        """Stamp of the newest sample of each stream; None before the first."""
+        return {"dvl": self.last_ns, "reference": self._reference.newest_ns, "imu": self._imu.newest_ns}
 
     @property
     def selected(self) -> str:

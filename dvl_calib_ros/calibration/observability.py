@@ -34,7 +34,8 @@ class Observability(NamedTuple):
 
     std: standard deviation (rad, or dimensionless). observed: the data has halved the prior's. axis: the body axis
     (roll, pitch, yaw) that an angle's uncertainty turns about, or scale (across). missing: what to fly, '' once
-    observed.
+    observed. progress: share of the way from the prior's standard deviation (0) to the fine threshold (1), by its
+    logarithm.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Observability(NamedTuple):
     observed: bool
     axis: str
     missing: str
+    progress: float
 
 
 def observability(model: Model, covariance: Array, parameters: Parameters) -> tuple[Observability, ...]:
@@ -58,10 +60,19 @@ def observability(model: Model, covariance: Array, parameters: Parameters) -> tu
         observed = bool(std <= OBSERVED_SHARE * prior_std[index])
         if index < 3:  # row i of T is the i-th DVL axis in the body
             axis = _BODY_AXES[int(np.argmax(np.abs(parameters.rotation_dvl_from_body[index]) * in_body))]
+            fine_std = parameters.fine_std_misalignment
         else:
             axis = _scale_axis(model, index, parameters)
-        entries.append(Observability(name, std, observed, axis, "" if observed else model.shown_by[axis]))
+            fine_std = parameters.fine_std_scale
+        missing = "" if observed else model.shown_by[axis]
+        entries.append(Observability(name, std, observed, axis, missing, _progress(std, prior_std[index], fine_std)))
     return tuple(entries)
+
+
+def _progress(std: float, prior_std: float, fine_std: float) -> float:
+    if std <= fine_std:
+        return 1.0
+    return 0.0 if std >= prior_std else math.log(prior_std / std) / math.log(prior_std / fine_std)
 
 
 def body_angle_std(covariance: Array, parameters: Parameters) -> Array:

@@ -281,6 +281,14 @@ class Parameters:
         low=0.0,
         high=10.0,
     )
+    max_repeats: float = _parameter(
+        0.0,
+        "How often in a row a DVL velocity may repeat the one before exactly; beyond, its driver hangs and it is not "
+        "used. 0: off (a simulated DVL without noise repeats itself).",
+        low=0.0,
+        high=1e6,
+        read_only=False,
+    )
     max_speed: float = _parameter(
         10.0,
         "A DVL or reference velocity above this is invalid.",

@@ -17,11 +17,14 @@ class Segment(NamedTuple):
 class GnssAvailability:
     """Whether GNSS is available: paired samples keep arriving, and a change has held for the hysteresis.
 
-    Before the first sample GNSS is not available.
+    Before the first sample GNSS is not available. losses: how often it stopped for longer than the timeout, whether or
+    not for long enough to count.
     """
 
     def __init__(self) -> None:
         self.available = False
+        self.losses = 0
+        self._fresh = False
         self._last_paired_ns: int | None = None
         self._changing_since_ns: int | None = None
 
@@ -30,6 +33,8 @@ class GnssAvailability:
         if paired:
             self._last_paired_ns = stamp_ns
         fresh = self._last_paired_ns is not None and stamp_ns - self._last_paired_ns <= timeout_ns
+        self.losses += self._fresh and not fresh
+        self._fresh = fresh
         if fresh == self.available:
             self._changing_since_ns = None
             return
@@ -63,8 +68,10 @@ class Selection:
         self.record(stamp_ns, parameters)
 
     def record(self, stamp_ns: int, parameters: Parameters) -> None:
-        """Start a new segment if another model is selected now."""
+        """Start a new segment if another model is selected now; one that had no time is replaced."""
         model = self.model(parameters)
+        if self.segments and self.segments[-1].from_ns == stamp_ns:
+            self.segments.pop()
         if not self.segments or self.segments[-1].model != model:
             self.segments.append(Segment(stamp_ns, model))
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from .. import __version__
-from . import apply, benchmark, demo, diagnose, evaluate, import_, parameters, replay, run, salvage, simulate
+from . import apply, benchmark, demo, diagnose, evaluate, import_, parameters, replay, run, salvage, simulate, watch
 
-COMMANDS = (run, replay, apply, diagnose, evaluate, simulate, import_, salvage, parameters, demo, benchmark)
+COMMANDS = (run, watch, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo, benchmark)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -19,12 +19,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     common.add_parameter_options(parser)
     common.add_topic_options(parser)
+    parser.add_argument("--watch", action="store_true", help="show estimates, convergence and what to fly, live")
     parser.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], dest="ros_args", help=argparse.SUPPRESS)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Translate the options for ROS 2 and run the node."""
     common.load(arguments)  # a bad file or value is said here, in one line, before ROS starts
+    if arguments.watch:
+        from .watch import run_and_watch
+
+        return run_and_watch(ros_arguments(arguments))
     from ..node.main import main
 
     return main(ros_arguments(arguments))

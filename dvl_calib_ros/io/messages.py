@@ -18,6 +18,9 @@ from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Velocit
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 
+# Different frame_ids of the reference that are remembered.
+MAX_FRAMES = 64
+
 EARTH_FRAMES = {
     "enu": VelocityFrame.ENU,
     "map": VelocityFrame.ENU,
@@ -62,12 +65,16 @@ class MessageFeed:
 
     def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None]) -> None:
         self.calibrator = calibrator
-        self.problems: dict[str, str] = {}
-        self.zero_stamps = 0
         self._dvl_covariance = LinearCovariance()
         self._reference_covariance = LinearCovariance()
         self._on_problem = on_problem
-        self.dvl_frame: str | None = calibrator.parameters.dvl_frame or None
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the problems and the frames seen."""
+        self.problems: dict[str, str] = {}
+        self.zero_stamps = 0
+        self.dvl_frame: str | None = self.calibrator.parameters.dvl_frame or None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, VelocityFrame | None] = {}
 
@@ -94,6 +101,8 @@ class MessageFeed:
         """Feed a TwistWithCovarianceStamped with the reference velocity; the sample, or None if refused."""
         frame_id = message.header.frame_id
         if frame_id not in self._reference_frames:
+            if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
+                self._reference_frames.clear()
             self._reference_frames[frame_id] = self._reference_frame(frame_id)
         frame = self._reference_frames[frame_id]
         if frame is None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice
+from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
 from ..calibration.observations import Observations
@@ -198,7 +198,7 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    notes = data_advice(result.counts)
+    notes = message_advice(result.counts) + data_advice(result.counts)
     if feed.zero_stamps:
         notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
     for estimate in result.estimates.values():

@@ -147,7 +147,7 @@ def save_bytes(path: Path, content: bytes) -> None:
             os.replace(backup, backup_of(target))
             backup = ""
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         remedy = "free some space, or name a file on another disk" if full else "name another place"
         raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
     finally:

@@ -31,7 +31,8 @@ from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
 from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
-from .diagnostics import diagnose
+from .diagnostics import RecentCounts, Silence, diagnose
+from .graph import input_problems, output_problems
 from .parameters import declare_parameters
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
@@ -59,8 +60,8 @@ class CalibrationNode(Node):
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
-        self._started = time.monotonic()
-        self._last_dvl: float | None = None
+        self._silence, self._recent = Silence(time.monotonic()), RecentCounts()
+        self._save_problem: str | None = None
 
         self._estimate = self._output_message()
         self._corrected = self._output_message()
@@ -120,11 +121,6 @@ class CalibrationNode(Node):
                 self.get_logger().info(f"{topic}: a publisher is best effort; subscribing as best effort")
                 assert self.executor is not None  # it runs this callback
                 self.executor.create_task(resubscribe)
-            else:
-                self._feed.problems[f"{topic} qos"] = (
-                    f"{topic}: a publisher offers an incompatible QoS ({event.last_policy_kind.name}) and is not heard"
-                )
-                self._warn(self._feed.problems[f"{topic} qos"])
 
         def resubscribe() -> None:
             old = self._inputs[topic]
@@ -146,7 +142,6 @@ class CalibrationNode(Node):
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
     def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
-        self._last_dvl = time.monotonic()
         sample = self._feed.dvl(message, self._received_ns(message))
         if sample is not None:
             self._publish_corrected(sample)
@@ -215,18 +210,26 @@ class CalibrationNode(Node):
         self._corrected_publisher.publish(message)
 
     def _publish_diagnostics(self) -> None:
-        silent = None if self._last_dvl is None else time.monotonic() - self._last_dvl
-        problems = list(self._feed.problems.values())
-        status = diagnose(self._calibrator, problems, silent, time.monotonic() - self._started)
+        problems = [*self._feed.problems.values(), *self._topic_problems()]
+        if self._save_problem:
+            problems.append(self._save_problem)
+        status = diagnose(self._calibrator, problems, self._silence, self._recent, time.monotonic())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
+
+    def _topic_problems(self) -> list[str]:
+        problems = [each for subscription in self._inputs.values() for each in input_problems(self, subscription)]
+        for publisher in (self._estimate_publisher, self._corrected_publisher):
+            problems += output_problems(self, publisher)
+        return problems
 
     # ------------------------------------------------------------------ services, parameters
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
-        self._feed.problems.clear()
+        self._feed.forget()
+        self._recent = RecentCounts()
         self._correction = None
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"
@@ -247,7 +250,12 @@ class CalibrationNode(Node):
         return response
 
     def _save(self, path: Path) -> None:
-        save_text(path, self._result_text())
+        try:
+            save_text(path, self._result_text())
+        except InputError as error:
+            self._save_problem = f"the result was not saved: {error}"
+            raise
+        self._save_problem = None
 
     def _result_text(self) -> str:
         return result_text(result_document(self._calibrator.result(), self._feed.dvl_frame or "dvl_link"))

@@ -3,36 +3,132 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from ..calibration.advice import consistency_advice, data_advice, gate_advice
+from ..calibration.advice import consistency_advice, data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate
+from .status import STATUS_NAME
 
-# A DVL that has sent nothing for so long is a fault, s.
+# A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0
+# Counts are warned of while they have grown within this, s: what is over is only counted.
+RECENT_S = 60.0
+_PIECES = 6
+
+Counts = Mapping[str, Mapping[str, int]]
+_NOT_TAKEN = ("invalid", "wrong_frame", "duplicate", "out_of_order", "stray", "held", "before_restart")
+_STREAMS = {
+    "dvl": ("DVL", "check the sensor, its driver and the topic dvl/twist"),
+    "imu": ("IMU", "the models that need attitude learn nothing; check its driver and the topic imu/data"),
+}
+
+
+class RecentCounts:
+    """How much counters have grown within the last `RECENT_S`."""
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[float, Counts]] = deque(maxlen=_PIECES)
+
+    def grown(self, counts: Counts, now_s: float) -> dict[str, dict[str, int]]:
+        """The same names with the increase. now_s: a clock that does not go back."""
+        if not self._past or now_s - self._past[-1][0] >= RECENT_S / _PIECES:
+            self._past.append((now_s, counts))
+        before = self._past[0][1] if len(self._past) == _PIECES else {}
+        return {
+            group: {
+                # one that is smaller than before has begun anew
+                name: count - then if (then := before.get(group, {}).get(name, 0)) <= count else count
+                for name, count in tally.items()
+            }
+            for group, tally in counts.items()
+        }
+
+
+class _Seen(NamedTuple):
+    """How many samples of a stream have been taken, and since when it is that many (s)."""
+
+    taken: int
+    since_s: float
+
+
+class Silence:
+    """Finds streams that bring nothing usable any more, and those that live in another time than the DVL.
+
+    Looked at once in a while, so that it costs nothing per message. now_s: a clock that does not go back.
+    """
+
+    def __init__(self, now_s: float) -> None:
+        self._started_s = now_s
+        self._seen: dict[str, _Seen] = {}
+
+    def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, str]:
+        """Stream -> what is wrong, and the remedy. counts: the calibrator's, as of now."""
+        newest_ns = calibrator.newest_ns
+        for stream in newest_ns:
+            taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in _NOT_TAKEN)
+            if stream not in self._seen or self._seen[stream].taken != taken:
+                self._seen[stream] = _Seen(taken, now_s)
+        silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
+        faults = {}
+        for stream, (name, remedy) in _STREAMS.items():
+            if not counts[stream]["received"]:
+                if stream == "dvl" and now_s - self._started_s > SILENCE_S:
+                    faults[stream] = f"no {name} message yet: {remedy}"
+            elif silent_s[stream] > SILENCE_S:
+                faults[stream] = f"no usable {name} message for {silent_s[stream]:.0f} s: {remedy}"
+        coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
+        return faults | _other_times(newest_ns, coming, calibrator.parameters.max_time_jump)
+
+
+def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump_s: float) -> dict[str, str]:
+    """Of the streams that come, those whose stamps are far from the DVL's."""
+    dvl_ns = newest_ns["dvl"]
+    if dvl_ns is None or "dvl" not in coming:
+        return {}
+    faults = {}
+    for stream, name in (("reference", "GNSS"), ("imu", "IMU")):
+        ns = newest_ns[stream]
+        if stream in coming and ns is not None and abs(ns - dvl_ns) > max_jump_s * 1e9:
+            side = "ahead of" if ns > dvl_ns else "behind"
+            faults[stream] = (
+                f"{name} stamps are {abs(ns - dvl_ns) * 1e-9:.0f} s {side} the DVL's and cannot be paired: set both "
+                "clocks by the same source"
+            )
+    return faults
 
 
 def diagnose(
-    calibrator: Calibrator, problems: list[str], dvl_silent_s: float | None, running_s: float
+    calibrator: Calibrator,
+    problems: Sequence[str],
+    silence: Silence,
+    recent: RecentCounts,
+    now_s: float,
 ) -> DiagnosticStatus:
-    """Status of the running calibration. dvl_silent_s: wall time since the last DVL message, None before the first."""
+    """Status of the running calibration. problems: what else is known to be wrong. now_s: steady clock."""
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
-    faults = _faults(dvl_silent_s, running_s)
-    warnings = problems + data_advice(counts) + gate_advice(estimate) + consistency_advice(estimate)
+    silent = silence.faults(calibrator, counts, now_s)
+    grown = recent.grown(counts, now_s)
+    faults = [silent.pop("dvl")] if "dvl" in silent else []
+    warnings = [*silent.values(), *problems, *_restart_advice(grown), *message_advice(grown), *data_advice(grown)]
+    warnings += gate_advice(estimate) + consistency_advice(estimate)
     level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-    status = DiagnosticStatus(level=level, name="dvl_calibration: calibration", hardware_id="dvl")
+    status = DiagnosticStatus(level=level, name=STATUS_NAME, hardware_id="dvl")
     status.message = "; ".join(faults + warnings) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
         "why": selection.reason(calibrator.parameters),
         "gnss": selection.gnss.reason,
+        "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
         **_estimate_values(estimate),
         **_count_values(estimate, counts),
+        "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
     }
     for number, problem in enumerate(problems, start=1):
         values[f"problem {number}"] = problem
@@ -40,10 +136,13 @@ def diagnose(
     return status
 
 
-def _faults(dvl_silent_s: float | None, running_s: float) -> list[str]:
-    if dvl_silent_s is None:
-        return ["no DVL message yet: check the topic dvl/twist and its type"] if running_s > SILENCE_S else []
-    return [f"no DVL message for {dvl_silent_s:.0f} s"] if dvl_silent_s > SILENCE_S else []
+def _restart_advice(counts: Counts) -> list[str]:
+    if not counts["calibration"]["restarts"]:
+        return []
+    return [
+        "DVL stamps went back and the calibration started anew: a bag looped, or a clock was set; set clocks before "
+        "the node is started"
+    ]
 
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:
@@ -54,6 +153,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
         factor, unit = (math.degrees(1.0), "deg") if name.startswith("phi") else (100.0, "%")
         values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
         values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
+        values[f"progress {name} [%]"] = f"{100.0 * entry.progress:.1f}"
         values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"
     for index, nuisance in enumerate(model.nuisance, start=model.n_errors):
         values[f"{nuisance.name} [{nuisance.unit}]"] = f"{estimate.state[index]:.4f}"
@@ -61,10 +161,13 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     low, high = estimate.nis_bounds
     rows = model.n_measurement
     values["mean NIS"] = f"{estimate.mean_nis:.3f} of {rows} (99 %: {low:.3f} .. {high:.3f})"
+    # the same once more as bare numbers, 1 where noise is what it is taken for: plotters read no words
+    values["NIS ratio"] = f"{estimate.mean_nis / rows:.4f}"
+    values["NIS ratio low"], values["NIS ratio high"] = f"{low / rows:.4f}", f"{high / rows:.4f}"
     return values
 
 
-def _count_values(estimate: Estimate, counts: Mapping[str, Mapping[str, int]]) -> dict[str, str]:
+def _count_values(estimate: Estimate, counts: Counts) -> dict[str, str]:
     values = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}
     for stream, tally in counts.items():
         for name, count in tally.items():

@@ -1,0 +1,115 @@
+"""Watch a calibration node that runs somewhere on the ROS domain: estimates, how far each is, what to fly next.
+
+Ctrl-C ends the view, not the node. ``dvl-calib run --watch`` starts a node and watches it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from types import FrameType
+from typing import IO, TYPE_CHECKING
+
+from . import common
+
+if TYPE_CHECKING:
+    from ..node.listener import Listener
+
+NAME = "watch"
+HELP = "watch a node that runs elsewhere, in the terminal"
+EXAMPLE = "dvl-calib watch"
+# How long a node may take to save, s.
+PATIENCE_S = 60.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command: none."""
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Watch until Ctrl-C."""
+    from .live_view import show
+
+    with _listener() as listener, suppress(KeyboardInterrupt):
+        show(common.console(), listener.latest)
+
+
+def _listener() -> Listener:
+    from ..io.errors import InputError
+
+    try:
+        import rich  # noqa: F401
+
+        from ..node.listener import Listener
+    except ImportError as error:
+        raise InputError(f"watching needs ROS 2 and rich ({error}); pip install 'dvl_calib_ros[ros]'") from error
+    return Listener()
+
+
+def run_and_watch(ros_arguments: Sequence[str]) -> int:
+    """Start the node in a process of its own and watch it; its exit code.
+
+    Ctrl-C, SIGTERM and SIGHUP end the node as they would without the view: it saves. It is in a session of its own, so
+    that a Ctrl-C reaches it once, through here.
+    """
+    from .live_view import show
+
+    with _listener() as listener:
+        command = [sys.executable, "-m", "dvl_calib_ros.node.main", *ros_arguments]
+        environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, start_new_session=True
+        )
+        assert process.stdout is not None  # a pipe
+        log = _Log(process.stdout)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, _interrupt)
+        said = 0  # lines that are on the screen already
+        try:
+            show(common.console(), listener.latest, lambda: process.poll() is None, log.lines)
+        except KeyboardInterrupt:
+            said = len(log.lines)
+        finally:
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not cut the saving short
+            code = _ended(process)
+        for text in log.finished()[said:]:
+            print(text, file=sys.stderr)
+    return code
+
+
+def _ended(process: subprocess.Popen[bytes]) -> int:
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+class _Log:
+    """Collects what the node writes, so that it neither garbles the view nor is lost."""
+
+    def __init__(self, pipe: IO[bytes]) -> None:
+        self.lines: list[str] = []
+        self._pipe = pipe
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        self.lines.extend(raw.decode(errors="replace").rstrip() for raw in self._pipe)
+
+    def finished(self) -> list[str]:
+        """All lines of a node that has ended."""
+        self._thread.join()
+        return self.lines

@@ -1,0 +1,68 @@
+"""Who else is on the node's topics, and who of them does not hear or is not heard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.duration import Infinite
+from rclpy.node import Node
+from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
+
+
+def input_problems(node: Node, subscription: Any) -> list[str]:
+    """What is wrong with the publishers of one of the node's inputs, and the remedy."""
+    topic, kind = subscription.topic_name, _type_name(subscription.msg_type)
+    publishers = node.get_publishers_info_by_topic(topic)
+    problems = [
+        f"{topic}: {_name(info)} publishes {info.topic_type}, where {kind} is expected, and is not heard; remap one of "
+        "the two, or convert"
+        for info in publishers
+        if info.topic_type != kind
+    ]
+    rightly_typed = [info for info in publishers if info.topic_type == kind]
+    if len(rightly_typed) > 1:
+        names = ", ".join(map(_name, rightly_typed))
+        problems.append(f"{topic}: {len(rightly_typed)} publishers ({names}), where one is expected; stop the others")
+    for info in rightly_typed:
+        reason = _incompatible(info.qos_profile, _in_full(subscription.qos_profile))
+        if reason:
+            problems.append(f"{topic}: the QoS of {_name(info)} is incompatible, it is not heard ({reason})")
+    return problems
+
+
+def output_problems(node: Node, publisher: Any) -> list[str]:
+    """Which subscribers of one of the node's outputs do not hear it, and why."""
+    problems = []
+    for info in node.get_subscriptions_info_by_topic(publisher.topic_name):
+        reason = _incompatible(_in_full(publisher.qos_profile), info.qos_profile)
+        if reason:
+            problems.append(
+                f"{publisher.topic_name}: {_name(info)} asks for an incompatible QoS and does not hear it ({reason})"
+            )
+    return problems
+
+
+def _incompatible(offered: QoSProfile, requested: QoSProfile) -> str | None:
+    compatibility, reason = qos_check_compatible(offered, requested)
+    return reason.removeprefix("ERROR: ").rstrip(";") if compatibility == QoSCompatibility.ERROR else None
+
+
+def _in_full(own: QoSProfile) -> QoSProfile:
+    """One of the node's own profiles, with what it leaves open said as others' profiles say it."""
+    return QoSProfile(
+        depth=1,
+        reliability=own.reliability,
+        durability=own.durability,
+        deadline=Infinite,
+        liveliness=LivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Infinite,
+    )
+
+
+def _name(info: Any) -> str:
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def _type_name(message_type: type) -> str:
+    package, _, _ = message_type.__module__.split(".", 2)
+    return f"{package}/msg/{message_type.__name__}"

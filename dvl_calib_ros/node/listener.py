@@ -1,0 +1,44 @@
+"""Hears what a calibration node says of itself in /diagnostics, wherever on the ROS domain it runs."""
+
+from __future__ import annotations
+
+import time
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from .status import STATUS_NAME, Status
+
+
+class Listener:
+    """Use as a context: a node of its own, in a context of its own, without signal handlers."""
+
+    def __enter__(self) -> Listener:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("dvl_calib_watch", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._latest: Status | None = None
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def latest(self, wait_s: float) -> Status | None:
+        """The latest status, heard within so many seconds or before."""
+        deadline = time.monotonic() + wait_s
+        while (left := deadline - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+        return self._latest
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == STATUS_NAME:
+                values = {item.key: item.value for item in status.values}
+                self._latest = Status(ord(status.level), status.message, values, time.monotonic())

@@ -1,0 +1,28 @@
+"""The calibration's status in /diagnostics, for those who read it; without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+STATUS_NAME = "dvl_calibration: calibration"
+
+
+@dataclass(frozen=True)
+class Status:
+    """One status as received. level: 0 OK, 1 WARN, 2 ERROR. received_s: monotonic time."""
+
+    level: int
+    message: str
+    values: Mapping[str, str]
+    received_s: float
+
+    @property
+    def parameters(self) -> list[tuple[str, str]]:
+        """(name, unit) of what the running model estimates, in the order of its state."""
+        keys = [key.removeprefix("std ") for key in self.values if key.startswith("std ")]
+        return [(name, unit.rstrip("]")) for name, _, unit in (key.partition(" [") for key in keys)]
+
+    def get(self, key: str) -> str:
+        """A value, '-' if there is none."""
+        return self.values.get(key, "-")
