@@ -72,7 +72,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fail(command: str, message: str) -> int:
-    print(f"dvl-calib {command}: {' '.join(message.splitlines())}", file=sys.stderr)
+    from ..io.errors import printable
+
+    print(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
     return 2
 
 

@@ -30,7 +30,14 @@ from ..calibration.screening import usable_covariance
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
-from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
+from ..io.result_file import (
+    check_in_folder,
+    check_writable,
+    load_initial_calibration,
+    result_document,
+    result_text,
+    save_text,
+)
 from .diagnostics import RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems
 from .parameters import declare_parameters
@@ -48,6 +55,7 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
         parameters = declare_parameters(self)
+        self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
         if parameters.result_file:
             check_writable(Path(parameters.result_file))
         initial = None
@@ -264,6 +272,7 @@ class CalibrationNode(Node):
         try:
             changed = self._changed(parameters)
             if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
+                check_in_folder(Path(changed.result_file), self._result_folder)
                 check_writable(Path(changed.result_file))
         except (ParameterError, InputError) as error:
             return SetParametersResult(successful=False, reason=str(error))
