@@ -17,6 +17,7 @@ from dvl_calib_ros import __version__
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.cli.main import COMMANDS, main
 from dvl_calib_ros.io.bags import BagReader
+from dvl_calib_ros.io.drivers import TWIST_TYPE
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,32 @@ def test_bad_usage_is_one_line_that_points_to_the_help(capsys, arguments, expect
     assert expected in error and "--help" in error
 
 
+def completed(tmp_path, typed: str) -> list[str]:
+    """What the shell is offered for a line that is being typed."""
+    answer = tmp_path / "answer"
+    asked = {
+        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_SHELL": "bash", "COMP_LINE": typed,
+        "COMP_POINT": str(len(typed)), "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "COMP_TYPE": "9",
+    }  # fmt: skip
+    assert shell(**asked).returncode == 0
+    return [word.strip() for word in answer.read_text().split("\n")]
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("dvl-calib re", ["replay"]),
+        ("dvl-calib replay --dv", ["--dvl-topic"]),
+        ("dvl-calib replay bag -p min_s", ["min_speed:="]),
+        ("dvl-calib replay bag -p gnss_free_model:=F", ["gnss_free_model:=F1"]),
+        ("dvl-calib simulate bag --storage m", ["mcap"]),
+    ],
+)
+def test_the_shell_completes_commands_options_choices_and_parameters(tmp_path, typed, expected):
+    pytest.importorskip("argcomplete", reason="shell completion is optional: pip install argcomplete")
+    assert completed(tmp_path, typed) == expected
+
+
 # ------------------------------------------------------------------ replay
 
 
@@ -119,7 +146,8 @@ def document(bag, tmp_path_factory) -> dict:
 
 
 def test_replay_json_has_the_documented_structure(document, bag):
-    assert set(document) == {"models", "verification", "selected", "counts", "parameters", "version"}
+    assert set(document) == {"models", "verification", "selected", "counts", "parameters", "version", "dvl"}
+    assert document["dvl"] == {"type": TWIST_TYPE, "turned_from_frd": False}
     assert set(document["verification"]) == set(MODELS)
     assert list(document["models"]) == list(MODELS)
     for name, model in MODELS.items():

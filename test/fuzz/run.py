@@ -69,6 +69,7 @@ def _environment() -> dict[str, str]:
 
 def main() -> int:
     """Run what was asked for."""
+    sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent), str(HERE)]
     if "--" in sys.argv:
         at = sys.argv.index("--")
         fuzz(sys.argv[1], sys.argv[at + 1 :])
@@ -77,7 +78,6 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=1_000_000, help="of all targets together")
     parser.add_argument("--corpus", type=Path, default=Path("fuzz_corpus"), help="folder; default: %(default)s")
     arguments = parser.parse_args()
-    sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent), str(HERE)]
     os.nice(max(0, 15 - os.nice(0)))
     names = arguments.targets or list(SHARES)
     total = sum(SHARES[name] for name in names)
