@@ -18,8 +18,9 @@ from io_fixtures import JAZZY
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.io.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.io.errors import InputError
-from dvl_calib_ros.io.messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from dvl_calib_ros.io.messages import MessageFeed
 from dvl_calib_ros.io.parameter_files import load_parameters
 
 sys.path.insert(0, str(ROOT / "test" / "fuzz"))

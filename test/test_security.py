@@ -23,8 +23,8 @@ from rosbags.serde import SerdeError
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.io.bags import BagReader
 from dvl_calib_ros.io.definitions import Definition, DefinitionError, typestore
+from dvl_calib_ros.io.drivers import TWIST_TYPE
 from dvl_calib_ros.io.errors import InputError, printable
-from dvl_calib_ros.io.messages import TWIST_TYPE
 from dvl_calib_ros.io.result_file import check_in_folder, check_writable, save_text
 from dvl_calib_ros.io.yaml_files import _Loader, load_yaml
 

@@ -20,8 +20,9 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.io.bags import BagReader
 from dvl_calib_ros.io.definitions import Definition, DefinitionError, typestore
+from dvl_calib_ros.io.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.io.errors import InputError
-from dvl_calib_ros.io.messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from dvl_calib_ros.io.messages import MessageFeed
 from dvl_calib_ros.io.parameter_files import load_parameters
 from dvl_calib_ros.io.result_file import load_initial_calibration
 from dvl_calib_ros.io.salvage import DamagedError
