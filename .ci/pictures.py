@@ -47,9 +47,9 @@ def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns
 
 def demo(folder: Path) -> None:
     """The end of the demo."""
-    output = dvl_calib("demo", "--speed", 20)
+    output = dvl_calib("demo", "--speed", 5)  # slow enough for a busy machine
     lines = [line.rstrip() for line in output.splitlines() if not line.startswith("   playing")]
-    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 1010)
+    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 836)
 
 
 def watch(folder: Path) -> None:

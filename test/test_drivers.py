@@ -55,9 +55,9 @@ class Feed:
 
     def __init__(self, kind: str, **parameters) -> None:
         self.kind = kind
-        self.calibrator = Calibrator(Parameters(**parameters))
+        self.calibrator = Calibrator(Parameters(dvl_type=kind, **parameters))
         self.said: list[str] = []
-        self.feed = MessageFeed(self.calibrator, self.said.append, VELOCITY_TYPES[kind])
+        self.feed = MessageFeed(self.calibrator, self.said.append)
 
     def take(self, message):
         return self.feed.dvl(as_plain(message), 0)
@@ -121,8 +121,7 @@ def test_a_reference_may_come_as_twist_or_odometry_in_any_frame(kind, frame, tmp
 
 
 def test_an_odometry_reference_is_in_its_child_frame_whatever_its_header_says():
-    feed = Feed(TWIST)
-    feed.feed = MessageFeed(feed.calibrator, feed.said.append, reference_type=VELOCITY_TYPES[ODOMETRY])
+    feed = Feed(TWIST, gnss_type=ODOMETRY)
     sample = ReferenceSample(SECOND, (1.0, 0.0, 0.0))
     assert feed.feed.reference(message(ODOMETRY, sample, "base_link"), 0).frame is VelocityFrame.BODY
     assert feed.feed.reference(message(ODOMETRY, sample, ""), 0) is None  # the header says odom
@@ -352,11 +351,10 @@ def test_no_garbage_in_the_fields_raises_and_every_message_is_counted(kind, rng)
 @settings(max_examples=15, deadline=None)
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_no_garbage_in_a_reference_raises_either(kind, rng):
-    calibrator = Calibrator(Parameters())
-    feed = MessageFeed(calibrator, lambda _: None, reference_type=VELOCITY_TYPES[kind])
+    feed = Feed(TWIST, gnss_type=kind)
     for _ in range(3):
-        feed.reference(numbers(rng, as_plain(message(kind, frame_id="map"))), 0)
-    assert calibrator.counts["reference"]["received"] == 3
+        feed.feed.reference(numbers(rng, as_plain(message(kind, frame_id="map"))), 0)
+    assert feed.calibrator.counts["reference"]["received"] == 3
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -453,6 +451,7 @@ def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_
     assert said in shown and "1 few_beams" in shown
     document = json.loads((tmp_path / "out.json").read_text())
     assert document["dvl"] == {"type": MARINE, "turned_from_frd": True}
+    assert document["parameters"]["dvl_type"] == MARINE  # what the node needs to go on with the result
     assert document["counts"]["dvl"]["few_beams"] == 1
 
 

@@ -107,8 +107,8 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
 
 
 def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wrong_with_them_is_said():
-    calibrator, kind = Calibrator(Parameters()), VELOCITY_TYPES[MARINE]
-    feed, silence, recent = MessageFeed(calibrator, lambda _: None, kind), Silence(0.0), RecentCounts()
+    calibrator, kind = Calibrator(Parameters(dvl_type=MARINE)), VELOCITY_TYPES[MARINE]
+    feed, silence, recent = MessageFeed(calibrator, lambda _: None), Silence(0.0), RecentCounts()
     for second in range(8):
         message = Maker().velocity(MARINE, DvlSample(second * 10**9, (1.5, 0.0, 0.0)))
         message.beam_velocities_valid = False

@@ -94,19 +94,19 @@ def replay(
     if parameters.prior_source == "initial_window":
         notes.append(INITIAL_WINDOW_WARNING)
     recorder = Recorder() if with_history else None
-    calibrator = Calibrator(
-        parameters,
-        prior_sway_heave=prior,
-        initial=initial,
-        block_size=BLOCK_SIZE,
-        on_event=notes.append,
-        on_block=recorder.observe if recorder else on_block,
-        verified=True,
-    )
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, notes)
-        feed = _feed(bag, chosen, calibrator, notes.append)
+        calibrator = Calibrator(
+            _of_types(bag, chosen, parameters),
+            prior_sway_heave=prior,
+            initial=initial,
+            block_size=BLOCK_SIZE,
+            on_event=notes.append,
+            on_block=recorder.observe if recorder else on_block,
+            verified=True,
+        )
+        feed = MessageFeed(calibrator, notes.append)
         if recorder:
             recorder.expect(bag.message_counts[chosen.dvl])
         _feed_all(bag, chosen, feed, recorder, on_progress)
@@ -125,11 +125,10 @@ def replay(
     )
 
 
-def _feed(bag: BagReader, topics: Topics, calibrator: Calibrator, on_problem: Callable[[str], None]) -> MessageFeed:
-    """A feed for the types that the bag has on these (checked) topics."""
+def _of_types(bag: BagReader, topics: Topics, parameters: Parameters) -> Parameters:
+    """The parameters with the message types that the bag has on these (checked) topics."""
     types = bag.topics
-    dvl, reference = types[topics.dvl], types.get(topics.gnss, TWIST_TYPE)
-    return MessageFeed(calibrator, on_problem, VELOCITY_TYPES[dvl], VELOCITY_TYPES[reference])
+    return parameters.replace(dvl_type=types[topics.dvl], gnss_type=types.get(topics.gnss, parameters.gnss_type))
 
 
 def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
@@ -143,6 +142,14 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
         option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
         raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
+    _check_types(bag, where, topics, notes)
+    if not bag.message_counts[topics.dvl]:
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
+    if topics.gnss not in present:
+        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
+
+
+def _check_types(bag: BagReader, where: str, topics: Topics, notes: list[str]) -> None:
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
         types = bag.types_of(name)
@@ -155,14 +162,10 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
             )
         if bag.lacks_definition(name):
             notes.append(
-                f"the bag does not say how {present[name]} is laid out (recorded before ROS 2 Iron?); it is read as "
+                f"the bag does not say how {types.pop()} is laid out (recorded before ROS 2 Iron?); it is read as "
                 "the definitions known here say. If it cannot be decoded, run ros2 bag convert to MCAP where the "
                 "package is installed"
             )
-    if not bag.message_counts[topics.dvl]:
-        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
-    if topics.gnss not in present:
-        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": VELOCITY_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
@@ -202,14 +205,14 @@ def _feed_and_note(feed: MessageFeed, recorder: Recorder, message: Any, received
 
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
     """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError."""
-    calibrator = Calibrator(parameters.replace(prior_source="fixed"))
     rotation = None
     velocities: list[Any] = []
     first_ns: int | None = None
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
-        feed = _feed(bag, chosen, calibrator, lambda _: None)
+        typed = _of_types(bag, chosen, parameters)
+        feed = MessageFeed(Calibrator(typed.replace(prior_source="fixed")), lambda _: None)
         for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
             if undecodable:
                 continue

@@ -144,18 +144,22 @@ def _whole_chunk(
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
     """All whole messages, in file order; then DamagedError, unless the recording is whole."""
-    damage, tables = Damage(), _Tables()
-    size = path.stat().st_size
     with path.open("rb") as file:
-        with suppress(Exception):  # schemas and channels once more: the chunk that introduces them may be damaged
-            summary = SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
-            if summary is not None:
-                tables.schemas, tables.channels = dict(summary.schemas), dict(summary.channels)
-        walk = _Walk(file, size, tables, damage)
-        at: int | None = len(MCAP_MAGIC)
-        while at is not None and at < size:
-            found, at = walk.step(at)
-            yield from map(tables.salvaged, found)
+        yield from salvage_mcap_stream(file, path.stat().st_size)
+
+
+def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
+    """As `salvage_mcap`, of an open file of so many bytes."""
+    damage, tables = Damage(), _Tables()
+    with suppress(Exception):  # schemas and channels once more: the chunk that introduces them may be damaged
+        summary = SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
+        if summary is not None:
+            tables.schemas, tables.channels = dict(summary.schemas), dict(summary.channels)
+    walk = _Walk(file, size, tables, damage)
+    at: int | None = len(MCAP_MAGIC)
+    while at is not None and at < size:
+        found, at = walk.step(at)
+        yield from map(tables.salvaged, found)
     if at is not None:
         damage.note(f"it stops at byte {size} without the end of the data", 0)
     damage.raise_if_any()
