@@ -18,20 +18,21 @@ from dvl_calib_ros.trial.vehicle import FAULTS
 
 pytestmark = pytest.mark.trial
 
+SINGLES = sorted(FAULTS)[::2]
 KINDS_HERE = tuple(kind for kind in KINDS if kind != RECORDED)  # the same part with and without the recordings
 
 
 def fixed_part() -> list[Case]:
-    """Nulls, every effect once at q = 20, pairs, unknown faults, and runs that cannot tell."""
+    """Nulls, every other effect at q = 20, pairs, unknown faults, and runs that cannot tell."""
     cases = plan(KINDS_HERE)
     strong = [case for case in cases if case.q == 20.0]
     return [
-        *[case for case in cases if case.category is Category.NULL][:10],
-        *[case for case in cases if case.category is Category.HARD_NULL][:5],
-        *[next(c for c in strong if c.category is Category.SINGLE and c.name == name) for name in FAULTS],
-        *[case for case in strong if case.category is Category.PAIR][:4],
-        *[case for case in strong if case.category is Category.UNKNOWN][:4],
-        *[case for case in cases if case.category is Category.UNIDENTIFIABLE][:3],
+        *[case for case in cases if case.category is Category.NULL][:5],
+        *[case for case in cases if case.category is Category.HARD_NULL][:3],
+        *[next(c for c in strong if c.category is Category.SINGLE and c.name == name) for name in SINGLES],
+        *[case for case in strong if case.category is Category.PAIR][:2],
+        *[case for case in strong if case.category is Category.UNKNOWN][:2],
+        *[case for case in cases if case.category is Category.UNIDENTIFIABLE][:2],
     ]
 
 
@@ -50,30 +51,30 @@ def test_no_case_breaks_the_diagnosis(scored):
 
 def test_nulls_raise_no_false_alarm(scored):
     nulls = scored[Category.NULL] + scored[Category.HARD_NULL]
-    assert len(nulls) == 15
-    assert sum(case.claimed for case in nulls) <= 1
+    assert len(nulls) == 8
+    assert not any(case.claimed for case in nulls)
 
 
 def test_strong_effects_are_found_and_named(scored):
     single = scored[Category.SINGLE]
-    assert len(single) == len(FAULTS)
-    assert sum(case.claimed for case in single) >= 13
-    assert sum(bool(case.named_set & case.truth.faults.keys()) for case in single) >= 12
-    assert sum(case.is_right_first for case in single if case.separable) >= 9
+    assert len(single) == len(SINGLES)
+    assert all(case.claimed for case in single)
+    assert all(case.named_set & case.truth.faults.keys() for case in single)
+    assert sum(case.is_right_first for case in single if case.separable) >= 5
 
 
 def test_strong_effects_are_closed_and_their_sizes_within_their_intervals(scored):
     single = scored[Category.SINGLE]
     assert np.median([case.closure for case in single if case.closure is not None]) >= 0.9
     inside = [low <= true <= high for case in single for low, true, high in case.intervals]
-    assert len(inside) >= 15
+    assert len(inside) >= 8
     assert np.mean(inside) >= 0.8
 
 
 def test_pairs_and_unknown_effects_are_seen(scored):
-    assert sum(both_named(case) for case in scored[Category.PAIR]) >= 2
-    assert sum(case.verdict == "unknown" for case in scored[Category.UNKNOWN]) >= 2
+    assert any(both_named(case) for case in scored[Category.PAIR])
+    assert any(case.verdict == "unknown" for case in scored[Category.UNKNOWN])
 
 
 def test_nothing_is_guessed_where_the_data_cannot_tell(scored):
-    assert sum(no_guess(case) for case in scored[Category.UNIDENTIFIABLE]) >= 2
+    assert all(no_guess(case) for case in scored[Category.UNIDENTIFIABLE])

@@ -73,13 +73,13 @@ CASES = {
     # φ × (0, -u, 0) = (φz u, 0, -φx u) on the DVL's axes; its x is to port
     "misalignment_drift": (
         circle(),
-        {"x_rad_per_hour": 1.0, "y_rad_per_hour": 5.0, "z_rad_per_hour": 2.0},
-        steady(0, 2.0 * HOURS * SPEED, -1.0 * HOURS * SPEED),
+        {"x_rad_per_hour": 0.02, "y_rad_per_hour": 0.1, "z_rad_per_hour": 0.04},
+        steady(0, 0.04 * HOURS * SPEED, -0.02 * HOURS * SPEED),
     ),
     "mount_flexure": (
         circle(),
-        {"x_rad_per_mps": 0.01, "y_rad_per_mps": 0.05, "z_rad_per_mps": 0.02},
-        steady(0, 0.02 * SPEED**2, -0.01 * SPEED**2),
+        {"x_rad_per_mps": 5e-4, "y_rad_per_mps": 2.5e-3, "z_rad_per_mps": 1e-3},
+        steady(0, 1e-3 * SPEED**2, -5e-4 * SPEED**2),
     ),
     # S (0, -u, 0) = (-xy u, 0, -yz u)
     "axis_nonorthogonality": (
@@ -207,6 +207,17 @@ def test_the_lag_is_that_of_the_differential_equation_at_uneven_times(rng, time_
         at_samples.append(error)
     expected = np.array(at_samples)[np.searchsorted(fine, time)]
     np.testing.assert_allclose(lag_error(time, values, time_constant), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [("misalignment_drift", {"x_rad_per_hour": 1.0, "z_rad_per_hour": 2.0}), ("mount_flexure", {"z_rad_per_mps": 0.2})],
+)
+def test_a_mounting_that_turns_far_leaves_the_speed_as_it_is(name, values):
+    motion = circle()
+    effect = EFFECTS[name]
+    turned = motion.velocity_body + effect.trace(motion, effect.defaults | values)
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), motion.speed, rtol=1e-12)
 
 
 def test_one_sample_has_neither_delay_nor_lag():

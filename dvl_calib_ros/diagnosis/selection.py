@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,7 +84,7 @@ def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
         if tested is None or tested.log_p > threshold or tested.drop < GHOST_SHARE * (start.deviance - fit.deviance):
             break
         before = fit.effects
-        fitter, fit = about(fitter.problem, _called_for(fitter, tested.fit, threshold))
+        fitter, fit = about(fitter.problem, _called_for(fitter, tested.fit, threshold, tested.fit.effects[:-1]))
         dictionary = dictionary_about(fitter, fit, effects)
         for _ in range(MAX_SWAPS):
             swapped = _swapped(fitter, fit, dictionary)
@@ -94,6 +94,10 @@ def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
             dictionary = dictionary_about(fitter, fit, effects)
         if set(fit.effects) == set(before):
             break
+    while (kept := _called_for(fitter, fit, threshold, fit.effects)).effects != fit.effects:
+        # with the noise that is left in the end, and about the end's calibration
+        fitter, fit = about(fitter.problem, kept)
+        dictionary = dictionary_about(fitter, fit, effects)
     selected = [_selected(fitter, fit, number, dictionary) for number in range(len(fit.effects))]
     base = fitter.fit([], fit.noise, {})
     return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter, dictionary)
@@ -186,9 +190,9 @@ def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
     return fitter.fit_with_noise(rest, fit.noise, fit.values)
 
 
-def _called_for(fitter: Fitter, fit: Fit, threshold: float) -> Fit:
-    """A fit without what is not called for any more, now that its last effect is in."""
-    for effect in fit.effects[:-1]:
+def _called_for(fitter: Fitter, fit: Fit, threshold: float, of: Sequence[Effect]) -> Fit:
+    """A fit without those of some effects that are not called for (any more), given all others."""
+    for effect in of:
         rest = _without(fitter, fit, effect)
         if log_p_value(rest.deviance - fit.deviance, fit.dof - rest.dof) > threshold:
             fit = rest

@@ -104,10 +104,13 @@ class ParameterSpec:
     linear: bool = True
 
 
-def along_axes(suffix: str, unit: str, typical: float, bound: float, description: str) -> tuple[ParameterSpec, ...]:
+def along_axes(
+    suffix: str, unit: str, typical: float, bound: float, description: str, linear: bool = True
+) -> tuple[ParameterSpec, ...]:
     """One parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
     return tuple(
-        ParameterSpec(f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis)) for axis in "xyz"
+        ParameterSpec(f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear)
+        for axis in "xyz"
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array
 from .base import ActsOn, Effect, EffectInput, ParameterSpec, along_axes, vector
@@ -64,14 +65,15 @@ class MisalignmentDrift(Effect):
     name = "misalignment_drift"
     summary = "the misalignment changes along the run: φ = rate · (t - start)"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
-    parameters = along_axes("rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour")
+    parameters = along_axes(
+        "rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour", linear=False
+    )
     acts_on = ActsOn.DVL
     confounded_with = ("scale_drift",)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ ((t - t_0) rate × T v)."""
-        turn = motion.elapsed[:, None] * vector(values, "rad_per_hour") / HOUR_S
-        return np.cross(turn, motion.velocity_dvl) @ motion.rotation_dvl_from_body
+        """Tᵀ (Exp((t - t_0) rate) - I) T v."""
+        return _turned(motion, motion.elapsed[:, None] * vector(values, "rad_per_hour") / HOUR_S)
 
 
 class MountFlexure(Effect):
@@ -80,14 +82,21 @@ class MountFlexure(Effect):
     name = "mount_flexure"
     summary = "the mounting bends with speed: φ = flexure · ‖v‖"
     manoeuvre = "straight legs at three speeds or more"
-    parameters = along_axes("rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed")
+    parameters = along_axes(
+        "rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed", linear=False
+    )
     acts_on = ActsOn.DVL
     confounded_with = ("velocity_bias", "quadratic_scale")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ (speed · flexure × T v)."""
-        turn = motion.speed[:, None] * vector(values, "rad_per_mps")
-        return np.cross(turn, motion.velocity_dvl) @ motion.rotation_dvl_from_body
+        """Tᵀ (Exp(speed · flexure) - I) T v."""
+        return _turned(motion, motion.speed[:, None] * vector(values, "rad_per_mps"))
+
+
+def _turned(motion: EffectInput, rotation_vectors: Array) -> Array:
+    """(N, 3) m/s that the velocity changes by when the DVL turns by rotation vectors (N, 3) rad, body frame."""
+    velocity = motion.velocity_dvl
+    return (Rotation.from_rotvec(rotation_vectors).apply(velocity) - velocity) @ motion.rotation_dvl_from_body
 
 
 class AxisNonorthogonality(Effect):
