@@ -73,8 +73,8 @@ CASES = {
     # φ × (0, -u, 0) = (φz u, 0, -φx u) on the DVL's axes; its x is to port
     "misalignment_drift": (
         circle(),
-        {"x_rad_per_hour": 0.02, "y_rad_per_hour": 0.1, "z_rad_per_hour": 0.04},
-        steady(0, 0.04 * HOURS * SPEED, -0.02 * HOURS * SPEED),
+        {"x_rad_per_hour": 0.04, "y_rad_per_hour": 0.2, "z_rad_per_hour": 0.08},
+        steady(0, 0.08 * HOURS * SPEED, -0.04 * HOURS * SPEED),
     ),
     "mount_flexure": (
         circle(),
