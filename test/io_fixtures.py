@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.io.bags import BagReader, BagWriter, Compression, Storage
-from dvl_calib_ros.io.messages import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.io.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.io.replay import Replayed, replay
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -73,20 +73,30 @@ def rewrite(path: Path, change: Callable[[str, Any], Any], samples: Iterable[Sam
     return path
 
 
-def mcap_bytes(messages: Iterable[tuple[str, int, bytes]], **options: Any) -> bytes:
-    """An MCAP file as the mcap library writes it: with checksums, small chunks, any compression."""
+def mcap_bytes(
+    messages: Iterable[tuple[str, int, bytes]], definitions: Mapping[str, tuple[str, str]] | None = None, **options: Any
+) -> bytes:
+    """An MCAP file as the mcap library writes it: with checksums, small chunks, any compression.
+
+    definitions: topic -> type and its definition, for topics of other types than `TOPICS` says.
+    """
     output = io.BytesIO()
     writer = McapWriter(output, **{"chunk_size": 2048, "compression": CompressionType.NONE, **options})
     writer.start("ros2")
     channels: dict[str, int] = {}
     for topic, log_ns, data in messages:
         if topic not in channels:
-            definition, _ = JAZZY.generate_msgdef(TOPICS[topic], ros_version=2)
-            schema = writer.register_schema(TOPICS[topic], "ros2msg", definition.encode())
+            msgtype, definition = (definitions or {}).get(topic) or _standard(topic)
+            schema = writer.register_schema(msgtype, "ros2msg", definition.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         writer.add_message(channels[topic], log_ns, data, log_ns)
     writer.finish()
     return output.getvalue()
+
+
+def _standard(topic: str) -> tuple[str, str]:
+    definition, _ = JAZZY.generate_msgdef(TOPICS[topic], ros_version=2)
+    return TOPICS[topic], definition
 
 
 def raw(*paths: Path) -> list[tuple[str, int, bytes]]:

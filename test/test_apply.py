@@ -58,9 +58,9 @@ def saved(tmp_path, result) -> Path:
     return change(tmp_path / "result.yaml", result[1])
 
 
-def change(path: Path, result, **changes) -> Path:
+def change(path: Path, result, turned: bool = False, **changes) -> Path:
     """The result file with other values at the top of its document."""
-    path.write_text(result_text({**result_document(result), **changes}))
+    path.write_text(result_text({**result_document(result, turned=turned), **changes}))
     return path
 
 
@@ -160,6 +160,23 @@ def test_a_calibration_that_starts_from_the_applied_urdf_finds_nothing_more(tmp_
     parameters.write_text(text)
     frame = Rotation.from_euler("xyz", CHAIN).apply([0.0, 0.2, 0.3])
     assert load_parameters(parameters).lever_arm == pytest.approx(np.array([0.5, 0.0, -0.1]) + frame, abs=1e-8)
+
+
+@pytest.mark.parametrize("urdf_has", ["the calibrated axes", "the driver's own frame"])
+def test_of_a_driver_that_points_down_the_urdf_keeps_its_axes_and_the_transform_is_the_drivers(
+    tmp_path, result, capsys, urdf_has
+):
+    saved = change(tmp_path / "result.yaml", result[1], turned=True)
+    flip = Rotation.from_euler("x", math.pi)
+    axes = flip if urdf_has == "the driver's own frame" else Rotation.identity()
+    path = robot(tmp_path / "robot.urdf", mounting=(Rotation.from_euler("xyz", MOUNTING) * axes).as_euler("xyz"))
+    assert apply(saved, "--urdf", path) == 0
+    assert difference(mounted(path), corrected(saved) * axes) < 1e-8  # nine digits are written
+    line = yaml.safe_load(saved.read_text())["mounting"]["static_transform_publisher"]
+    assert line in capsys.readouterr().out
+    given = shlex.split(line)
+    quaternion = [float(given[given.index(f"--q{axis}") + 1]) for axis in "xyzw"]
+    assert difference(Rotation.from_quat(quaternion), corrected(saved) * flip) < 1e-8
 
 
 def test_applied_twice_is_applied_once_and_the_file_before_is_still_kept(tmp_path, saved, capsys):

@@ -29,8 +29,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dvl_calib_ros.calibration.samples import DvlSample, VelocityFrame
 from dvl_calib_ros.io.bags import BagReader, BagWriter, Compression, Storage
+from dvl_calib_ros.io.drivers import TWIST_TYPE
 from dvl_calib_ros.io.errors import InputError
-from dvl_calib_ros.io.messages import TWIST_TYPE, stamp_ns
+from dvl_calib_ros.io.messages import stamp_ns
 
 if sys.version_info >= (3, 14):
     from compression import zstd

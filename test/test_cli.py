@@ -17,6 +17,7 @@ from dvl_calib_ros import __version__
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.cli.main import COMMANDS, main
 from dvl_calib_ros.io.bags import BagReader
+from dvl_calib_ros.io.drivers import TWIST_TYPE
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +120,8 @@ def document(bag, tmp_path_factory) -> dict:
 
 
 def test_replay_json_has_the_documented_structure(document, bag):
-    assert set(document) == {"models", "verification", "selected", "counts", "parameters", "version"}
+    assert set(document) == {"models", "verification", "selected", "counts", "parameters", "version", "dvl"}
+    assert document["dvl"] == {"type": TWIST_TYPE, "turned_from_frd": False}
     assert set(document["verification"]) == set(MODELS)
     assert list(document["models"]) == list(MODELS)
     for name, model in MODELS.items():

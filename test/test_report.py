@@ -90,6 +90,10 @@ def test_the_static_transform_can_be_pasted(made):
     assert "ros2 run tf2_ros static_transform_publisher --x 0 --y 0 --z 0 --qx" in made[0].text
 
 
+def test_the_type_of_the_dvls_data_is_shown(made):
+    assert "DVL data geometry_msgs/msg/TwistWithCovarianceStamped" in made[0].text
+
+
 def test_warnings_are_shown(tmp_path):
     samples = [sample for sample in run() if isinstance(sample, DvlSample)]
     path, replayed = replay_page(tmp_path, samples)

@@ -47,6 +47,14 @@ def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     """What is wrong with the data that came, and the remedy; from `Calibrator.counts`."""
     dvl, pairing = counts["dvl"], counts["pairing"]
     sentences = []
+    if dvl["received"] >= ENOUGH_SAMPLES and not dvl["accepted"]:
+        lost = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
+        sentences.append(f"none of {dvl['received']} DVL messages can be used: {lost}")
+    if _never_meet(counts):
+        sentences.append(
+            "no DVL sample has a reference velocity at its time, though both come: do their stamps agree? A DVL that "
+            "stamps with a clock of its own must be synchronised (NTP)"
+        )
     if pairing["without_attitude"]:
         sentences.append(
             f"{pairing['without_attitude']} DVL samples have an earth-frame reference but no attitude: the models with "
@@ -76,6 +84,15 @@ def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
     if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
         sentences.append("every sample is slower than min_speed: nothing is learnt")
     return sentences
+
+
+def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
+    """Whether valid DVL and reference samples come, and enough of them have gone by without a single pair."""
+    reference, pairing = counts["reference"], counts["pairing"]
+    usable = 2 * reference["received"] - sum(reference.values())
+    if pairing["paired"] or pairing["without_attitude"]:
+        return False
+    return usable >= ENOUGH_SAMPLES and pairing["unpaired"] >= ENOUGH_SAMPLES
 
 
 def gate_advice(estimate: Estimate) -> list[str]:

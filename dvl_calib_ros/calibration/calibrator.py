@@ -150,6 +150,8 @@ class Calibrator:
         self._reference: Track[ReferenceSample] = Track(gnss_ns, latency_ns, retention_ns)
         self._imu: Track[ImuSample] = Track(imu_ns, latency_ns, retention_ns)
         self._tally: dict[str, Counter[str]] = {name: Counter() for name in ("dvl", "reference", "imu", "pairing")}
+        # those of a stream's counters that refused messages are under
+        self.refused_as: dict[str, set[str]] = {name: set() for name in ("dvl", "reference", "imu")}
         # streams that still bring samples from before a restart of the DVL's stamps
         self._before_restart: set[str] = set()
         self._forget_dvl()
@@ -251,6 +253,7 @@ class Calibrator:
 
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
+        self.refused_as[stream].add(reason)
         self._tally[stream]["received"] += 1
         self._tally[stream][reason] += 1
 
@@ -541,7 +544,7 @@ class Calibrator:
     def counts(self) -> dict[str, dict[str, int]]:
         """Where the messages went, since the start or the last restart.
 
-        dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (wrong_frame) + accepted;
+        dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (`refuse`) + accepted;
         accepted = slow + frozen + turning + no_turn_rate + usable + awaiting_imu; repeated and dropouts are counted
         beside these. pairing: accepted and decided = paired +
         unpaired; awaiting_reference is the rest. usable = oriented + not_oriented (no attitude or no angular velocity)
@@ -562,8 +565,8 @@ class Calibrator:
             counts["reference"].setdefault(key, 0)
         for key in ("paired", "unpaired", "without_attitude", "oriented", "not_oriented"):
             pairing.setdefault(key, 0)
-        not_accepted = ("invalid", "duplicate", "out_of_order", "stray", "held", "wrong_frame")
-        dvl["accepted"] = dvl["received"] - sum(dvl[key] for key in not_accepted)
+        not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *self.refused_as["dvl"]}
+        dvl["accepted"] = dvl["received"] - sum(dvl.get(key, 0) for key in not_accepted)
         dvl["awaiting_imu"] = len(self._awaiting_imu)
         dvl["usable"] = dvl["accepted"] - sum(dvl[key] for key in (*unused, "awaiting_imu"))
         pairing["gnss_losses"] = self.selection.gnss.losses

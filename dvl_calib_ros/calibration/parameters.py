@@ -23,6 +23,7 @@ from .samples import VelocityFrame
 
 AUTO = "auto"
 FROM_FRAME_ID = "from_frame_id"
+FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
 
 
 class ParameterError(ValueError):
@@ -143,6 +144,20 @@ class Parameters:
     dvl_frame: str = _parameter(
         "",
         "frame_id that DVL messages must carry. Empty: any but a body or earth frame, and the first one seen.",
+    )
+    dvl_axes: str = _parameter(
+        FROM_MESSAGE,
+        "Axes of the DVL's data: flu (forward-left-up), taken as they are, or frd (forward-right-down), turned to "
+        "flu. from_message: a frame_id that ends in _frd or _flu says so, else the message type does.",
+        choices=(FROM_MESSAGE, FLU, FRD),
+    )
+    dvl_type: str = _parameter(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "Message type of the DVL's topic, live (a bag says its types itself).",
+    )
+    gnss_type: str = _parameter(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "Message type of the reference's topic, live.",
     )
     mounting_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
@@ -294,6 +309,13 @@ class Parameters:
         "A DVL or reference velocity above this is invalid.",
         unit="m/s",
         low=0.1,
+        high=100.0,
+    )
+    max_fom: float = _parameter(
+        0.4,
+        "A DVL message with a figure of merit above this is invalid (dvl_msgs/DVL, which has one).",
+        unit="m/s",
+        low=0.0,
         high=100.0,
     )
     imu_timeout: float = _parameter(

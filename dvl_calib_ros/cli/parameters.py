@@ -1,4 +1,4 @@
-"""List every parameter, model and effect as the code defines them: the README's tables, and parameter files."""
+"""List all parameters, models, effects and drivers of the code: the README's tables, and parameter files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 NAME = "parameters"
-HELP = "list every parameter, model or effect, or write a parameter file"
+HELP = "list every parameter, model, effect or driver, or write a parameter file"
 EXAMPLE = "dvl-calib parameters --yaml > calibration.yaml"
 
 
@@ -15,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--yaml", action="store_true", help="a ROS 2 parameter file with every default")
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
+    what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
@@ -33,6 +34,11 @@ def run(arguments: argparse.Namespace) -> None:
         from ..effects.table import effect_table
 
         print(effect_table(), end="")
+        return
+    if arguments.drivers:
+        from ..io.drivers import driver_table
+
+        print(driver_table(), end="")
         return
     if arguments.urdf is not None:
         from ..io.mounting import urdf_parameters

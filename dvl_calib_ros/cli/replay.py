@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from . import common
 from .reporting import add_report_option, report_writer
+
+if TYPE_CHECKING:
+    from ..io.replay import Replayed
 
 NAME = "replay"
 HELP = "calibrate with recorded bags"
@@ -40,25 +45,30 @@ def run(arguments: argparse.Namespace) -> None:
         replayed = replay(arguments.bags, parameters, topics, on_progress, with_history=write_report is not None)
     result = replayed.result
     if arguments.json is not None:
-        common.write_json(arguments.json, replay_document(result, models))
+        common.write_json(
+            arguments.json,
+            replay_document(result, models) | {"dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned}},
+        )
     if arguments.save is not None:
-        save_text(arguments.save, result_text(result_document(result, replayed.dvl_frame)))
+        save_text(arguments.save, result_text(result_document(result, replayed.dvl_frame, replayed.turned)))
     if write_report is not None:
         write_report(arguments.report, replayed, arguments.bags, models)
-    _print(replayed.notes, result, models)
+    _print(replayed, models)
 
 
-def _print(notes, result, models) -> None:  # type: ignore[no-untyped-def]
-    common.print_warnings(notes)
+def _print(replayed: Replayed, models: Sequence[str]) -> None:
+    result = replayed.result
+    common.print_warnings(replayed.notes)
     out = common.console()
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
-    seconds = 1e-9 * (result.last_ns - result.first_ns)
+    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
     title = f"{dvl['accepted']} DVL samples over {seconds:.1f} s, {pairing['paired']} paired with GNSS"
     out.print(common.result_table(result, models, title))
     for name in ("dvl", "reference", "imu"):
         counts = result.counts[name]
         lost = ", ".join(f"{value} {key}" for key, value in counts.items() if value and key != "received")
         out.print(f"{name}: {counts['received']} received" + (f": {lost}" if lost else ""))
+    out.print(f"dvl data: {replayed.dvl_data}")
     out.print(f"selected: {result.selected} ({result.selected_because})")
     for entry in result.estimate.observability:
         if entry.missing:

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from enum import Enum
 from operator import itemgetter
 from pathlib import Path, PurePath
@@ -30,9 +30,9 @@ from rosbags.typesys.store import Typestore
 
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from .attachments import attach
-from .definitions import Definition, DefinitionError, typestore
+from .definitions import Definition, DefinitionError, is_empty, known_typestores, typestore
+from .drivers import IMU_TYPE, TWIST_TYPE, VELOCITY_TYPES
 from .errors import InputError
-from .messages import IMU_TYPE, TWIST_TYPE
 from .salvage import LARGEST_RECORD, DamagedError, Salvaged
 from .salvage_mcap import MCAP_MAGIC, indexed_messages, read_summary, salvage_mcap
 from .salvage_sqlite import SQLITE_MAGIC, salvage_sqlite
@@ -86,23 +86,34 @@ class _Source:
         self.span_ns = span_ns
         self.messages = messages
         self._definitions = definitions
-        self._stores: dict[str, Typestore | DefinitionError] = {}
+        self._stores: dict[str, list[Typestore] | DefinitionError] = {}
 
     def definition(self, topic: str) -> Definition | None:
         """The embedded definition of a topic's messages."""
         return self._definitions.get(self.topics[topic])
 
-    def typestore(self, msgtype: str) -> Typestore:
-        """Types for a message: from the definition embedded in the bag, else Jazzy's. Raises DefinitionError."""
+    def decode(self, msgtype: str, data: bytes) -> Any:
+        """A message, by the definition embedded in the bag, else by those known here. Raises DefinitionError."""
+        stores = self._typestores(msgtype)
+        for store in stores[:-1]:  # of several versions, the one that a message fits from beginning to end
+            with suppress(Exception):
+                message = store.deserialize_cdr(data, msgtype)
+                self._stores[msgtype] = [store]
+                return message
+        return stores[-1].deserialize_cdr(data, msgtype)
+
+    def _typestores(self, msgtype: str) -> list[Typestore]:
         if msgtype not in self._stores:
+            definition = self._definitions.get(msgtype)
             try:
-                self._stores[msgtype] = typestore(self._definitions.get(msgtype), msgtype)
+                known = is_empty(definition)
+                self._stores[msgtype] = known_typestores(msgtype) if known else [typestore(definition, msgtype)]
             except DefinitionError as error:  # once, not for every message
                 self._stores[msgtype] = error
-        store = self._stores[msgtype]
-        if isinstance(store, DefinitionError):
-            raise store
-        return store
+        stores = self._stores[msgtype]
+        if isinstance(stores, DefinitionError):
+            raise stores
+        return stores
 
 
 class BagReader:
@@ -136,6 +147,16 @@ class BagReader:
         """Topic -> message type."""
         return {topic: msgtype for source in self._sources for topic, msgtype in source.topics.items()}
 
+    def types_of(self, topic: str) -> set[str]:
+        """All types that the recordings hold on a topic; one, if all is well."""
+        return {source.topics[topic] for source in self._sources if topic in source.topics}
+
+    def lacks_definition(self, topic: str) -> bool:
+        """Whether a recording has a topic of a driver's type that is not Jazzy's, without its definition."""
+        sources = [source for source in self._sources if topic in source.topics]
+        own = [source for source in sources if getattr(VELOCITY_TYPES.get(source.topics[topic]), "definitions", ())]
+        return any(is_empty(source.definition(topic)) for source in own)
+
     def definition(self, topic: str) -> Definition | None:
         """The embedded definition of a topic's messages, None if there is none."""
         return next((source.definition(topic) for source in self._sources if topic in source.topics), None)
@@ -157,7 +178,7 @@ class BagReader:
         """Messages of these topics."""
         for log_ns, source, topic, msgtype, data in self._merged(topics):
             try:
-                message, why = self._sources[source].typestore(msgtype).deserialize_cdr(data, msgtype), ""
+                message, why = self._sources[source].decode(msgtype, data), ""
             except (SerdeError, DefinitionError) as error:
                 message, why = None, str(error)
             except Exception as error:  # a damaged definition or message can break the generated decoder anyhow

@@ -13,6 +13,8 @@ from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from .drivers import VELOCITY_TYPES
+
 # Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
 LONGEST_DEFINITION = 1 << 18
 LARGEST_ARRAYS = 1 << 16
@@ -34,9 +36,23 @@ class DefinitionError(Exception):
     """A definition that cannot be used."""
 
 
+def is_empty(definition: Definition | None) -> bool:
+    """Whether a recording does not say how messages are laid out; those of before ROS 2 Iron do not."""
+    return definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
+
+
+def known_typestores(msgtype: str) -> list[Typestore]:
+    """Types for a message without a definition: Jazzy's, and each version of a driver's message that is known here."""
+    known = VELOCITY_TYPES[msgtype].definitions if msgtype in VELOCITY_TYPES else ()
+    stores = [get_typestore(Stores.ROS2_JAZZY) for _ in known or ("",)]
+    for store, text in zip(stores, known, strict=False):
+        store.register(get_types_from_msg(text, msgtype))
+    return stores
+
+
 def typestore(definition: Definition | None, msgtype: str) -> Typestore:
     """Types for a message: from its definition, or Jazzy's if that is empty. Raises DefinitionError."""
-    if definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip():
+    if definition is None or is_empty(definition):
         return get_typestore(Stores.ROS2_JAZZY)
     try:
         store = get_typestore(Stores.EMPTY)

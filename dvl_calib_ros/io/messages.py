@@ -1,6 +1,7 @@
 """ROS messages to samples, for rclpy's message objects and for rosbags' alike: only their fields are looked at.
 
-The one place where messages become samples: `MessageFeed` checks frames and stamps and feeds a `Calibrator`.
+The one place where messages become samples: `MessageFeed` checks frames and stamps and feeds a `Calibrator`. What the
+message types of the drivers hold is in `drivers`.
 """
 
 from __future__ import annotations
@@ -11,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.frames import Array
-from ..calibration.parameters import FROM_FRAME_ID
+from ..calibration.frames import FLU_FROM_FRD, Array, Vector
+from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-
-TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
-IMU_TYPE = "sensor_msgs/msg/Imu"
+from .drivers import TWIST_TYPE, VELOCITY_TYPES, VelocityType
 
 # Different frame_ids of the reference that are remembered.
 MAX_FRAMES = 64
@@ -36,37 +35,69 @@ def stamp_ns(stamp: Any) -> int:
 
 
 class LinearCovariance:
-    """Takes the linear (3, 3) part out of twist covariances (36,).
+    """Takes the (3, 3) of the linear velocity out of covariances of messages: of it alone, or of a twist.
 
     Most drivers send the same covariance with every message; it stays the same object then, and what is made of it
-    need not be made again.
+    need not be made again. turned: from forward-right-down to forward-left-up, or the other way.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, turned: bool = False) -> None:
         self._bytes = b""
         self._linear: Array = np.zeros((3, 3))
+        self._turned = turned
 
-    def __call__(self, covariance: Any) -> Array:
-        """(36,) -> (3, 3)."""
+    def __call__(self, covariance: Any) -> Array | None:
+        """(9,) or (36,) -> (3, 3); None -> None. Raises ValueError for any other size."""
+        if covariance is None:
+            return None
         array = np.asarray(covariance, dtype=float)
         content = array.tobytes()
         if content != self._bytes:
+            linear = array.reshape(3, 3) if array.size == 9 else array.reshape(6, 6)[:3, :3]
+            self._linear = linear * _TURNED_COVARIANCE if self._turned else linear.copy()
             self._bytes = content
-            self._linear = array.reshape(6, 6)[:3, :3].copy()
         return self._linear
+
+
+# F C F of a covariance C and the diagonal F = FLU_FROM_FRD, element by element
+_TURNED_COVARIANCE = np.outer(FLU_FROM_FRD.diagonal(), FLU_FROM_FRD.diagonal())
+# what a message of another layout than its type's makes the readers raise
+_UNREADABLE = (AttributeError, TypeError, ValueError, IndexError, OverflowError)
+
+
+class _Reader:
+    """Reads the velocity and its covariance from messages of one type. turned: as in `LinearCovariance`."""
+
+    def __init__(self, kind: VelocityType, turned: bool = False) -> None:
+        self._velocity, self._given = kind.velocity, kind.covariance
+        self._covariance = LinearCovariance(turned)
+        self._turned = turned
+
+    def __call__(self, message: Any) -> tuple[Vector, Array | None]:
+        velocity = self._velocity(message)
+        covariance = self._covariance(self._given(message))
+        if self._turned:
+            return (velocity.x, -velocity.y, -velocity.z), covariance
+        return (velocity.x, velocity.y, velocity.z), covariance
 
 
 class MessageFeed:
     """Feeds a calibrator with messages.
 
     on_problem is called with a sentence (what is wrong, what to do) when a problem is new; `problems` keeps the latest
-    sentence of each kind. Counting is the calibrator's.
+    sentence of each kind. Counting is the calibrator's. dvl_type, reference_type: of the messages to come.
     """
 
-    def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        calibrator: Calibrator,
+        on_problem: Callable[[str], None],
+        dvl_type: VelocityType = VELOCITY_TYPES[TWIST_TYPE],
+        reference_type: VelocityType = VELOCITY_TYPES[TWIST_TYPE],
+    ) -> None:
         self.calibrator = calibrator
-        self._dvl_covariance = LinearCovariance()
-        self._reference_covariance = LinearCovariance()
+        self.dvl_type, self.gnss_type = dvl_type, reference_type
+        self._reference_reader = _Reader(reference_type)
         self._on_problem = on_problem
         self.forget()
 
@@ -75,6 +106,7 @@ class MessageFeed:
         self.problems: dict[str, str] = {}
         self.zero_stamps = 0
         self.dvl_frame: str | None = self.calibrator.parameters.dvl_frame or None
+        self._dvl_reader: _Reader | None = None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, VelocityFrame | None] = {}
 
@@ -84,37 +116,43 @@ class MessageFeed:
         return next((frame for frame in self._reference_frames.values() if frame is not None), None)
 
     def dvl(self, message: Any, received_ns: int) -> DvlSample | None:
-        """Feed a TwistWithCovarianceStamped from the DVL; the sample if it is valid and in order."""
-        frame_id = message.header.frame_id
-        if frame_id != self.dvl_frame and not self._accept_dvl_frame(frame_id):
-            self.calibrator.refuse("dvl", "wrong_frame")
+        """Feed a message of dvl_type; the sample if it is valid and in order."""
+        calibrator, kind = self.calibrator, self.dvl_type
+        try:
+            frame_id = kind.frame_id(message)
+            if frame_id != self.dvl_frame and not self._accept_dvl_frame(frame_id):
+                calibrator.refuse("dvl", "wrong_frame")
+                return None
+            broken = kind.broken_rule(message, calibrator.parameters)
+            if broken is not None:
+                calibrator.refuse("dvl", broken.counter)
+                return None
+            velocity, covariance = (self._dvl_reader or self._make_dvl_reader(frame_id))(message)
+            stamp = self._stamp_ns("dvl", message.header, received_ns)
+        except _UNREADABLE as error:
+            self.undecodable("dvl", f"{kind.name}, {type(error).__name__}: {error}")
             return None
-        linear = message.twist.twist.linear
-        sample = DvlSample(
-            self._stamp_ns("dvl", message.header, received_ns),
-            (linear.x, linear.y, linear.z),
-            self._dvl_covariance(message.twist.covariance),
-        )
-        return sample if self.calibrator.feed_dvl(sample) else None
+        sample = DvlSample(stamp, velocity, covariance)
+        return sample if calibrator.feed_dvl(sample) else None
 
     def reference(self, message: Any, received_ns: int) -> ReferenceSample | None:
-        """Feed a TwistWithCovarianceStamped with the reference velocity; the sample, or None if refused."""
-        frame_id = message.header.frame_id
-        if frame_id not in self._reference_frames:
-            if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
-                self._reference_frames.clear()
-            self._reference_frames[frame_id] = self._reference_frame(frame_id)
-        frame = self._reference_frames[frame_id]
-        if frame is None:
-            self.calibrator.refuse("reference", "wrong_frame")
+        """Feed a message of reference_type with the reference velocity; the sample, or None if refused."""
+        try:
+            frame_id = self.gnss_type.frame_id(message)
+            if frame_id not in self._reference_frames:
+                if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
+                    self._reference_frames.clear()
+                self._reference_frames[frame_id] = self._reference_frame(frame_id)
+            frame = self._reference_frames[frame_id]
+            if frame is None:
+                self.calibrator.refuse("reference", "wrong_frame")
+                return None
+            velocity, covariance = self._reference_reader(message)
+            stamp = self._stamp_ns("reference", message.header, received_ns)
+        except _UNREADABLE as error:
+            self.undecodable("reference", f"{self.gnss_type.name}, {type(error).__name__}: {error}")
             return None
-        linear = message.twist.twist.linear
-        sample = ReferenceSample(
-            self._stamp_ns("reference", message.header, received_ns),
-            (linear.x, linear.y, linear.z),
-            self._reference_covariance(message.twist.covariance),
-            frame,
-        )
+        sample = ReferenceSample(stamp, velocity, covariance, frame)
         self.calibrator.feed_reference(sample)
         return sample
 
@@ -161,6 +199,27 @@ class MessageFeed:
             f"publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is its name.",
         )
         return False
+
+    @property
+    def turns_dvl(self) -> bool:
+        """Whether the DVL's data are turned from forward-right-down to forward-left-up."""
+        axes = self.calibrator.parameters.dvl_axes
+        if axes != FROM_MESSAGE:
+            return axes == FRD
+        suffix = (self.dvl_frame or "").lower().rpartition("_")[2]
+        return suffix == "frd" or (self.dvl_type.points_down and suffix != "flu")
+
+    def _make_dvl_reader(self, frame_id: str) -> _Reader:
+        """The reader of the DVL's messages, made at the first that has passed, which tells the frame."""
+        self._dvl_reader = _Reader(self.dvl_type, self.turns_dvl)
+        if self.turns_dvl and self.calibrator.parameters.rotation_dvl_from_body[2, 2] < 0.0:
+            self._problem(
+                "dvl axes",
+                f"dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and "
+                "mounting_rpy turns the DVL upside down as well: right for a DVL that looks up. If mounting_rpy is "
+                "that of a frame whose z points down, set dvl_axes to flu, which takes the data as they are.",
+            )
+        return self._dvl_reader
 
     def _is_body_or_earth(self, frame_id: str) -> bool:
         name = frame_id.lstrip("/")

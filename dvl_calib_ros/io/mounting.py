@@ -16,11 +16,11 @@ import yaml
 
 from .. import __version__
 from ..calibration.error_model import corrected_mounting
-from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
 from ..calibration.observability import Convergence, observability
-from ..calibration.parameters import ParameterError, Parameters
+from ..calibration.parameters import FRD, ParameterError, Parameters
 from ..calibration.verification import Word
 from .errors import InputError
 from .parameter_files import NODE_NAME, changed_parameters
@@ -38,8 +38,10 @@ FUSION_NODE = "ekf_filter_node"
 class CalibratedMounting:
     """The selected model's calibration of a result file.
 
-    rotation_body_from_dvl (3, 3): corrected. scale (3,): δk per DVL axis, 0 where not estimated; scale_ahead: of motion
-    ahead. objections: why it should not be applied; doubts: what to know when it is; both in sentences.
+    rotation_body_from_dvl (3, 3): corrected, of the forward-left-up axes that are calibrated. turned: whether the
+    driver's data, in dvl_frame, are forward-right-down, and were turned to those. scale (3,): δk per DVL axis, 0 where
+    not estimated; scale_ahead: of motion ahead. objections: why it should not be applied; doubts: what to know when it
+    is; both in sentences.
     """
 
     path: Path
@@ -51,11 +53,17 @@ class CalibratedMounting:
     scale: Array
     objections: tuple[str, ...]
     doubts: tuple[str, ...]
+    turned: bool = False
+
+    @property
+    def rotation_body_from_dvl_frame(self) -> Array:
+        """Corrected mounting (3, 3) of dvl_frame itself, for those who use the driver's data as they come."""
+        return self.rotation_body_from_dvl @ FLU_FROM_FRD if self.turned else self.rotation_body_from_dvl
 
     @property
     def rpy(self) -> Array:
-        """Corrected mounting (3,) rad, as in a URDF origin."""
-        return rpy_from_rotation(self.rotation_body_from_dvl)
+        """Corrected mounting (3,) rad of dvl_frame, as in a URDF origin."""
+        return rpy_from_rotation(self.rotation_body_from_dvl_frame)
 
     @property
     def scale_ahead(self) -> float:
@@ -65,7 +73,7 @@ class CalibratedMounting:
     @property
     def static_transform(self) -> str:
         """Arguments of tf2's static_transform_publisher."""
-        quaternion = quaternion_from_rotation(self.rotation_body_from_dvl)
+        quaternion = quaternion_from_rotation(self.rotation_body_from_dvl_frame)
         return static_transform_arguments(self.parameters.lever_arm, quaternion, self.base_frame, self.dvl_frame)
 
 
@@ -78,6 +86,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         parameters = Parameters.from_mapping(content["parameters"])
         saved = rotation_from_rpy(np.array(content["mounting"]["corrected_rpy"], dtype=float).reshape(3))
         frames = (str(content["mounting"]["frame_id"]), str(content["mounting"]["child_frame_id"]))
+        turned = content["mounting"].get("dvl_data_axes") == FRD
         convergence = Convergence(content["models"][model.name]["convergence"])
         objections, doubts = _judged(content.get("verification"), convergence)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -92,7 +101,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     if not angle_between(rotation, saved) < 1e-6:
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     doubts += _unseen(model, state, parameters)
-    return CalibratedMounting(path, model, parameters, *frames, rotation, errors[3:], objections, doubts)
+    return CalibratedMounting(path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned)
 
 
 def _judged(
@@ -140,17 +149,20 @@ def calibrated_urdf(urdf: Urdf, mounting: Mounting, calibrated: CalibratedMounti
 
     Raises InputError if its mounting is another than the one the calibration began with, unless force is set.
     """
-    now = mounting.rotation_body_from_dvl
-    if angle_between(now, calibrated.rotation_body_from_dvl) < ALREADY:
+    now, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
+    begun_with = calibrated.parameters.rotation_dvl_from_body.T
+    if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
+        corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
+    if angle_between(now, corrected) < ALREADY:
         return urdf.content
-    if angle_between(now, calibrated.parameters.rotation_dvl_from_body.T) > SAME_MOUNTING and not force:
+    if angle_between(now, begun_with) > SAME_MOUNTING and not force:
         raise InputError(
             f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(now))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
             f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
             "or write the calibrated one all the same with --force"
         )
-    return urdf.turned(mounting, calibrated.rotation_body_from_dvl)
+    return urdf.turned(mounting, corrected)
 
 
 def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -22,8 +22,9 @@ from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..calibration.verification import verification_document
 from .bags import BagReader
+from .drivers import IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
 from .errors import InputError
-from .messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from .messages import MessageFeed
 from .recorder import Recorder, RunHistory
 from .result_file import estimate_document, load_initial_calibration
 
@@ -54,6 +55,7 @@ class Replayed:
     """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id.
 
     history: the run over time, if it was asked for. reference_frame: of the reference's messages, None without any.
+    dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
     """
 
     result: Result
@@ -61,6 +63,13 @@ class Replayed:
     dvl_frame: str
     history: RunHistory | None = None
     reference_frame: VelocityFrame | None = None
+    dvl_type: str = TWIST_TYPE
+    turned: bool = False
+
+    @property
+    def dvl_data(self) -> str:
+        """Type and axes of the DVL's data, in words."""
+        return self.dvl_type + (", turned from forward-right-down to forward-left-up" if self.turned else "")
 
 
 def replay(
@@ -94,11 +103,10 @@ def replay(
         on_block=recorder.observe if recorder else on_block,
         verified=True,
     )
-    feed = MessageFeed(calibrator, notes.append)
     with BagReader(paths) as bag:
-        present = bag.topics
-        chosen = topics.found_in(present)
+        chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, notes)
+        feed = _feed(bag, chosen, calibrator, notes.append)
         if recorder:
             recorder.expect(bag.message_counts[chosen.dvl])
         _feed_all(bag, chosen, feed, recorder, on_progress)
@@ -106,7 +114,22 @@ def replay(
     result = calibrator.result()
     notes += _warnings(result, topics, feed)
     history = recorder.history(calibrator) if recorder else None
-    return Replayed(result, tuple(notes), feed.dvl_frame or "dvl_link", history, feed.reference_frame)
+    return Replayed(
+        result,
+        tuple(notes),
+        feed.dvl_frame or "dvl_link",
+        history,
+        feed.reference_frame,
+        feed.dvl_type.name,
+        feed.turns_dvl,
+    )
+
+
+def _feed(bag: BagReader, topics: Topics, calibrator: Calibrator, on_problem: Callable[[str], None]) -> MessageFeed:
+    """A feed for the types that the bag has on these (checked) topics."""
+    types = bag.topics
+    dvl, reference = types[topics.dvl], types.get(topics.gnss, TWIST_TYPE)
+    return MessageFeed(calibrator, on_problem, VELOCITY_TYPES[dvl], VELOCITY_TYPES[reference])
 
 
 def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
@@ -118,16 +141,38 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         raise InputError("--dvl-topic, --gnss-topic and --imu-topic must be different topics")
     if topics.dvl not in present:
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
-        raise InputError(f"{where}: no topic {topics.dvl!r}; set --dvl-topic. The bag has: {listing}")
-    wanted = {"dvl": TWIST_TYPE, "gnss": TWIST_TYPE, "imu": IMU_TYPE}
-    for role, msgtype in wanted.items():
+        option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
+        raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
+    for role, wanted in _WANTED.items():
         name = getattr(topics, role)
-        if name in present and present[name] != msgtype:
-            raise InputError(f"{where}: topic {name} holds {present[name]}, expected {msgtype}; set --{role}-topic")
+        types = bag.types_of(name)
+        if types - wanted:
+            held, expected = " and ".join(sorted(types)), " or ".join(wanted)
+            raise InputError(f"{where}: topic {name} holds {held}, expected {expected}; set --{role}-topic")
+        if len(types) > 1:
+            raise InputError(
+                f"{where}: topic {name} holds {' and '.join(sorted(types))}; replay bags of one type together"
+            )
+        if bag.lacks_definition(name):
+            notes.append(
+                f"the bag does not say how {present[name]} is laid out (recorded before ROS 2 Iron?); it is read as "
+                "the definitions known here say. If it cannot be decoded, run ros2 bag convert to MCAP where the "
+                "package is installed"
+            )
     if not bag.message_counts[topics.dvl]:
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in present:
         notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
+
+
+_WANTED: Mapping[str, Set[str]] = {"dvl": VELOCITY_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
+
+
+def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
+    """Topics that may be the DVL's: of a type that only DVLs have, else with dvl in the name, else of any fitting."""
+    fitting = sorted(name for name, kind in present.items() if kind in VELOCITY_TYPES and name != topics.gnss)
+    only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
+    return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
 
 
 def _feed_all(
@@ -158,13 +203,13 @@ def _feed_and_note(feed: MessageFeed, recorder: Recorder, message: Any, received
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
     """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError."""
     calibrator = Calibrator(parameters.replace(prior_source="fixed"))
-    feed = MessageFeed(calibrator, lambda _: None)
     rotation = None
     velocities: list[Any] = []
     first_ns: int | None = None
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
+        feed = _feed(bag, chosen, calibrator, lambda _: None)
         for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
             if undecodable:
                 continue
@@ -198,7 +243,7 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    notes = message_advice(result.counts) + data_advice(result.counts)
+    notes = message_advice(result.counts) + feed.dvl_type.advice(dvl) + data_advice(result.counts)
     if feed.zero_stamps:
         notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
     for estimate in result.estimates.values():
@@ -209,7 +254,8 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
 def _remedy(feed: MessageFeed) -> str:
     """What is known of the DVL's messages that were refused."""
     known = [sentence for kind, sentence in feed.problems.items() if kind.startswith("dvl")]
-    return " ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
+    known += feed.dvl_type.advice(feed.calibrator.counts["dvl"])
+    return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 
 def _counted(counts: Any) -> str:

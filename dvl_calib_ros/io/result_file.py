@@ -18,9 +18,10 @@ import numpy as np
 import yaml
 
 from .. import __version__
-from ..calibration.frames import quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.frames import FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.parameters import FLU, FRD
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
 from .errors import InputError
@@ -41,13 +42,18 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, Any]:
-    """A result as plain data for the result file."""
+def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = False) -> dict[str, Any]:
+    """A result as plain data for the result file.
+
+    turned: the driver's data are forward-right-down and were turned. The mounting is that of the forward-left-up axes,
+    as mounting_rpy is; the transform is that of dvl_frame itself, for those who use the driver's data as they come.
+    """
     estimate = result.estimate
     parameters = result.parameters
     nominal = rotation_from_rpy(parameters["mounting_rpy"])
     corrected = estimate.rotation_body_from_dvl(nominal.T)
     rpy, quaternion = rpy_from_rotation(corrected), quaternion_from_rotation(corrected)
+    to_frame = quaternion_from_rotation(corrected @ FLU_FROM_FRD) if turned else quaternion
     verification = result.verifications.get(result.selected)
     parent, child = parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
     return {
@@ -65,11 +71,10 @@ def result_document(result: Result, dvl_frame: str = "dvl_link") -> dict[str, An
             "corrected_rpy": rpy.tolist(),
             "corrected_quaternion_xyzw": list(quaternion),
             "scale_error_xyz": estimate.scale.tolist(),
+            "dvl_data_axes": FRD if turned else FLU,
             "frame_id": parent,
             "child_frame_id": child,
-            "static_transform_publisher": _static_transform_publisher(
-                parameters["lever_arm"], quaternion, parent, child
-            ),
+            "static_transform_publisher": _static_transform_publisher(parameters["lever_arm"], to_frame, parent, child),
         },
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},

@@ -27,12 +27,14 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..calibration.screening import CovarianceScreen
+from ..io.drivers import velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
 from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
 from .diagnostics import RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems
+from .message_types import message_class
 from .parameters import declare_parameters
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
@@ -48,6 +50,9 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
         parameters = declare_parameters(self)
+        dvl_type = velocity_type("dvl_type", parameters.dvl_type)
+        gnss_type = velocity_type("gnss_type", parameters.gnss_type)
+        dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
         if parameters.result_file:
             check_writable(Path(parameters.result_file))
         initial = None
@@ -56,7 +61,7 @@ class CalibrationNode(Node):
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
-        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._feed = MessageFeed(self._calibrator, self._warn, dvl_type, gnss_type)
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._offset_ns = round(parameters.dvl_time_offset * 1e9)
@@ -81,8 +86,8 @@ class CalibrationNode(Node):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
-        self._subscribe(TwistWithCovarianceStamped, "dvl/twist", self._on_dvl)
-        self._subscribe(TwistWithCovarianceStamped, "gnss/twist", self._on_reference)
+        self._subscribe(dvl_class, "dvl/twist", self._on_dvl)
+        self._subscribe(gnss_class, "gnss/twist", self._on_reference)
         self._subscribe(Imu, "imu/data", self._on_imu)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
@@ -146,13 +151,13 @@ class CalibrationNode(Node):
         stamp = message.header.stamp
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
-    def _on_dvl(self, message: TwistWithCovarianceStamped) -> None:
+    def _on_dvl(self, message: Any) -> None:
         sample = self._feed.dvl(message, self._received_ns(message))
         if sample is not None:
             self._publish_corrected(sample)
         self._publish_if_updated()
 
-    def _on_reference(self, message: TwistWithCovarianceStamped) -> None:
+    def _on_reference(self, message: Any) -> None:
         self._feed.reference(message, self._received_ns(message))
         self._publish_if_updated()
 
@@ -215,16 +220,20 @@ class CalibrationNode(Node):
         self._corrected_publisher.publish(message)
 
     def _publish_diagnostics(self) -> None:
-        problems = [*self._feed.problems.values(), *self._topic_problems()]
+        feed = self._feed
+        problems = [*feed.problems.values(), *self._topic_problems()]
         if self._save_problem:
             problems.append(self._save_problem)
-        status = diagnose(self._calibrator, problems, self._silence, self._recent, time.monotonic())
+        status = diagnose(self._calibrator, feed.dvl_type, problems, self._silence, self._recent, time.monotonic())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
 
     def _topic_problems(self) -> list[str]:
-        problems = [each for subscription in self._inputs.values() for each in input_problems(self, subscription)]
+        type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
+        problems = []
+        for topic, subscription in self._inputs.items():
+            problems += input_problems(self, subscription, type_parameters.get(topic))
         for publisher in (self._estimate_publisher, self._corrected_publisher):
             problems += output_problems(self, publisher)
         return problems
@@ -263,7 +272,8 @@ class CalibrationNode(Node):
         self._save_problem = None
 
     def _result_text(self) -> str:
-        return result_text(result_document(self._calibrator.result(), self._feed.dvl_frame or "dvl_link"))
+        feed = self._feed
+        return result_text(result_document(self._calibrator.result(), feed.dvl_frame or "dvl_link", feed.turns_dvl))
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:

@@ -13,6 +13,7 @@ from ..calibration.advice import consistency_advice, data_advice, gate_advice, m
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate
+from ..io.drivers import VelocityType
 from .status import STATUS_NAME
 
 # A stream that has brought nothing usable for so long is silent, s.
@@ -22,7 +23,7 @@ RECENT_S = 60.0
 _PIECES = 6
 
 Counts = Mapping[str, Mapping[str, int]]
-_NOT_TAKEN = ("invalid", "wrong_frame", "duplicate", "out_of_order", "stray", "held", "before_restart")
+_NOT_TAKEN = {"invalid", "duplicate", "out_of_order", "stray", "held", "before_restart"}
 _STREAMS = {
     "dvl": ("DVL", "check the sensor, its driver and the topic dvl/twist"),
     "imu": ("IMU", "the models that need attitude learn nothing; check its driver and the topic imu/data"),
@@ -71,7 +72,8 @@ class Silence:
         """Stream -> what is wrong, and the remedy. counts: the calibrator's, as of now."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
-            taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in _NOT_TAKEN)
+            lost = _NOT_TAKEN | calibrator.refused_as[stream]
+            taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             if stream not in self._seen or self._seen[stream].taken != taken:
                 self._seen[stream] = _Seen(taken, now_s)
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
@@ -105,17 +107,22 @@ def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump
 
 def diagnose(
     calibrator: Calibrator,
+    dvl_type: VelocityType,
     problems: Sequence[str],
     silence: Silence,
     recent: RecentCounts,
     now_s: float,
 ) -> DiagnosticStatus:
-    """Status of the running calibration. problems: what else is known to be wrong. now_s: steady clock."""
+    """Status of the running calibration.
+
+    dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock.
+    """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     silent = silence.faults(calibrator, counts, now_s)
     grown = recent.grown(counts, now_s)
     faults = [silent.pop("dvl")] if "dvl" in silent else []
     warnings = [*silent.values(), *problems, *_restart_advice(grown), *message_advice(grown), *data_advice(grown)]
+    warnings += dvl_type.advice(grown["dvl"])
     warnings += gate_advice(estimate) + consistency_advice(estimate)
     level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
     status = DiagnosticStatus(level=level, name=STATUS_NAME, hardware_id="dvl")

@@ -8,14 +8,19 @@ from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 
+from ..io.drivers import TYPES_OF
 
-def input_problems(node: Node, subscription: Any) -> list[str]:
-    """What is wrong with the publishers of one of the node's inputs, and the remedy."""
+
+def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[str]:
+    """What is wrong with the publishers of one of the node's inputs, and the remedy.
+
+    type_parameter: the one that names the type of the topic, if it can be chosen.
+    """
     topic, kind = subscription.topic_name, _type_name(subscription.msg_type)
     publishers = node.get_publishers_info_by_topic(topic)
     problems = [
-        f"{topic}: {_name(info)} publishes {info.topic_type}, where {kind} is expected, and is not heard; remap one of "
-        "the two, or convert"
+        f"{topic}: {_name(info)} publishes {info.topic_type}, where {kind} is expected, and is not heard; "
+        f"{_other_type_remedy(info.topic_type, type_parameter)}"
         for info in publishers
         if info.topic_type != kind
     ]
@@ -28,6 +33,12 @@ def input_problems(node: Node, subscription: Any) -> list[str]:
         if reason:
             problems.append(f"{topic}: the QoS of {_name(info)} is incompatible, it is not heard ({reason})")
     return problems
+
+
+def _other_type_remedy(name: str, type_parameter: str | None) -> str:
+    if type_parameter is None or name not in TYPES_OF[type_parameter]:
+        return "remap one of the two, or convert"
+    return f"set {type_parameter} to it, or remap one of the two"
 
 
 def output_problems(node: Node, publisher: Any) -> list[str]:

@@ -7,18 +7,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import TwistWithCovarianceStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu
 
 from ..io.bags import BagReader
 from ..io.errors import InputError
-from ..io.messages import IMU_TYPE, TWIST_TYPE
 from ..io.replay import Topics
+from .message_types import message_class
 
-MESSAGE_CLASSES = {TWIST_TYPE: TwistWithCovarianceStamped, IMU_TYPE: Imu}
 PATIENCE = Duration(seconds=30)
 
 
@@ -34,7 +31,7 @@ class BagPlayer:
             found = defaults.found_in(bag.topics)
             for name, target in ((found.dvl, defaults.dvl), (found.gnss, defaults.gnss), (found.imu, defaults.imu)):
                 if name in bag.topics:
-                    kind = MESSAGE_CLASSES[bag.topics[name]]
+                    kind = message_class(f"{name} of the bag holds", bag.topics[name])
                     # room for every message: none is overwritten before it is acknowledged, however fast we play
                     depth = max(bag.message_counts[name], 1)
                     profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability)

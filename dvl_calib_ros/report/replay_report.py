@@ -65,7 +65,7 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
     if history is None:
         raise ValueError("the replay has no history; run it with with_history=True")
     shown = [name for name in MODELS if name in models or name == result.selected]
-    document = result_document(result, replayed.dvl_frame)
+    document = result_document(result, replayed.dvl_frame, replayed.turned)
     time = TimeAxis(history.stamps_ns)
     names = ", ".join(bag.name or str(bag) for bag in bags)
     return {
@@ -74,7 +74,7 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
         "written": document["written"].replace("T", " ").replace("+00:00", " UTC"),
         "verdict": _verdict(result.verifications.get(result.selected)),
         "numbers": _numbers(result.estimate),
-        "facts": _facts(result, document["mounting"], bags),
+        "facts": _facts(replayed, document["mounting"], bags),
         "static_transform": document["mounting"]["static_transform_publisher"],
         "warnings": replayed.notes,
         "held_out": _held_out(result, shown),
@@ -130,7 +130,8 @@ def _numbers(estimate: Estimate) -> list[dict[str, str]]:
     return numbers
 
 
-def _facts(result: Result, mounting: Mapping[str, Any], bags: Sequence[Path]) -> list[tuple[str, str]]:
+def _facts(replayed: Replayed, mounting: Mapping[str, Any], bags: Sequence[Path]) -> list[tuple[str, str]]:
+    result = replayed.result
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     estimate = result.estimate
     missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
@@ -139,6 +140,7 @@ def _facts(result: Result, mounting: Mapping[str, Any], bags: Sequence[Path]) ->
         ("Corrected mounting", _rpy(mounting["corrected_rpy"])),
         ("Nominal mounting", _rpy(mounting["nominal_rpy"])),
         ("Recorded", _when(result)),
+        ("DVL data", replayed.dvl_data),
         ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
         ("Used by " + result.selected, f"{estimate.used}, {estimate.gated} gated"),
         *([("Not shown yet", "; ".join(dict.fromkeys(missing)))] if missing else []),

@@ -16,8 +16,9 @@ from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..io.bags import BagReader
+from ..io.drivers import IMU_TYPE, REFERENCE_TYPES
 from ..io.errors import InputError
-from ..io.messages import IMU_TYPE, TWIST_TYPE, MessageFeed
+from ..io.messages import MessageFeed
 from ..io.replay import Topics
 from .trajectories import Motion
 
@@ -75,12 +76,13 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
 
 def _read(recording: Recording) -> _Samples:
     parameters = Parameters(gnss_frame=recording.gnss_frame)
-    feed = MessageFeed(Calibrator(parameters), lambda _: None)
     velocities: dict[int, tuple[Vector, VelocityFrame]] = {}
     attitudes: dict[int, Quaternion] = {}
     with BagReader([recording.path]) as bag:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
         _check_topics(recording, topics, bag.topics)
+        reference_type = REFERENCE_TYPES[bag.topics[topics.gnss]]
+        feed = MessageFeed(Calibrator(parameters), lambda _: None, reference_type=reference_type)
         for topic, log_ns, message, undecodable in bag.messages([topics.gnss, topics.imu]):
             if undecodable:
                 continue
@@ -111,11 +113,12 @@ def _read(recording: Recording) -> _Samples:
 
 
 def _check_topics(recording: Recording, topics: Topics, present: dict[str, str]) -> None:
-    for name, msgtype in ((topics.gnss, TWIST_TYPE), (topics.imu, IMU_TYPE)):
-        if present.get(name) != msgtype:
+    for name, types in ((topics.gnss, tuple(REFERENCE_TYPES)), (topics.imu, (IMU_TYPE,))):
+        if present.get(name) not in types:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(present.items())) or "none"
             raise InputError(
-                f"{recording.path}: no topic {name!r} of {msgtype}; set --motion-topics. The bag has: {listing}"
+                f"{recording.path}: no topic {name!r} of {' or '.join(types)}; set --motion-topics. "
+                f"The bag has: {listing}"
             )
 
 

@@ -1,0 +1,25 @@
+"""Message classes by the name of their type; only what is asked for is imported."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from ..io.drivers import VELOCITY_TYPES
+from ..io.errors import InputError
+
+
+def message_class(what: str, name: str) -> Any:
+    """The class of type ``package/msg/Name``. Raises InputError if its package is not installed.
+
+    what: the parameter or topic that asks for it, for the error.
+    """
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(import_module(f"{package}.msg"), kind)
+    except (ImportError, AttributeError) as error:
+        known = VELOCITY_TYPES.get(name)
+        how = known.install if known and known.install else f"install {package}"
+        raise InputError(
+            f"{what} {name}: the message package {package} is not installed ({error}); {how}, and source its setup.bash"
+        ) from error

@@ -1,0 +1,113 @@
+"""The live node on other message types than the default: over DDS where they are installed, else without it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
+
+from conftest import ROOT
+from diagnostic_msgs.msg import DiagnosticArray
+from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, as_plain, write_driver_bag
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from io_fixtures import run
+from nav_msgs.msg import Odometry
+from ros import World, until
+from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.io.errors import InputError
+from dvl_calib_ros.io.replay import replay
+from dvl_calib_ros.io.yaml_files import load_yaml
+from dvl_calib_ros.node.calibration_node import CalibrationNode
+from dvl_calib_ros.node.message_types import message_class
+
+
+@pytest.fixture
+def world():
+    world = World()
+    yield world
+    world.close()
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (["-p", "dvl_type:=marine_acoustic_msgs/Dvl"], "sudo apt install ros-$ROS_DISTRO-marine-acoustic-msgs"),
+        (["-p", "dvl_type:=dvl_msgs/msg/DVL"], "the message package dvl_msgs is not installed"),
+        (["-p", "dvl_type:=sensor_msgs/Imu"], "dvl_type: 'sensor_msgs/Imu' is none of geometry_msgs/msg/Twist"),
+        (["-p", "gnss_type:=dvl_msgs/DVL"], "gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs/msg/Twist"),
+    ],
+)
+def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(arguments, said):
+    command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1 and said in done.stderr
+
+
+def test_the_node_and_the_replay_agree_on_other_types(world, tmp_path):
+    bag, saved = write_driver_bag(tmp_path / "bag", run(), ODOMETRY, TWIST_STAMPED), tmp_path / "live.yaml"
+    types = as_arguments(PATIENT | {"dvl_type": ODOMETRY, "gnss_type": TWIST_STAMPED})
+    with world.calibration_node(*types, f"result_file:={saved}"):
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        sent = play(world, bag)
+        for topic, stream in (("dvl/twist", "dvl"), ("gnss/twist", "reference"), ("imu/data", "imu")):
+            until(lambda s=stream, t=topic: diagnosed(diagnostics, f"{s} received") == str(sent[t]), f"all of {topic}")
+    assert_agree(load_yaml(saved, "result file"), replay([bag], Parameters(**PATIENT)).result)
+
+
+def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):
+    with world.calibration_node():  # in one process, DDS would refuse the second type
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        publisher = world.node.create_publisher(Odometry, "dvl/twist", 10)
+        until(
+            lambda: any("set dvl_type" in str(message.status[0].message) for message in diagnostics),
+            "the diagnostics to name it",
+        )
+        said = diagnostics[-1].status[0].message
+        assert "test_client publishes nav_msgs/msg/Odometry, where" in said
+        world.node.destroy_publisher(publisher)
+        count = len(diagnostics)
+        until(lambda: len(diagnostics) > count + 1, "diagnostics after it")
+        assert "Odometry" not in diagnostics[-1].status[0].message
+
+
+@pytest.mark.parametrize("dvl_type", [MARINE, A50])
+def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed(dvl_type, world, monkeypatch):
+    """Stands in for a package that there is no wheel of: DDS is left out, all else is the node's."""
+    package, kind = dvl_type.split("/msg/")
+    stub = ModuleType(f"{package}.msg")
+    setattr(stub, kind, type(kind, (), {}))
+    monkeypatch.setitem(sys.modules, package, ModuleType(package))
+    monkeypatch.setitem(sys.modules, f"{package}.msg", stub)
+    subscribed = {}
+
+    def subscribe(node, message_type, topic, callback, *_, **__):
+        subscribed[topic] = (message_type, callback)
+        return SimpleNamespace(topic_name=topic)
+
+    monkeypatch.setattr(CalibrationNode, "create_subscription", subscribe)
+    maker, samples = Maker(), [sample for sample in run() if isinstance(sample, DvlSample)]
+    with node_here(world, dvl_type=dvl_type) as node:
+        message_type, callback = subscribed["dvl/twist"]
+        assert message_type is getattr(stub, kind)
+        assert subscribed["gnss/twist"][0] is TwistWithCovarianceStamped
+        messages = [as_plain(maker.velocity(dvl_type, sample)) for sample in samples]
+        messages[3].altitude = -1.0
+        for message in messages:
+            callback(message)
+        counts = node._calibrator.counts["dvl"]
+        assert (received(node), counts["no_bottom"], counts["accepted"]) == (len(samples), 1, len(samples) - 1)
+        assert node._feed.turns_dvl
+
+
+def test_a_class_that_its_package_does_not_have_is_named():
+    assert message_class("dvl_type", TWIST) is TwistWithCovarianceStamped
+    with pytest.raises(InputError, match=r"dvl_type nav_msgs/msg/Dvl: .* install nav_msgs, and source"):
+        message_class("dvl_type", "nav_msgs/msg/Dvl")
