@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import theilslopes
 
 from ..calibration.frames import Array
 from ..io.yaml_files import load_yaml
@@ -27,6 +28,8 @@ LATENCY_TARGET = 2.0
 SOAK_MINUTES = 10.0
 SOAK_RATES = {"dvl": 5.0, "gnss": 5.0, "imu": 20.0}
 SOAK_SPEED = 10.0
+# First a minute of operation comes at once: queues grow to what a stall of the machine may make of them, and then stay.
+SOAK_BURST_S = 60.0
 # Share of a soak after which memory and CPU are to be steady.
 SOAK_WARM_UP = 0.25
 MEMORY_TARGET_MB_PER_H = 1.0
@@ -35,6 +38,7 @@ ROUNDS = 3
 MEGABYTE = 1 << 20
 
 _NODE = [sys.executable, "-m", "dvl_calib_ros.node.main"]
+_CORRECTED = "dvl_calibration/calibrated_twist"
 _REPUBLISHER = """
 import rclpy
 from geometry_msgs.msg import TwistWithCovarianceStamped as Twist
@@ -89,11 +93,10 @@ def measure_latency() -> list[Measurement]:
 def measure_rate() -> list[Measurement]:
     """1000 Hz for 60 s from a reliable publisher: what the node received, and its memory early and late."""
     with _running_node() as (node, environment):
-        publisher = _publish(environment, dvl_rate=1000.0, gnss_rate=10.0, seconds=60.0)
+        publisher = _publish(environment, dvl_rate=1000.0, gnss_rate=10.0, seconds=60.0, echo=_CORRECTED)
         time.sleep(15.0)
         early = _resident(node.process.pid)
         sent = _report(publisher)["sent"]
-        time.sleep(2.0)
         late = _resident(node.process.pid)
         received = node.stop()["dvl"]["accepted"]
     return [
@@ -111,16 +114,22 @@ def measure_rate() -> list[Measurement]:
 
 def measure_soak(minutes: float = SOAK_MINUTES) -> list[Measurement]:
     """So many minutes of operation, at ten times the rates: samples lost, growth of memory and of CPU."""
-    with _running_node("max_latency:=30.0") as (node, environment):
+    with _running_node(f"max_latency:={SOAK_BURST_S}") as (node, environment):
         rates = {f"{name}_rate": rate for name, rate in SOAK_RATES.items()}
-        publisher = _publish(environment, **rates, seconds=60.0 * minutes, speed=SOAK_SPEED)
+        publisher = _publish(
+            environment,
+            **rates,
+            seconds=60.0 * minutes + SOAK_BURST_S,
+            speed=SOAK_SPEED,
+            burst=SOAK_BURST_S,
+            echo=_CORRECTED,
+        )
         usage = _watch(node.process.pid, publisher)
         sent = _report(publisher)["sent"]
-        time.sleep(2.0)
         received = node.stop()["dvl"]["accepted"]
     steady = usage[usage[:, 0] > usage[-1, 0] * SOAK_WARM_UP]
     hours = steady[:, 0] * SOAK_SPEED / 3600.0
-    growth = float(np.polyfit(hours, steady[:, 1] / MEGABYTE, 1)[0])
+    growth = float(theilslopes(steady[:, 1] / MEGABYTE, hours).slope)
     first, second = _cpu_shares(steady)
     what = f"soak, {minutes:g} min of operation at {SOAK_SPEED:.0f} times the rates (DVL 5, GNSS 5, IMU 20 Hz)"
     return [

@@ -26,6 +26,7 @@ DEPTH = 100_000
 SPEED_MPS, TURN_RATE = 1.5, 0.05
 # Of every minute of a vehicle with an IMU, GNSS is away for so long, s.
 OUTAGE_S, MINUTE_S = 10.0, 60.0
+PATIENCE_S = 60.0
 
 
 class Vehicle:
@@ -47,7 +48,7 @@ class Vehicle:
     def wait_until_received(self) -> None:
         """Wait until all is acknowledged."""
         for publisher in (self._dvl, self._gnss, self._imu):
-            publisher.wait_for_all_acked(Duration(seconds=60))
+            publisher.wait_for_all_acked(Duration(seconds=PATIENCE_S))
 
     def dvl(self, at: float) -> tuple[int, int]:
         """Publish a DVL message; its stamp."""
@@ -86,6 +87,10 @@ class Echo:
         """Take note of a message sent at a time (s, monotonic clock)."""
         self._sent_at[stamp] = at_s
 
+    def is_back(self, stamp: tuple[int, int]) -> bool:
+        """Whether the message with this stamp has come back."""
+        return stamp not in self._sent_at
+
     def _on_echo(self, message: TwistWithCovarianceStamped) -> None:
         stamp = message.header.stamp
         at_s = self._sent_at.pop((stamp.sec, stamp.nanosec), None)
@@ -100,6 +105,7 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=float, default=0.0, help="Hz of the run's time")
     parser.add_argument("--seconds", type=float, required=True, help="length of the run, s of its own time")
     parser.add_argument("--speed", type=float, default=1.0, help="the run's seconds per second")
+    parser.add_argument("--burst", type=float, default=0.0, help="first seconds of the run, sent without waiting")
     parser.add_argument("--echo", metavar="TOPIC", help="listen here for a message with the stamp of each DVL message")
     options = parser.parse_args()
     rclpy.init()
@@ -110,10 +116,10 @@ def main() -> None:
     wait = _spinning(node) if echo else time.sleep
     vehicle.wait_for_subscribers()
     started = time.monotonic()
-    sent, gnss_sent, imu_sent = 0, 0, 0
+    sent, gnss_sent, imu_sent, stamp = 0, 0, 0, (0, 0)
     for i in range(int(options.dvl_rate * options.seconds)):
         at = i / options.dvl_rate
-        early_s = started + at / options.speed - time.monotonic()
+        early_s = started + (at - options.burst) / options.speed - time.monotonic()
         if early_s > 0.0:
             wait(early_s)
         while imu_sent < at * options.imu_rate:
@@ -128,8 +134,9 @@ def main() -> None:
             vehicle.gnss(gnss_sent / options.gnss_rate)
             gnss_sent += 1
     vehicle.wait_until_received()
-    if echo:
-        wait(1.0)
+    until = time.monotonic() + PATIENCE_S
+    while echo and not echo.is_back(stamp) and time.monotonic() < until:
+        wait(0.1)  # the last one back: the node has dealt with all
     print(json.dumps({"sent": sent, "latencies_s": echo.latencies_s if echo else []}))
     rclpy.shutdown()
 
