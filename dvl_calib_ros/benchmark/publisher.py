@@ -1,6 +1,6 @@
 """A vehicle under way, in a process of its own: publishes reliably, and listens for what comes back.
 
-Prints one line of JSON: DVL messages sent, and the latencies (s) from a DVL message to the echo with its stamp.
+Prints one line of JSON: DVL messages sent, p50 and p99 (s) from a DVL message to the echo with its stamp.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import rclpy
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from rclpy.duration import Duration
@@ -79,7 +80,7 @@ class Echo:
     """Notes when messages are sent and when one with their stamp comes back."""
 
     def __init__(self, node: Any, topic: str) -> None:
-        self.latencies_s: list[float] = []
+        self._latencies_s: list[float] = []
         self._sent_at: dict[tuple[int, int], float] = {}
         node.create_subscription(TwistWithCovarianceStamped, topic, self._on_echo, 1000)
 
@@ -91,11 +92,18 @@ class Echo:
         """Whether the message with this stamp has come back."""
         return stamp not in self._sent_at
 
+    def percentiles_s(self) -> dict[str, float]:
+        """p50 and p99 of the latencies (s) so far; nothing if there are none."""
+        if not self._latencies_s:
+            return {}
+        p50, p99 = np.percentile(self._latencies_s, [50.0, 99.0])
+        return {"p50": float(p50), "p99": float(p99)}
+
     def _on_echo(self, message: TwistWithCovarianceStamped) -> None:
         stamp = message.header.stamp
         at_s = self._sent_at.pop((stamp.sec, stamp.nanosec), None)
         if at_s is not None:
-            self.latencies_s.append(time.monotonic() - at_s)
+            self._latencies_s.append(time.monotonic() - at_s)
 
 
 def main() -> None:
@@ -137,7 +145,7 @@ def main() -> None:
     until = time.monotonic() + PATIENCE_S
     while echo and not echo.is_back(stamp) and time.monotonic() < until:
         wait(0.1)  # the last one back: the node has dealt with all
-    print(json.dumps({"sent": sent, "latencies_s": echo.latencies_s if echo else []}))
+    print(json.dumps({"sent": sent} | (echo.percentiles_s() if echo else {})))
     rclpy.shutdown()
 
 
