@@ -9,8 +9,9 @@ ROS_FREE = ["numpy>=1.26", "scipy>=1.11", "pyyaml>=6.0", "rich>=13.7", "rosbags>
 STATISTICS = ["statsmodels>=0.14"]
 REPORT = ["matplotlib>=3.6", "jinja2>=3.1"]
 DASK = ["distributed>=2023.9"]
+COMPLETION = ["argcomplete>=3.1"]
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
-TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40", *DASK]
+TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40", *DASK, *COMPLETION]
 
 
 def shared(folder: str) -> list:
@@ -28,7 +29,7 @@ setup(
     package_data={NAME: ["report/templates/*"]},
     python_requires=">=3.10",
     install_requires=[*ROS_FREE, *STATISTICS, *REPORT],
-    extras_require={"ros": ROS, "dask": DASK, "test": TEST},
+    extras_require={"ros": ROS, "dask": DASK, "completion": COMPLETION, "test": TEST},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -105,6 +105,32 @@ def test_bad_usage_is_one_line_that_points_to_the_help(capsys, arguments, expect
     assert expected in error and "--help" in error
 
 
+def completed(tmp_path, typed: str) -> list[str]:
+    """What the shell is offered for a line that is being typed."""
+    answer = tmp_path / "answer"
+    asked = {
+        "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_SHELL": "bash", "COMP_LINE": typed,
+        "COMP_POINT": str(len(typed)), "_ARGCOMPLETE_STDOUT_FILENAME": str(answer), "COMP_TYPE": "9",
+    }  # fmt: skip
+    assert shell(**asked).returncode == 0
+    return [word.strip() for word in answer.read_text().split("\n")]
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("dvl-calib re", ["replay"]),
+        ("dvl-calib replay --dv", ["--dvl-topic"]),
+        ("dvl-calib replay bag -p min_s", ["min_speed:="]),
+        ("dvl-calib replay bag -p gnss_free_model:=F", ["gnss_free_model:=F1"]),
+        ("dvl-calib simulate bag --storage m", ["mcap"]),
+    ],
+)
+def test_the_shell_completes_commands_options_choices_and_parameters(tmp_path, typed, expected):
+    pytest.importorskip("argcomplete", reason="shell completion is optional: pip install argcomplete")
+    assert completed(tmp_path, typed) == expected
+
+
 # ------------------------------------------------------------------ replay
 
 

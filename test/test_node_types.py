@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
 from conftest import ROOT
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, as_plain, write_driver_bag
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
@@ -19,12 +19,16 @@ from nav_msgs.msg import Odometry
 from ros import World, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
 
+from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.io.drivers import VELOCITY_TYPES
 from dvl_calib_ros.io.errors import InputError
+from dvl_calib_ros.io.messages import MessageFeed
 from dvl_calib_ros.io.replay import replay
 from dvl_calib_ros.io.yaml_files import load_yaml
 from dvl_calib_ros.node.calibration_node import CalibrationNode
+from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
 
 
@@ -39,8 +43,6 @@ def world():
     "arguments, said",
     [
         (["-p", "dvl_type:=marine_acoustic_msgs/Dvl"], "sudo apt install ros-$ROS_DISTRO-marine-acoustic-msgs"),
-        (["-p", "dvl_type:=dvl_msgs/msg/DVL"], "the message package dvl_msgs is not installed"),
-        (["-p", "dvl_type:=sensor_msgs/Imu"], "dvl_type: 'sensor_msgs/Imu' is none of geometry_msgs/msg/Twist"),
         (["-p", "gnss_type:=dvl_msgs/DVL"], "gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs/msg/Twist"),
     ],
 )
@@ -70,12 +72,9 @@ def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):
             lambda: any("set dvl_type" in str(message.status[0].message) for message in diagnostics),
             "the diagnostics to name it",
         )
-        said = diagnostics[-1].status[0].message
-        assert "test_client publishes nav_msgs/msg/Odometry, where" in said
+        assert "test_client publishes nav_msgs/msg/Odometry, where" in diagnostics[-1].status[0].message
         world.node.destroy_publisher(publisher)
-        count = len(diagnostics)
-        until(lambda: len(diagnostics) > count + 1, "diagnostics after it")
-        assert "Odometry" not in diagnostics[-1].status[0].message
+        until(lambda: "Odometry" not in diagnostics[-1].status[0].message, "diagnostics without it")
 
 
 @pytest.mark.parametrize("dvl_type", [MARINE, A50])
@@ -107,7 +106,25 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
         assert node._feed.turns_dvl
 
 
-def test_a_class_that_its_package_does_not_have_is_named():
+def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wrong_with_them_is_said():
+    calibrator, kind = Calibrator(Parameters(dvl_type=MARINE)), VELOCITY_TYPES[MARINE]
+    feed, silence, recent = MessageFeed(calibrator, lambda _: None), Silence(0.0), RecentCounts()
+    for second in range(8):
+        message = Maker().velocity(MARINE, DvlSample(second * 10**9, (1.5, 0.0, 0.0)))
+        message.beam_velocities_valid = False
+        feed.dvl(message, 0)
+        status = diagnose(calibrator, kind, [], silence, recent, float(second))
+    assert status.level == DiagnosticStatus.ERROR
+    assert "no usable DVL message for 7 s" in status.message
+    assert "8 DVL messages are not used: beam_velocities_valid is false" in status.message
+    assert {item.key: item.value for item in status.values}["dvl flagged_invalid"] == "8"
+
+
+def test_a_package_or_class_that_is_not_there_is_named_with_the_remedy():
     assert message_class("dvl_type", TWIST) is TwistWithCovarianceStamped
+    with pytest.raises(
+        InputError, match=r"the message package dvl_msgs is not installed .* build the driver's dvl_msgs"
+    ):
+        message_class("dvl_type", A50)
     with pytest.raises(InputError, match=r"dvl_type nav_msgs/msg/Dvl: .* install nav_msgs, and source"):
         message_class("dvl_type", "nav_msgs/msg/Dvl")

@@ -68,6 +68,18 @@ def test_the_bar_is_as_long_as_the_convergence(percent, full):
     assert all(colour == ("32" if percent == 100.0 else "33") for colour, _ in bars)
 
 
+def test_what_another_process_says_can_neither_style_the_view_nor_move_the_cursor():
+    evil = "[bold]\x1b[2J[/] \x07"
+    changes = {"why": evil, "phi_x [deg]": evil, "observed phi_x": f"no (roll); needs {evil}", "convergence": evil}
+    text = drawn(status(1, evil, **changes), 100.0, [evil])
+    assert text.count("[bold]") >= 4 and not {"\x1b", "\x07"} & set(text)
+
+
+def test_before_the_first_sample_there_is_no_nis():
+    text = drawn(status(**{"samples used": "0", "mean NIS": "nan of 3 (99 %: -3.041 .. 7.013)"}), 100.0)
+    assert "0 used, 2 gated" in text and "nan" not in text
+
+
 def test_faults_silence_and_waiting_are_said():
     assert "no DVL message for 7 s" in drawn(status(2, "no DVL message for 7 s"), 100.0)
     assert "nothing heard" not in drawn(status(), 100.0 + SILENCE_S)

@@ -22,9 +22,17 @@ if TYPE_CHECKING:
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
     """--params and -p, as ROS 2 users know them."""
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
-    parser.add_argument(
+    override = parser.add_argument(
         "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"
     )
+    override.completer = _parameter_completions  # type: ignore[attr-defined]  # argcomplete's convention
+
+
+def _parameter_completions(**_: Any) -> list[str]:
+    from ..calibration.parameters import SCHEMA
+
+    choices = [f"{name}:={choice}" for name, spec in SCHEMA.items() for choice in spec.choices]
+    return choices + [f"{name}:=" for name, spec in SCHEMA.items() if not spec.choices]
 
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:

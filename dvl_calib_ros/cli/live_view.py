@@ -26,35 +26,45 @@ LOG_LINES = 5
 def rendered(status: Status | None, now_s: float, log: Sequence[str] = ()) -> RenderableType:
     """The view. now_s: monotonic time. log: last lines that the node has written."""
     from rich.console import Group
-    from rich.markup import escape
     from rich.text import Text
 
-    tail = [Text(line, style="dim", no_wrap=True, overflow="ellipsis") for line in log[-LOG_LINES:]]
+    tail = [Text(_printable(line), style="dim", no_wrap=True, overflow="ellipsis") for line in log[-LOG_LINES:]]
     if status is None:
         return Group("[yellow]waiting for the node's /diagnostics[/] ... (same ROS_DOMAIN_ID?)", *tail)
     colour = COLOURS.get(status.level, "red")
     why = status.get("why") if status.get("gnss") in status.get("why") else f"{status.get('why')}; {status.get('gnss')}"
     head = [
-        f"[bold]{escape(status.get('model'))}[/]: {escape(why)}",
-        f"[bold {colour}]{escape(status.get('convergence'))}[/]   {_counts(status)}",
+        f"[bold]{_shown(status.get('model'))}[/]: {_shown(why)}",
+        f"[bold {colour}]{_shown(status.get('convergence'))}[/]   {_shown(_counts(status))}",
     ]
     if status.level:
-        head.append(f"[{colour}]{escape(status.message)}[/]")
+        head.append(f"[{colour}]{_shown(status.message)}[/]")
     silent = now_s - status.received_s
     if silent > SILENCE_S:
         head.insert(0, f"[bold red]nothing heard of the node for {silent:.0f} s[/]")
     return Group(*head, _table(status), *tail)
 
 
+def _shown(text: str) -> str:
+    """A text of another process as rich takes it: it can neither style nor move the cursor."""
+    from rich.markup import escape
+
+    return escape(_printable(text))
+
+
+def _printable(text: str) -> str:
+    return "".join(letter if letter.isprintable() else "�" for letter in text)
+
+
 def _counts(status: Status) -> str:
     words = [f"{status.get('samples used')} used", f"{status.get('samples gated')} gated"]
     words += [f"{count} invalid" for count in [status.get("dvl invalid")] if count not in ("-", "0")]
-    return ", ".join((*words, f"NIS {status.get('mean NIS')}"))
+    words += [f"NIS {status.get('mean NIS')}"] if status.get("samples used") != "0" else []
+    return ", ".join(words)
 
 
 def _table(status: Status) -> RenderableType:
     from rich import box
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=box.SIMPLE, pad_edge=False)
@@ -68,7 +78,8 @@ def _table(status: Status) -> RenderableType:
         progress = status.values.get(f"progress {name} [%]")
         bar: Any = "" if progress is None else _bar(float(progress))
         missing = observed.partition("needs ")[2]
-        table.add_row(f"{name} {unit}", status.get(key), status.get(f"std {key}"), bar, escape(missing))
+        value, std = _shown(status.get(key)), _shown(status.get(f"std {key}"))
+        table.add_row(_shown(f"{name} {unit}"), value, std, bar, _shown(missing))
     return table
 
 
@@ -125,4 +136,4 @@ def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], 
         what = (status.get("model"), status.get("convergence"), str(status.level))
         if what != said or now_s - said_s > LINE_S:
             said, said_s = what, now_s
-            yield line(status)
+            yield _printable(line(status))

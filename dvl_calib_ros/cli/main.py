@@ -46,6 +46,8 @@ def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad usage or bad input, said in one line on standard error."""
+    if "_ARGCOMPLETE" in os.environ:
+        _complete()
     argv = sys.argv[1:] if argv is None else argv
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show φ must not end the run
@@ -69,6 +71,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         name = "" if error.filename is None else f"{error.filename}: "
         return _fail(arguments.command, f"{name}{error.strerror or error}; check names, permissions and space")
+
+
+def _complete() -> NoReturn:
+    """Answer the shell, which asks what the line that is being typed may go on with, and end."""
+    import argcomplete
+
+    argcomplete.autocomplete(build_parser(os.environ.get("COMP_LINE", "").split()))
+    sys.exit(1)  # not reached: it ends the process itself
 
 
 def _fail(command: str, message: str) -> int:

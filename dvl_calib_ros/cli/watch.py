@@ -63,15 +63,15 @@ def run_and_watch(ros_arguments: Sequence[str]) -> int:
     with _listener() as listener:
         command = [sys.executable, "-m", "dvl_calib_ros.node.main", *ros_arguments]
         environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, _interrupt)
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, start_new_session=True
         )
-        assert process.stdout is not None  # a pipe
-        log = _Log(process.stdout)
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, _interrupt)
         said = 0  # lines that are on the screen already
         try:
+            assert process.stdout is not None  # a pipe
+            log = _Log(process.stdout)
             show(common.console(), listener.latest, lambda: process.poll() is None, log.lines)
         except KeyboardInterrupt:
             said = len(log.lines)
@@ -89,6 +89,7 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
     try:
         return process.wait(PATIENCE_S)
     except subprocess.TimeoutExpired:
+        print(f"the node did not end within {PATIENCE_S:.0f} s and is killed; it may not have saved", file=sys.stderr)
         process.kill()
         return process.wait()
 
@@ -107,7 +108,8 @@ class _Log:
         self._thread.start()
 
     def _read(self) -> None:
-        self.lines.extend(raw.decode(errors="replace").rstrip() for raw in self._pipe)
+        for raw in self._pipe:
+            self.lines.append(raw.decode(errors="replace").rstrip())
 
     def finished(self) -> list[str]:
         """All lines of a node that has ended."""

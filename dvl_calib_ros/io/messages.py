@@ -15,7 +15,7 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.frames import FLU_FROM_FRD, Array, Vector
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from .drivers import TWIST_TYPE, VELOCITY_TYPES, VelocityType
+from .drivers import VelocityType, velocity_type
 
 # Different frame_ids of the reference that are remembered.
 MAX_FRAMES = 64
@@ -85,19 +85,15 @@ class MessageFeed:
     """Feeds a calibrator with messages.
 
     on_problem is called with a sentence (what is wrong, what to do) when a problem is new; `problems` keeps the latest
-    sentence of each kind. Counting is the calibrator's. dvl_type, reference_type: of the messages to come.
+    sentence of each kind. Counting is the calibrator's. The messages are of the types that its parameters dvl_type and
+    gnss_type name; raises InputError for what is none.
     """
 
-    def __init__(
-        self,
-        calibrator: Calibrator,
-        on_problem: Callable[[str], None],
-        dvl_type: VelocityType = VELOCITY_TYPES[TWIST_TYPE],
-        reference_type: VelocityType = VELOCITY_TYPES[TWIST_TYPE],
-    ) -> None:
+    def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None]) -> None:
         self.calibrator = calibrator
-        self.dvl_type, self.gnss_type = dvl_type, reference_type
-        self._reference_reader = _Reader(reference_type)
+        self.dvl_type = velocity_type("dvl_type", calibrator.parameters.dvl_type)
+        self._reference_type = velocity_type("gnss_type", calibrator.parameters.gnss_type)
+        self._reference_reader = _Reader(self._reference_type)
         self._on_problem = on_problem
         self.forget()
 
@@ -136,9 +132,9 @@ class MessageFeed:
         return sample if calibrator.feed_dvl(sample) else None
 
     def reference(self, message: Any, received_ns: int) -> ReferenceSample | None:
-        """Feed a message of reference_type with the reference velocity; the sample, or None if refused."""
+        """Feed a message of gnss_type with the reference velocity; the sample, or None if refused."""
         try:
-            frame_id = self.gnss_type.frame_id(message)
+            frame_id = self._reference_type.frame_id(message)
             if frame_id not in self._reference_frames:
                 if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
                     self._reference_frames.clear()
@@ -150,7 +146,7 @@ class MessageFeed:
             velocity, covariance = self._reference_reader(message)
             stamp = self._stamp_ns("reference", message.header, received_ns)
         except _UNREADABLE as error:
-            self.undecodable("reference", f"{self.gnss_type.name}, {type(error).__name__}: {error}")
+            self.undecodable("reference", f"{self._reference_type.name}, {type(error).__name__}: {error}")
             return None
         sample = ReferenceSample(stamp, velocity, covariance, frame)
         self.calibrator.feed_reference(sample)

@@ -245,8 +245,9 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
             "  ros__parameters:",
             *(f"    {key}: {_flow(value)}" for key, value in own.items()),
             *_comment(
-                f"B. The driver's own topic, in frame {dvl}, turned by TF (URDF or static transform, calibrated), "
-                "which has the lever arm, too. Our node does not run. Corrected in misalignment only: "
+                f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, turned by TF (URDF or "
+                "static transform, calibrated), which has the lever arm, too. Our node does not run. Corrected in "
+                "misalignment only: "
                 f"{scale_advice(calibrated)}. The covariance is the driver's, without the calibration's. As above, but:"
             ),
             "#   twist0: /dvl/twist",

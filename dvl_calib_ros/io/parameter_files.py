@@ -11,6 +11,7 @@ import yaml
 
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
+from .drivers import TYPES_OF, velocity_type
 from .errors import InputError
 from .yaml_files import load_yaml, parse_scalar
 
@@ -39,9 +40,12 @@ def load_parameters(
         if not is_ros_parameter(name):
             values[name] = "" if value is None else value
     try:
-        return Parameters.from_mapping(values)
+        parameters = Parameters.from_mapping(values)
     except ParameterError as error:
         raise InputError(f"-p {error}") from error
+    for name in TYPES_OF:
+        velocity_type(name, getattr(parameters, name))
+    return parameters
 
 
 def _node_parameters(path: Path) -> dict[str, Any]:

@@ -94,19 +94,19 @@ def replay(
     if parameters.prior_source == "initial_window":
         notes.append(INITIAL_WINDOW_WARNING)
     recorder = Recorder() if with_history else None
-    calibrator = Calibrator(
-        parameters,
-        prior_sway_heave=prior,
-        initial=initial,
-        block_size=BLOCK_SIZE,
-        on_event=notes.append,
-        on_block=recorder.observe if recorder else on_block,
-        verified=True,
-    )
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, notes)
-        feed = _feed(bag, chosen, calibrator, notes.append)
+        calibrator = Calibrator(
+            _of_types(bag, chosen, parameters),
+            prior_sway_heave=prior,
+            initial=initial,
+            block_size=BLOCK_SIZE,
+            on_event=notes.append,
+            on_block=recorder.observe if recorder else on_block,
+            verified=True,
+        )
+        feed = MessageFeed(calibrator, notes.append)
         if recorder:
             recorder.expect(bag.message_counts[chosen.dvl])
         _feed_all(bag, chosen, feed, recorder, on_progress)
@@ -125,11 +125,10 @@ def replay(
     )
 
 
-def _feed(bag: BagReader, topics: Topics, calibrator: Calibrator, on_problem: Callable[[str], None]) -> MessageFeed:
-    """A feed for the types that the bag has on these (checked) topics."""
+def _of_types(bag: BagReader, topics: Topics, parameters: Parameters) -> Parameters:
+    """The parameters with the message types that the bag has on these (checked) topics."""
     types = bag.topics
-    dvl, reference = types[topics.dvl], types.get(topics.gnss, TWIST_TYPE)
-    return MessageFeed(calibrator, on_problem, VELOCITY_TYPES[dvl], VELOCITY_TYPES[reference])
+    return parameters.replace(dvl_type=types[topics.dvl], gnss_type=types.get(topics.gnss, parameters.gnss_type))
 
 
 def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
@@ -202,14 +201,14 @@ def _feed_and_note(feed: MessageFeed, recorder: Recorder, message: Any, received
 
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
     """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError."""
-    calibrator = Calibrator(parameters.replace(prior_source="fixed"))
     rotation = None
     velocities: list[Any] = []
     first_ns: int | None = None
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
-        feed = _feed(bag, chosen, calibrator, lambda _: None)
+        typed = _of_types(bag, chosen, parameters)
+        feed = MessageFeed(Calibrator(typed.replace(prior_source="fixed")), lambda _: None)
         for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
             if undecodable:
                 continue

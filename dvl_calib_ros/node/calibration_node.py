@@ -61,7 +61,7 @@ class CalibrationNode(Node):
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
-        self._feed = MessageFeed(self._calibrator, self._warn, dvl_type, gnss_type)
+        self._feed = MessageFeed(self._calibrator, self._warn)
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._offset_ns = round(parameters.dvl_time_offset * 1e9)

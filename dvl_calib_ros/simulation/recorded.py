@@ -75,14 +75,13 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
 
 
 def _read(recording: Recording) -> _Samples:
-    parameters = Parameters(gnss_frame=recording.gnss_frame)
     velocities: dict[int, tuple[Vector, VelocityFrame]] = {}
     attitudes: dict[int, Quaternion] = {}
     with BagReader([recording.path]) as bag:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
         _check_topics(recording, topics, bag.topics)
-        reference_type = REFERENCE_TYPES[bag.topics[topics.gnss]]
-        feed = MessageFeed(Calibrator(parameters), lambda _: None, reference_type=reference_type)
+        parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=bag.topics[topics.gnss])
+        feed = MessageFeed(Calibrator(parameters), lambda _: None)
         for topic, log_ns, message, undecodable in bag.messages([topics.gnss, topics.imu]):
             if undecodable:
                 continue

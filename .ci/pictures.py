@@ -1,0 +1,102 @@
+"""Make the pictures of the README anew, in resource/images: python .ci/pictures.py [NAME...]. Needs chromium."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+from rich.console import Console, RenderableType
+from rich.text import Text
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # this tree, whatever is installed
+TARGET = ROOT / "resource" / "images"
+HARBOUR_BOX = Path("bags", "harbour_box")  # as it is to stand in a report
+COLOURS = 64
+WIDTH = 1000  # pixels
+
+
+def dvl_calib(*arguments: object) -> str:
+    """Output of a command."""
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+
+
+def screenshot(page: Path, name: str, height: int) -> None:
+    """The upper part of a page, in few colours."""
+    shot = page.with_suffix(".png")
+    command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={shot}"]
+    subprocess.run([*command, f"--window-size={WIDTH},{height}", page.as_uri()], check=True, capture_output=True)
+    image = Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    image.save(TARGET / f"{name}.png", optimize=True)
+    print(f"{name}.png: {image.size}, {(TARGET / f'{name}.png').stat().st_size // 1000} kB")
+
+
+def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns: int, height: int) -> None:
+    """What a terminal of this width shows."""
+    console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True, highlight=False)
+    console.print(shown)
+    page = folder / f"{name}.html"
+    page.write_text(f"<body style='margin:0'>{console.export_svg(title=title)}</body>")
+    screenshot(page, name, height)
+
+
+def demo(folder: Path) -> None:
+    """The end of the demo."""
+    output = dvl_calib("demo", "--speed", 5)  # slow enough for a busy machine
+    lines = [line.rstrip() for line in output.splitlines() if not line.startswith("   playing")]
+    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 836)
+
+
+def watch(folder: Path) -> None:
+    """The live view 250 s into a run."""
+    from dvl_calib_ros.calibration.calibrator import Calibrator
+    from dvl_calib_ros.calibration.parameters import Parameters
+    from dvl_calib_ros.cli.live_view import rendered
+    from dvl_calib_ros.io.bags import BagReader
+    from dvl_calib_ros.io.messages import MessageFeed
+    from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
+    from dvl_calib_ros.node.status import Status
+
+    calibrator = Calibrator(Parameters())
+    feed = MessageFeed(calibrator, print)
+    handlers = {"dvl/twist": feed.dvl, "gnss/twist": feed.reference, "imu/data": feed.imu}
+    with BagReader([ROOT / HARBOUR_BOX]) as bag:
+        first_ns = None
+        for topic, log_ns, message, _ in bag.messages(handlers):
+            first_ns = first_ns or log_ns
+            if log_ns - first_ns > 250e9:
+                break
+            handlers[topic](message, log_ns)
+    found = diagnose(calibrator, [], Silence(0.0), RecentCounts(), 0.0)
+    values = {item.key: item.value for item in found.values}
+    shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
+    terminal(shown, folder, "watch", "dvl-calib run --watch", 100, 318)
+
+
+def report(folder: Path) -> None:
+    """The head of replay's report."""
+    page = folder / "report.html"
+    dvl_calib("replay", HARBOUR_BOX, "--report", page)
+    screenshot(page, "report", 1100)
+
+
+def diagnosis(folder: Path) -> None:
+    """The head of a diagnosis' report: a lever arm that nobody has told of."""
+    bag, page = folder / "bag", folder / "diagnosis.html"
+    dvl_calib("simulate", bag, "--trajectory", "free", "--gnss-std", 0.03, "--effect", "lever_arm:x_m=0.5,y_m=-0.2")
+    dvl_calib("diagnose", bag, "--report", page)
+    screenshot(page, "diagnosis", 1100)
+
+
+PICTURES = {each.__name__: each for each in (demo, watch, report, diagnosis)}
+
+if __name__ == "__main__":
+    TARGET.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        for wanted in sys.argv[1:] or PICTURES:
+            PICTURES[wanted](Path(scratch))
