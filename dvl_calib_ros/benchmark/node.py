@@ -28,8 +28,8 @@ LATENCY_TARGET = 2.0
 SOAK_MINUTES = 10.0
 SOAK_RATES = {"dvl": 5.0, "gnss": 5.0, "imu": 20.0}
 SOAK_SPEED = 10.0
-# First a minute of operation comes at once: queues grow to what a stall of the machine may make of them, and then stay.
-SOAK_BURST_S = 60.0
+# First so much of operation comes at once: queues grow to what a stall of the machine may make of them, and then stay.
+SOAK_BURST_S = 200.0
 # Share of a soak after which memory and CPU are to be steady.
 SOAK_WARM_UP = 0.25
 MEMORY_TARGET_MB_PER_H = 1.0
