@@ -244,7 +244,7 @@ def test_models_are_switched_by_parameter_at_once_and_a_late_subscriber_gets_the
         ("gnss_hysteresis", -1.0, ""),
         ("gnss_hysteresis", "long", "type"),
         ("fine_std_scale", float("nan"), ""),
-        ("result_file", "/no/such/folder/r.yaml", "does not exist"),
+        ("result_file", "/no/such/folder/r.yaml", "at run time"),
         ("no_such_parameter", 1.0, ""),
     ],
 )
@@ -271,7 +271,8 @@ def test_whole_numbers_are_accepted_for_doubles_at_the_start(world):
         assert list(node.get_parameter("lever_arm").value) == [1.0, 0.0, 2.0]
 
 
-def test_services_reset_and_save_answer_in_words(world, tmp_path):
+def test_services_reset_and_save_answer_in_words(world, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with node_here(world) as node:
         dvl = Publisher(world)
         dvl.send(*(twist(1000 + 0.2 * i) for i in range(10)))

@@ -96,7 +96,7 @@ WRONG = [
     ("{min_speed: 1" + "0" * 400 + "}", "too large"),
     ("{min_speed: 1" + "0" * 5000 + "}", "not valid YAML"),
     ("{min_speed: [" + "[" * 3000 + "]}", "not valid YAML"),
-    ("&a {min_speed: *a}", "contains itself"),
+    ("&a {min_speed: *a}", "without aliases"),
     ("{min_speed: !!python/object/apply:os.getcwd []}", "not valid YAML"),
 ]
 

@@ -391,7 +391,8 @@ class Parameters:
     )
     result_file: str = _parameter(
         "",
-        "Result file (YAML) written by ~/save and at shutdown. Empty: none.",
+        "Result file (YAML) written by ~/save and at shutdown. Empty: none. At run time only another .yaml file in the "
+        "same folder (the working directory, if none was named at the start).",
         read_only=False,
     )
     initial_calibration: str = _parameter(

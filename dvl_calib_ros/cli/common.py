@@ -106,9 +106,11 @@ def print_warnings(notes: Sequence[str]) -> None:
     """What the user should know, on standard error."""
     from rich.markup import escape
 
+    from ..io.errors import printable
+
     errors = console(stderr=True)
     for note in notes:
-        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+        errors.print(f"[yellow]warning:[/] {escape(printable(note))}", soft_wrap=True)
 
 
 @contextmanager

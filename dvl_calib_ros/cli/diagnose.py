@@ -84,9 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _print(diagnosis: Diagnosis) -> None:
     from rich.markup import escape
 
-    errors = common.console(stderr=True)
-    for note in diagnosis.notes:
-        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+    common.print_warnings(diagnosis.notes)
     out = common.console()
     verdict = diagnosis.verdict.value
     out.print(f"[bold {COLOURS.get(verdict, 'yellow')}]{verdict}[/]: {escape(diagnosis.sentence)}", soft_wrap=True)

@@ -300,9 +300,7 @@ def _print_cross_check(check: CrossCheck) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    errors = common.console(stderr=True)
-    for note in check.notes:
-        errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+    common.print_warnings(check.notes)
     caption = "with the noise of GNSS, which no calibration removes; -: nothing to calibrate with, or to check against"
     title = "Difference of DVL and GNSS, rms m/s, on bags that were not calibrated on"
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")

@@ -82,7 +82,9 @@ def _complete() -> NoReturn:
 
 
 def _fail(command: str, message: str) -> int:
-    print(f"dvl-calib {command}: {' '.join(message.splitlines())}", file=sys.stderr)
+    from ..io.errors import printable
+
+    print(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
     return 2
 
 

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, say what was lost."""
     from ..io.bags import BagReader, BagWriter, Compression, Storage
-    from ..io.errors import InputError
+    from ..io.errors import InputError, printable
 
     counts: Counter[str] = Counter()
     with BagReader(arguments.bags) as reader:
@@ -41,5 +41,5 @@ def run(arguments: argparse.Namespace) -> None:
                     on_progress(number / total)
         common.print_warnings(reader.notes)
     for topic, count in sorted(counts.items()):
-        print(f"{topic}: {count} messages")
+        print(printable(f"{topic}: {count} messages"))
     print(f"{arguments.output}: {counts.total()} messages")

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
+from ..effects.base import Effect
 from .fitting import Fit, Fitter
 from .problem import PRIOR_STD, Problem
+from .selection import Selection, selected_again
 
 BLOCK_S = 20.0
 FOLDS = 5
@@ -26,26 +28,6 @@ class Gap:
     noise_floor: float
     closure: float
     interval: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """Columns (M, 3, p) that explain a series (M, 3), least squares with prior (p,) one over std."""
-
-    columns: Array
-    series: Array
-    prior: Array
-
-
-def explanation(fitter: Fitter, fit: Fit) -> Explanation:
-    """A fit, made linear about its values: calibration and effects."""
-    columns, series, prior = [fitter.problem.base], fit.residual + fitter.problem.base @ fit.change, [1.0 / PRIOR_STD]
-    for effect in fit.effects:
-        specs, jacobian = fitter.jacobian(effect, fit.values[effect.name])
-        columns.append(jacobian)
-        series = series + jacobian @ np.array([fit.values[effect.name][spec.name] for spec in specs])
-        prior.append(np.array([1e-3 / spec.typical for spec in specs]))
-    return Explanation(np.concatenate(columns, axis=2), series, np.concatenate(prior))
 
 
 @dataclass(frozen=True)
@@ -67,35 +49,37 @@ class HeldOutResiduals:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
-def held_out(fitter: Fitter, fit: Fit, dictionary: Array) -> HeldOutResiduals:
-    """What is left before and after the effects of a fit, on held-out data.
+def held_out(selection: Selection, dictionary: Array, only: Effect | None = None) -> HeldOutResiduals:
+    """What is left before and after the effects of a selection, on held-out data.
 
-    Calibration and effects are fitted on all folds but one and judged on that. The noise floor is what is left by
-    everything together, the dictionary of `unexplained` too, with the degrees of freedom given back: so it shares the
-    noise of before and after, and their differences are exact to the size of the gap rather than of the noise.
+    Effects are selected, and fitted with the calibration, on all folds but one, and judged on that; `only`: that one
+    effect in all folds. The noise floor is what is left by everything together, the dictionary of `unexplained` too if
+    given, with the degrees of freedom given back: so it shares the noise of before and after, and their differences are
+    exact to the size of the gap rather than of the noise. A simulator that lacks nothing would still be calibrated on
+    the other folds: what that costs belongs to the floor.
     """
-    problem, noise = fitter.problem, fit.noise
-    block, fold = blocks_of(problem)
-    bare = Explanation(problem.base, fitter.residual, 1.0 / PRIOR_STD)
-    full = explanation(fitter, fit)
-    before = _left_in_folds(bare, noise.whiten(bare.columns), noise.whiten(bare.series), fold[block])
-    after = before
-    if fit.effects:
-        after = _left_in_folds(full, noise.whiten(full.columns), noise.whiten(full.series), fold[block])
-    size = np.maximum(np.sqrt((dictionary**2).mean(axis=(0, 1))), 1e-12)
-    everything = Explanation(
-        np.concatenate([full.columns, dictionary / size], axis=2),
-        full.series,
-        np.concatenate([full.prior, np.full(dictionary.shape[2], 1e-3)]),
-    )
-    floor = _floor(everything, noise.whiten(everything.columns), noise.whiten(everything.series))
+    fitter, fit = selection.fitter, selection.fit
+    block, fold = blocks_of(fitter.problem)
+    seen = selection.dictionary.seen(fit.noise, fitter.residual)
+    before, after = np.empty_like(fitter.residual), np.empty_like(fitter.residual)
+    floor = _floor(fitter, fit, dictionary)
+    for held in np.unique(fold):
+        test = fold[block] == held
+        train = seen.without(test)
+        before[test] = train.left(train.solved([]), [])[test]
+        after[test] = before[test]
+        if fit.effects:
+            chosen = [fit.effects.index(only)] if only is not None else selected_again(train)
+            after[test] = train.left(train.solved(chosen), chosen)[test]
+        base = fitter.problem.base[test]
+        floor[test] += np.einsum("mip,pq,miq->mi", base, train.covariance([]), base, optimize=True)
     return HeldOutResiduals(before, after, floor, block)
 
 
-def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
-    """Held-out gap before and after the effects of a fit, with a bootstrap over blocks."""
-    before, after, floor = held_out(fitter, fit, dictionary).squares()
-    n = len(fitter.residual)
+def measure_gap(selection: Selection, dictionary: Array, only: Effect | None = None) -> Gap:
+    """Held-out gap before and after the effects of a selection, or one of them, with a bootstrap over blocks."""
+    before, after, floor = held_out(selection, dictionary, only).squares()
+    n = len(selection.fitter.residual)
 
     def closure(at: Integers) -> Array:
         gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
@@ -105,11 +89,11 @@ def measure_gap(fitter: Fitter, fit: Fit, dictionary: Array) -> Gap:
     resampled = closure(rng.integers(0, len(before), (RESAMPLES, len(before))))
     low, high = np.percentile(np.clip(resampled, -1.0, 1.0), [2.5, 97.5]).tolist()
     excess = [max(0.0, float(part.sum() - floor.sum()) / n) for part in (before, after)]
-    is_gap = bool(fit.effects) and excess[0] > 0.0
+    is_gap = bool(selection.fit.effects) and excess[0] > 0.0
     value = min(1.0, float(closure(np.arange(len(before))))) if is_gap else np.nan
     return Gap(
         before=float(np.sqrt(excess[0])),
-        after=float(np.sqrt(min(excess) if not fit.effects else excess[1])),
+        after=float(np.sqrt(excess[1])),
         noise_floor=float(np.sqrt(max(0.0, floor.sum() / n))),
         closure=max(-1.0, value) if is_gap else np.nan,
         interval=(low, high) if is_gap else (np.nan, np.nan),
@@ -126,27 +110,21 @@ def blocks_of(problem: Problem) -> tuple[Integers, Integers]:
     return block, np.arange(len(first)) % FOLDS
 
 
-def _left_in_folds(it: Explanation, white: Array, white_series: Array, fold: Integers) -> Array:
-    """(M, 3) m/s that is left of each sample, with coefficients from the folds that it (M,) is not in."""
-    p = it.columns.shape[2]
-    left = np.empty_like(it.series)
-    of_row = np.repeat(fold, 3)
-    for held in np.unique(fold):
-        train = of_row != held
-        a = white[train]
-        solution = np.linalg.lstsq(
-            np.concatenate([a, np.diag(it.prior)]), np.concatenate([white_series[train], np.zeros(p)]), rcond=None
-        )[0]
-        test = fold == held
-        left[test] = it.series[test] - it.columns[test] @ solution
-    return left
-
-
-def _floor(it: Explanation, white: Array, white_series: Array) -> Array:
+def _floor(fitter: Fitter, fit: Fit, dictionary: Array) -> Array:
     """(M, 3) (m/s)², square of the noise: of what is left, and of what the fit has taken of it."""
-    normal = white.T @ white + np.diag(it.prior**2)
+    base = fitter.problem.base
+    jacobians = [(effect, *fitter.jacobian(effect, fit.values[effect.name])) for effect in fit.effects]
+    series = fit.residual + base @ fit.change
+    for effect, specs, jacobian in jacobians:
+        series = series + jacobian @ np.array([fit.values[effect.name][spec.name] for spec in specs])
+    size = np.maximum(np.sqrt((dictionary**2).mean(axis=(0, 1))), 1e-12)
+    columns = np.concatenate([base, *(jacobian for *_, jacobian in jacobians), dictionary / size], axis=2)
+    weak = [np.array([1e-3 / spec.typical for spec in specs]) for _, specs, _ in jacobians]
+    prior = np.concatenate([1.0 / PRIOR_STD, *weak, np.full(dictionary.shape[2], 1e-3)])
+    white = fit.noise.whiten(np.concatenate([columns, series[:, :, None]], axis=2))
+    normal = white[:, :-1].T @ white[:, :-1] + np.diag(prior**2)
     covariance = np.linalg.pinv(normal, hermitian=True)
-    left = it.series - it.columns @ (covariance @ (white.T @ white_series))
-    taken = np.einsum("mip,pq,miq->mi", it.columns, covariance, it.columns, optimize=True)
+    left = series - columns @ (covariance @ (white[:, :-1].T @ white[:, -1]))
+    taken = np.einsum("mip,pq,miq->mi", columns, covariance, columns, optimize=True)
     floor: Array = left**2 + taken
     return floor

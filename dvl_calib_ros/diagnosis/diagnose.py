@@ -16,12 +16,13 @@ from ..effects.registry import EFFECTS
 from ..io.errors import InputError
 from ..io.replay import Topics
 from .closure import Gap, measure_gap
-from .fitting import Fit, Fitter, is_time_of_run
+from .dictionary import is_time_of_run
+from .fitting import Fit, Fitter
 from .noise_findings import noise_findings
 from .problem import PRIOR_STD, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
-from .selection import LEVEL, Selected, Selection, refined, select
+from .selection import LEVEL, Selected, Selection, select
 from .series import collect_series
 from .unexplained import Unexplained, unexplained
 from .where import places
@@ -37,6 +38,8 @@ MIN_VISIBLE_SHARE = 0.5
 # The rest, as a share of the gap, from which a combination of effects does not explain it
 UNEXPLAINED_SHARE = 0.25
 POWER = 0.8
+# p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
+WEAK = 1e-3
 # Recordings whose mounting differs by more than this (rad) are not of one vehicle
 SAME_MOUNTING = np.deg2rad(3.0)
 
@@ -76,14 +79,13 @@ def diagnose_recordings(
         for name, effect in effects.items()
         if name not in testable
     }
-    selection = _about_its_answer(select(problem, testable))
+    selection = select(problem, testable)
     rest = unexplained(selection.fitter, selection.fit)
-    gap = measure_gap(selection.fitter, selection.fit, rest.columns)
-    if selection.selected and not gap.after < gap.before:
-        # what does not shrink the error on held-out data is no explanation, however unlikely it is to be chance
+    gap = measure_gap(selection, rest.columns)
+    if selection.selected and not _is_borne_out(selection, gap, len(testable)):
         selection = selection.withdrawn()
         rest = unexplained(selection.fitter, selection.fit)
-        gap = measure_gap(selection.fitter, selection.fit, rest.columns)
+        gap = measure_gap(selection, rest.columns)
     detectable = {
         name: _minimum_detectable(selection.fitter, selection.fit, effect, len(testable))
         for name, effect in testable.items()
@@ -108,7 +110,7 @@ def diagnose_recordings(
         minimum_detectable=detectable,
         next_manoeuvre=next_manoeuvre,
         notes=tuple(notes),
-        series=collect_series(selection.fitter, selection.fit, rest) if with_series else None,
+        series=collect_series(selection, rest) if with_series else None,
     )
 
 
@@ -167,13 +169,10 @@ def _check_mountings(recordings: Sequence[Recording], rotation_dvl_from_body: Ar
             )
 
 
-def _about_its_answer(selection: Selection) -> Selection:
-    """The selection with the problem made linear about its calibration, and the times of its effects made fine."""
-    fitter, fit = selection.fitter, selection.fit
-    for each in selection.selected:
-        fit = refined(fitter, fit, each.effect)
-    base = fitter.fit([], fit.noise, {})
-    return Selection(selection.selected, base, fit, fitter)
+def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
+    """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
+    p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
+    return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before
 
 
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
@@ -206,7 +205,7 @@ def _covariance(
 def _minimum_detectable(fitter: Fitter, fit: Fit, effect: Effect, n_tested: int) -> dict[str, float]:
     """Size of each parameter that is found with a power of 80 per cent at the level of the tests."""
     others = [other for other in fit.effects if other is not effect]
-    values = {**fit.values, effect.name: fitter.starts(effect)[0][0]}
+    values = {**fit.values, effect.name: effect.defaults}
     specs, _ = fitter.jacobian(effect, values[effect.name])
     covariance = _covariance(fitter, fit, [*others, effect], values)
     std = np.sqrt(np.diag(covariance))[-len(specs) :]
@@ -235,8 +234,7 @@ def _found(selection: Selection, selected: Selected, n_tested: int, gap: Gap, di
             parameters[spec.name] = fitter.time_interval(fit, effect, spec)
     closure = gap.closure
     if len(fit.effects) > 1:
-        alone = fitter.fit([effect], fit.noise, fit.values)
-        closure = measure_gap(fitter, alone, dictionary).closure
+        closure = measure_gap(selection, dictionary, only=effect).closure
     ordered = {spec.name: parameters[spec.name] for spec in effect.parameters}
     p = min(1.0, float(np.exp(selected.log_p)) * n_tested)
     return FoundEffect(effect.name, selected.equivalent, ordered, closure, p)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from ..calibration.frames import Array
 from ..effects.base import Needs
-from .noise import Noise
+from .noise import Noise, white_noise
 from .problem import Problem
 
 SIGNIFICANT = 1e-4
@@ -54,11 +54,14 @@ def fit_level(problem: Problem, innovations: Array) -> Level | None:
     return Level(tuple(found), 0.5 * slopes, float(chi2.sf(wald, len(slopes))), p_of, level)
 
 
-def with_levels(problem: Problem, noise: Noise) -> Noise:
-    """The noise with the level that its innovations call for, if they do so clearly."""
-    innovations = noise.whiten(problem.residual).reshape(-1, 3)
-    level = fit_level(problem, innovations)
-    if level is None or level.p > SIGNIFICANT:
-        return noise
-    changed = replace(noise, level=noise.level * level.values[:, None])
-    return changed.refitted(changed.robust(problem.residual))
+def estimated(problem: Problem, left: Array, rotation: Array | None) -> tuple[Noise, Array]:
+    """The noise that is left (M, 3) of a problem's residual, in a frame, with the level that it calls for if it does
+    so clearly; and what is left with its outliers drawn in.
+    """
+    noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
+    noise = noise.refitted(noise.robust(left))
+    level = fit_level(problem, noise.whiten(left).reshape(-1, 3))
+    if level is not None and level.p < SIGNIFICANT:
+        noise = replace(noise, level=noise.level * level.values[:, None])
+    robust = noise.robust(left)
+    return noise.refitted(robust), robust

@@ -19,8 +19,8 @@ from ..calibration.frames import Array
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)
 HUBER = 2.5
 # Time constant, s, of the slowest noise of a receiver; an effect that comes and goes within a run is slower
-LONGEST_S = 40.0
-ORDERS = ((0, 0), (1, 0), (1, 1), (2, 1), (3, 1))
+LONGEST_S = 15.0
+ORDERS = ((0, 0), (1, 0), (1, 1))
 _STARTS = (0.0, 0.9)
 
 

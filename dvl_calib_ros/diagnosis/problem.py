@@ -6,32 +6,42 @@ traces of effects. Exp(φ) is the rotation that I + [φ×] stands for; at 5° ab
 cent of the speed, which a diagnosis would take for an effect.
 
 Regressors are made from the calibrated DVL velocity, whose noise is small; those made from the reference would pull
-estimates towards zero (errors in variables).
+estimates towards zero (errors in variables). But the DVL's noise is in the residual as well, and must not explain
+itself. So the motion of a sample is told by its neighbours (`predicted`). That blurs what is quick, which a delay is
+seen by best; but the noise of a series shifted in time is as large as before, so a delay, in the form in which it is
+undone, gains nothing by the noise of an ideal low-pass of the series itself (`lowpassed`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct, idct
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.frames import Array, skew
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn, Effect, EffectInput, Needs
+from ..effects.timing import DvlTimeOffset, ReferenceTimeOffset, delayed
 from .noise import segments_of
 from .recordings import Recording
 
 Values = Mapping[str, float]
+DVL_TIME_OFFSET, REFERENCE_TIME_OFFSET = DvlTimeOffset(), ReferenceTimeOffset()
 # The calibration is refitted in every hypothesis, held by a prior where the data says little, as of roll and of the
 # scale of sway and heave: else these would take in much of a lever arm. Std of φ (rad) and δk
 PRIOR_STD: Array = np.array([0.1] * 3 + [0.02] * 3)
 # The velocity at a time is told by samples that are this far away: delays within it do not bring its own noise back
 OWN_S, NEIGHBOURS_S = 0.6, 4.0
+# Bands of the DVL's spectrum, how much louder than the quietest ones counts as motion, and the share of all
+# frequencies beyond which none does: what interpolation does to them is not exact
+SPECTRUM_BANDS, SIGNAL_TO_NOISE, MAX_BAND = 40, 4.0, 0.6
+MIN_SPECTRUM = 40
 _ITERATIONS = 6
 SHAKES = 2
 
@@ -66,13 +76,13 @@ class Calibration:
 class Problem:
     """Recordings seen with a calibration. M is the number of averaged samples of all of them.
 
-    added: per recording (N, 3) m/s in the body frame, traces that are known to be in the DVL velocity: the motion is
-    made without them. shake: per recording (N, 3) m/s, added to the motion.
+    added: name of an effect -> per recording (N, 3) m/s in the body frame, traces that are known to be in the DVL
+    velocity: the motion is made without them. shake: per recording (N, 3) m/s, added to the DVL velocity.
     """
 
     recordings: tuple[Recording, ...]
     calibration: Calibration
-    added: tuple[Array, ...] | None = None
+    added: Mapping[str, tuple[Array, ...]] = field(default_factory=dict)
     shake: tuple[Array, ...] | None = None
 
     @cached_property
@@ -83,30 +93,52 @@ class Problem:
     @cached_property
     def motions(self) -> tuple[EffectInput, ...]:
         """The vehicle's motion, per recording, at `finer` times for each sample."""
-        return tuple(map(self._motion, self.recordings, self._velocities))
+        return tuple(map(self._motion, self.recordings, self._predicted))
 
     @cached_property
-    def _velocities(self) -> tuple[Array, ...]:
-        """(N, 3) m/s per recording: the calibrated DVL velocity, less what is known to be in it.
+    def _kept_delayed(self) -> dict[str, tuple[tuple[EffectInput, ...], tuple[EffectInput, ...]]]:
+        return {}
 
-        From each sample's neighbours: a sample's own noise is in its residual, too, and what is made of it would seem
-        to explain that: sway or heave of little more than the noise would be scaled to it.
+    def _for_delays(self, left_in: str) -> tuple[tuple[EffectInput, ...], tuple[EffectInput, ...]]:
+        """The motion with its quick changes, for mere delays, and as told by neighbours, for the rest; per recording.
+
+        left_in: the effect whose traces are left in it, '' for none.
         """
+        if left_in not in self._kept_delayed:
+            quick, slow = [], []
+            parts = zip(self.recordings, self._velocities(left_in), self._predictors, strict=True)
+            for recording, velocity, predict in parts:
+                quick.append(self._motion(recording, lowpassed(recording.time, velocity, velocity)))
+                slow.append(self._motion(recording, lowpassed(recording.time, predict(velocity), velocity)))
+            self._kept_delayed[left_in] = tuple(quick), tuple(slow)
+        return self._kept_delayed[left_in]
+
+    def _velocities(self, left_in: str = "") -> list[Array]:
+        """(N, 3) m/s per recording: the calibrated DVL velocity, less what is known to be in it but of one effect."""
         matrix = self.calibration.body_from_measured.T
         velocities = [recording.velocity_dvl @ matrix for recording in self.recordings]
-        if self.added is not None:
-            velocities = [velocity - added for velocity, added in zip(velocities, self.added, strict=True)]
-        predicted = [
-            predict(velocity) for predict, velocity in zip(self._predictors(velocities), velocities, strict=True)
-        ]
+        for name, traces in self.added.items():
+            if name != left_in:
+                velocities = [velocity - trace for velocity, trace in zip(velocities, traces, strict=True)]
         if self.shake is not None:
-            predicted = [one + shake for one, shake in zip(predicted, self.shake, strict=True)]
-        return tuple(predicted)
+            velocities = [velocity + shake for velocity, shake in zip(velocities, self.shake, strict=True)]
+        return velocities
 
-    def _predictors(self, velocities: Sequence[Array]) -> list[_Predictor]:
+    @cached_property
+    def _predicted(self) -> tuple[Array, ...]:
+        """(N, 3) m/s per recording: velocities from each sample's neighbours.
+
+        A sample's own noise is in its residual, too, and what is made of it would seem to explain that: sway or heave
+        of little more than the noise would be scaled to it.
+        """
+        return tuple(predict(velocity) for predict, velocity in zip(self._predictors, self._velocities(), strict=True))
+
+    @cached_property
+    def _predictors(self) -> list[_Predictor]:
+        unshaken = replace(self, shake=None)._velocities()
         return [
             _Predictor.fitted(recording.time, velocity, recording.every)
-            for recording, velocity in zip(self.recordings, velocities, strict=True)
+            for recording, velocity in zip(self.recordings, unshaken, strict=True)
         ]
 
     @cached_property
@@ -116,17 +148,14 @@ class Problem:
         What noise that is in both can seem to explain of itself (`selection.own_doing`).
         """
         rng = np.random.default_rng(0)
-        matrix = self.calibration.body_from_measured.T
-        predictors = self._predictors([recording.velocity_dvl @ matrix for recording in self.recordings])
         made_up = []
         for _ in range(SHAKES):
-            noise = [
+            noise = tuple(
                 predict.std * rng.standard_normal((len(r.time), 3))
-                for predict, r in zip(predictors, self.recordings, strict=True)
-            ]
-            seen = tuple(predict(one, np.zeros(3)) for predict, one in zip(predictors, noise, strict=True))
+                for predict, r in zip(self._predictors, self.recordings, strict=True)
+            )
             in_residual = self.joined([r.averaged(one) for r, one in zip(self.recordings, noise, strict=True)])
-            made_up.append((in_residual, replace(self, shake=seen)))
+            made_up.append((in_residual, replace(self, shake=noise)))
         return tuple(made_up)
 
     def _motion(self, recording: Recording, velocity: Array) -> EffectInput:
@@ -163,7 +192,7 @@ class Problem:
         """(M, 3, 6): what a change of φ and δk that the calibration lacks adds to the residual."""
         turned = self.calibration.turned
         parts = []
-        for recording, velocity in zip(self.recordings, self._velocities, strict=True):
+        for recording, velocity in zip(self.recordings, self._predicted, strict=True):
             velocity = recording.averaged(velocity) @ turned.T
             # v = (I + δk) Exp(δφ) turned u, seen through the calibration without the change
             columns = np.concatenate([-skew(velocity), velocity[:, :, None] * np.eye(3)], axis=2)
@@ -179,12 +208,21 @@ class Problem:
         """(M, 3) m/s that an effect adds to the residual."""
         return self.joined([r.averaged(t) for r, t in zip(self.recordings, self.traces(effect, values), strict=True)])
 
-    def traces(self, effect: Effect, values: Values) -> list[Array]:
+    def traces(self, effect: Effect, values: Values) -> Sequence[Array]:
         """`trace` per recording (N, 3), before averaging."""
-        traces = [
-            effect.trace(motion, values)[:: recording.finer]
-            for recording, motion in zip(self.recordings, self.motions, strict=True)
-        ]
+        delay = effect.delay(values)
+        if delay:
+            is_late = effect.acts_on is ActsOn.MOTION
+            quick, slow = self._for_delays(effect.name if is_late else "")
+            if is_late:  # what the DVL says now the vehicle did before
+                quick, slow = (tuple(advanced(each, delay) for each in those) for those in (quick, slow))
+            traces: list[Array] = [
+                effect.trace(one, values) + _shift(effect, other, delay) - _shift(effect, one, delay)
+                for one, other in zip(slow, quick, strict=True)
+            ]
+        else:
+            traces = [effect.trace(motion, values) for motion in self.motions]
+        traces = [trace[:: recording.finer] for recording, trace in zip(self.recordings, traces, strict=True)]
         if effect.acts_on is not ActsOn.DVL:
             return traces
         matrix = self.calibration.body_from_measured @ self.calibration.rotation_dvl_from_body
@@ -228,6 +266,18 @@ class Problem:
     def time(self) -> Array:
         """(M,) s since the beginning of the sample's recording."""
         return self.joined([recording.bin_time for recording in self.recordings])
+
+
+def advanced(motion: EffectInput, seconds: float) -> EffectInput:
+    """The motion with its velocity so many seconds earlier."""
+    return replace(motion, velocity_body=delayed(motion.time, motion.velocity_body, -seconds))
+
+
+def _shift(effect: Effect, motion: EffectInput, delay: float) -> Array:
+    """(N, 3) m/s: what is a mere delay in the trace of an effect."""
+    return (DVL_TIME_OFFSET if effect.acts_on is ActsOn.MOTION else REFERENCE_TIME_OFFSET).trace(
+        motion, {"seconds": delay}
+    )
 
 
 def calibrated(recordings: Sequence[Recording], rotation_dvl_from_body: Array) -> Problem:
@@ -303,6 +353,33 @@ class _Predictor:
                 pairs = _pairs_around(velocity[part, axis] - mean[axis], self.own, self.reach)
                 out[part.start + self.reach : part.stop - self.reach, axis] = mean[axis] + pairs @ self.weights[axis]
         return out
+
+
+def lowpassed(time: Array, velocity: Array, seen: Array) -> Array:
+    """A velocity (N, 3) without those frequencies in which that seen (N, 3) is little more than noise.
+
+    By stretch and axis, projected on cosines of low frequency: a low-pass that changes nothing if applied again.
+    """
+    out = velocity.copy()
+    for part in segments_of([time]):
+        if part.stop - part.start < MIN_SPECTRUM:
+            continue
+        spectrum, power = dct(velocity[part], axis=0, norm="ortho"), dct(seen[part], axis=0, norm="ortho") ** 2
+        for axis in range(3):
+            spectrum[_cut_off_index(power[:, axis]) :, axis] = 0.0
+        out[part] = idct(spectrum, axis=0, norm="ortho")
+    return out
+
+
+def _cut_off_index(power: Array) -> int:
+    """Number of cosines up to the last band that holds more than noise; the quietest bands are taken for noise."""
+    n = len(power)
+    edges = np.unique(np.linspace(0, n, SPECTRUM_BANDS + 1).astype(int))
+    bands = np.add.reduceat(power, edges[:-1]) / np.diff(edges)
+    floor = np.quantile(bands, 0.25)
+    above = np.flatnonzero(bands > SIGNAL_TO_NOISE * floor)
+    last = edges[above[-1] + 1] if len(above) else edges[1]
+    return int(min(last, MAX_BAND * n))
 
 
 def _pairs_around(series: Array, own: int, reach: int) -> Array:

@@ -24,6 +24,8 @@ from ..io.replay import Topics, replay
 # and five hours must fit. Traces are computed at the third at least, so that delays and lags are exact.
 MAX_RATE_HZ = 10.0
 MAX_TEST_RATE_HZ = 5.0
+# Samples of one recording that hypotheses are tested on: 40 minutes at the rate above; longer ones are averaged more
+MAX_TEST_SAMPLES = 12_000
 MIN_TRACE_RATE_HZ = 8.0
 # Share of the DVL's samples that must have attitude and angular velocity for them to be used at all
 MIN_ORIENTED_SHARE = 0.5
@@ -123,7 +125,7 @@ def make_recording(
         time=time,
         velocity_dvl=velocity_dvl,
         reference_body=reference_body,
-        bins=_bins(time, interval, min(MAX_TEST_RATE_HZ, _independent_rate(reference_around, reference_rate))),
+        bins=_bins(time, interval, _test_rate(time, reference_around, reference_rate)),
         reported_variance=reported_variance,
         rotation_enu_from_body=rotation_enu_from_body,
         angular_velocity=angular_velocity,
@@ -132,6 +134,12 @@ def make_recording(
         repeats=repeats,
         received=received,
     )
+
+
+def _test_rate(time: Array, reference_around: Array | None, reference_rate: float) -> float:
+    """Rate, Hz, of the means that hypotheses are tested on."""
+    enough = MAX_TEST_SAMPLES / max(float(time[-1] - time[0]), 1.0)
+    return min(MAX_TEST_RATE_HZ, enough, _independent_rate(reference_around, reference_rate))
 
 
 def _independent_rate(reference_around: Array | None, reference_rate: float) -> float:

@@ -9,9 +9,10 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..effects.base import ActsOn, Effect
-from .fitting import WINDOW_STEPS, Fit, Fitter, is_time_of_run, log_p_value, smooth_parameters
-from .levels import with_levels
-from .noise import Noise, white_noise
+from .dictionary import WINDOW_STEPS, Candidate, Dictionary, Seen, is_time_of_run, log_p_value
+from .fitting import Fit, Fitter
+from .levels import estimated
+from .noise import Noise
 from .problem import Problem
 
 # Family-wise level of the claim that there is any effect at all
@@ -25,8 +26,15 @@ GHOST_SHARE = 0.05
 INDISTINGUISHABLE = 3.0
 # Deviance behind the best at which no noise of its own will bring a rival back
 OUT_OF_THE_QUESTION = 40.0
-# Starts of an effect with several from which a fit goes on
-BEST_STARTS = 2
+# Share of an effect's drop in deviance that its rivals may look worse by for being linear
+LINEAR_SHARE = 0.05
+# Effects that are tested in earnest in one step, of each of two looks
+MAX_TESTED = 3
+MAX_SWAPS = 2
+# Times that the noise is estimated anew from what a fit leaves
+ROUNDS = 2
+# A time of the run is told to this share of it
+FINEST = 500.0
 # log p beyond which a hypothesis is worth an estimate of its own noise
 WORTH_A_LOOK = -3.0
 
@@ -48,48 +56,72 @@ class Selection:
     base: Fit
     fit: Fit
     fitter: Fitter
+    dictionary: Dictionary
 
     def withdrawn(self) -> Selection:
         """Without any effect."""
-        return Selection((), self.base, self.base, self.fitter)
+        return replace(self, selected=(), fit=self.base)
 
 
 def first_noise(problem: Problem) -> tuple[Noise, Array]:
-    """Noise of a problem's residual in the frame where it is simplest, and the residual robustified with it."""
-    best: tuple[float, Noise] | None = None
-    for rotation in {id(r): r for r in (problem.rotation_enu_from_body, None)}.values():
-        noise = white_noise(problem.residual, problem.segments, rotation, problem.interval).refitted(problem.residual)
-        robust = noise.robust(problem.residual)
-        noise = noise.refitted(robust)
-        deviance = noise.deviance(robust)
-        if best is None or deviance < best[0]:
-            best = deviance, noise
-    assert best is not None
-    noise = with_levels(problem, best[1])
-    robust = noise.robust(problem.residual)
-    return noise.refitted(robust), robust
+    """Noise of a problem's residual in the frame where it is simplest, and the residual without its outliers."""
+    rotations = {id(rotation): rotation for rotation in (problem.rotation_enu_from_body, None)}.values()
+    found = [estimated(problem, problem.residual, rotation) for rotation in rotations]
+    return min(found, key=lambda each: each[0].deviance(each[1]))
 
 
 def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
-    """Forward selection among testable effects; each step keeps what the data calls for at the family-wise level."""
+    """Forward selection among testable effects, each step with a check of what is in already: whether it is called for
+    any more, and whether another effect explains more in its place.
+    """
     noise, robust = first_noise(problem)
     fitter = Fitter(problem, robust)
     start = fit = fitter.fit_with_noise([], noise, {})
-    threshold = float(np.log(LEVEL / len(effects)))
-    chosen: list[Effect] = []
+    dictionary = Dictionary(problem, effects)
+    threshold = log_threshold(dictionary)
+    while len(fit.effects) < MAX_EFFECTS:
+        tested = _best_added(fitter, fit, dictionary)
+        if tested is None or tested.log_p > threshold or tested.drop < GHOST_SHARE * (start.deviance - fit.deviance):
+            break
+        before = fit.effects
+        fitter, fit = about(fitter.problem, _called_for(fitter, tested.fit, threshold))
+        dictionary = dictionary_about(fitter, fit, effects)
+        for _ in range(MAX_SWAPS):
+            swapped = _swapped(fitter, fit, dictionary)
+            if swapped is None:
+                break
+            fitter, fit = about(fitter.problem, swapped)
+            dictionary = dictionary_about(fitter, fit, effects)
+        if set(fit.effects) == set(before):
+            break
+    selected = [_selected(fitter, fit, number, dictionary) for number in range(len(fit.effects))]
+    base = fitter.fit([], fit.noise, {})
+    return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter, dictionary)
+
+
+def log_threshold(dictionary: Dictionary) -> float:
+    """log p below which an effect is called for, having looked at all of the dictionary."""
+    return float(np.log(LEVEL / len(dictionary.effects)))
+
+
+def selected_again(seen: Seen) -> list[int]:
+    """Variants that forward selection takes from a dictionary, with the noise as it is and traces as they are there."""
+    chosen: list[int] = []
+    explained = 0.0
     while len(chosen) < MAX_EFFECTS:
-        tested = {name: added(fitter, fit, effect) for name, effect in effects.items() if effect not in chosen}
-        name = min(tested, key=lambda name: tested[name].log_p)
-        if tested[name].log_p > threshold or tested[name].drop < GHOST_SHARE * (start.deviance - fit.deviance):
+        candidates = seen.candidates(chosen).values()
+        best = min(candidates, key=lambda candidate: candidate.log_p, default=None)
+        if best is None or best.log_p > log_threshold(seen.dictionary) or best.drop < GHOST_SHARE * explained:
             break
-        chosen, fit = _backward(fitter, [*chosen, effects[name]], tested[name].fit, threshold)
-        fitter, fit = about(problem, fit)
-        problem = fitter.problem
-        if effects[name] not in chosen:
-            break
-    selected = [_selected(fitter, fit, effect, effects) for effect in chosen]
-    base = fitter.fit_with_noise([], fit.noise, {}) if chosen else fit
-    return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter)
+        chosen.append(best.index)
+        explained += best.drop
+    return chosen
+
+
+def dictionary_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Dictionary:
+    """Variants of all effects, those in a fit about its values first."""
+    present = [fitter.variant(effect, fit.values[effect.name]) for effect in fit.effects]
+    return Dictionary(fitter.problem, effects, present)
 
 
 @dataclass(frozen=True)
@@ -101,34 +133,45 @@ class Tested:
     fit: Fit
 
 
-def added(fitter: Fitter, fit: Fit, effect: Effect) -> Tested:
-    """Test an effect on top of a fit."""
-    effects = [*fit.effects, effect]
-    best, tried = _best_start(fitter, fit, effects, fit.noise, fit.deviance)
-    if fit.noise.is_coloured:
-        # the noise may have taken the effect's colour, and the effect left to it then looks small
-        white = fit.noise.white
-        other, other_tried = _best_start(fitter, fit, effects, white, white.deviance(fit.residual))
-        if log_p_value(white.deviance(fit.residual) - other.deviance, other.dof - fit.dof, other_tried) < WORTH_A_LOOK:
-            other = fitter.fit_with_noise(effects, fit.noise.like(other.residual), other.values, rounds=1)
-            if other.deviance < best.deviance:
-                best, tried = other, other_tried
-    drop = fit.deviance - best.deviance
-    log_p = log_p_value(drop, best.dof - fit.dof, tried)
-    if log_p < WORTH_A_LOOK:
-        best = fitter.fit_with_noise(effects, best.noise, best.values)
-        # a better optimum of the noise must not count for the effect
-        without = fitter.fit_with_noise(fit.effects, best.noise, fit.values, rounds=1)
-        drop = min(fit.deviance, without.deviance) - best.deviance - own_doing(fitter, best, effect)
-        log_p = log_p_value(drop, best.dof - fit.dof, tried)
-    return Tested(log_p, drop, best)
+def _best_added(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Tested | None:
+    """The most significant effect on top of a fit, of those that look like it; None if none does.
+
+    They are looked for with the noise that the fit leaves, with that which all effects together leave, and as if it
+    had no colour: the noise may have taken an effect's colour, which then looks small.
+    """
+    chosen = list(range(dictionary.n_present))
+    beyond = fit.noise.like(dictionary.beyond(fit.noise, fitter.residual))
+    worth: dict[str, tuple[float, Candidate, Noise]] = {}
+    for noise in (fit.noise, beyond, *([fit.noise.white] if fit.noise.is_coloured else [])):
+        candidates = sorted(dictionary.seen(noise, fitter.residual).candidates(chosen).values(), key=lambda c: c.log_p)
+        for candidate in candidates[:MAX_TESTED]:
+            name = candidate.effect.name
+            if candidate.log_p < WORTH_A_LOOK and (name not in worth or candidate.log_p < worth[name][0]):
+                worth[name] = candidate.log_p, candidate, noise
+    tested = [_added(fitter, fit, candidate, noise) for _, candidate, noise in worth.values()]
+    return min(tested, key=lambda each: each.log_p, default=None)
+
+
+def _added(fitter: Fitter, fit: Fit, candidate: Candidate, noise: Noise) -> Tested:
+    """Test an effect on top of a fit, each with the noise of its own."""
+    effects = [*fit.effects, candidate.effect]
+    best = fitter.fit(effects, noise, {**fit.values, candidate.effect.name: candidate.values})
+    best = fitter.fit_with_noise(effects, fit.noise.like(best.residual), best.values, rounds=1)
+    # a better optimum of the noise must not count for the effect
+    without = fitter.fit_with_noise(fit.effects, best.noise, fit.values, rounds=1)
+    drop = min(fit.deviance, without.deviance) - best.deviance
+    drop -= own_doing(fitter, best, candidate.effect)
+    return Tested(log_p_value(drop, best.dof - fit.dof, candidate.tried), drop, best)
 
 
 def own_doing(fitter: Fitter, fit: Fit, effect: Effect) -> float:
     """Drop in deviance that an effect owes to noise which is in the residual and, through the motion, in its trace.
 
-    Samples do not tell their own velocity, but whitening mixes neighbours. Found with noise that is made up.
+    Samples do not tell their own velocity, but whitening mixes neighbours. Found with noise that is made up. A delay
+    owes it nothing (`problem`).
     """
+    if effect.delay(fit.values[effect.name]):
+        return 0.0
     problem, values, noise = fitter.problem, fit.values[effect.name], fit.noise
     still = problem.trace(effect, values)
     drops = []
@@ -138,87 +181,98 @@ def own_doing(fitter: Fitter, fit: Fit, effect: Effect) -> float:
     return max(0.0, float(np.mean(drops)))
 
 
-def _best_start(fitter: Fitter, fit: Fit, effects: list[Effect], noise: Noise, deviance: float) -> tuple[Fit, float]:
-    """The most significant fit from the starts of the last of the effects, and how many starts were like it."""
-    effect = effects[-1]
-    starts = fitter.starts(effect)
-    if smooth_parameters(effect) and len(starts) > BEST_STARTS:
-        starts.sort(key=lambda start: fitter.misfit(effects, noise, {**fit.values, effect.name: start[0]}))
-        starts = starts[:BEST_STARTS]
-    trials = [(fitter.fit(effects, noise, {**fit.values, effect.name: start}), tried) for start, tried in starts]
-    return min(trials, key=lambda trial: log_p_value(deviance - trial[0].deviance, trial[0].dof - fit.dof, trial[1]))
-
-
 def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
     rest = [other for other in fit.effects if other is not effect]
     return fitter.fit_with_noise(rest, fit.noise, fit.values)
 
 
-def _backward(fitter: Fitter, chosen: list[Effect], fit: Fit, threshold: float) -> tuple[list[Effect], Fit]:
-    """Drop what is not called for any more now that others are in."""
-    for effect in chosen[:-1]:
+def _called_for(fitter: Fitter, fit: Fit, threshold: float) -> Fit:
+    """A fit without what is not called for any more, now that its last effect is in."""
+    for effect in fit.effects[:-1]:
         rest = _without(fitter, fit, effect)
         if log_p_value(rest.deviance - fit.deviance, fit.dof - rest.dof) > threshold:
-            chosen = [other for other in chosen if other is not effect]
             fit = rest
-    return chosen, fit
+    return fit
 
 
-def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
+def _swapped(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Fit | None:
+    """A fit with one effect replaced by another that is clearly more significant in its place; None without one."""
+    seen = dictionary.seen(fit.noise, fitter.residual)
+    chosen = list(range(dictionary.n_present))
+    best, best_gain = None, INDISTINGUISHABLE
+    for number, effect in enumerate(fit.effects):
+        candidates = seen.candidates(chosen, instead_of=number)
+        own = candidates.pop(effect.name).log_p
+        other = min(candidates.values(), key=lambda candidate: candidate.log_p, default=None)
+        if other is not None and own - other.log_p > best_gain:
+            best, best_gain = (effect, other), own - other.log_p
+    if best is None:
+        return None
+    out, into = best
+    effects = [into.effect if effect is out else effect for effect in fit.effects]
+    swapped = fitter.fit_with_noise(effects, fit.noise, {**fit.values, into.effect.name: into.values})
+    return swapped if fit.deviance - swapped.deviance > 2.0 * (swapped.dof - fit.dof) else None
+
+
+def _selected(fitter: Fitter, fit: Fit, number: int, dictionary: Dictionary) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
     One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
     that fits worse could be if it needs fewer.
     """
+    effect = fit.effects[number]
     rest = _without(fitter, fit, effect)
     drop = rest.deviance - fit.deviance
-    log_p = log_p_value(drop, fit.dof - rest.dof, fitter.tried(effect, fit.values[effect.name]))
+    # with the noise that is left when the cause is known: it is the same for all that could be the cause
+    candidates = dictionary.seen(fit.noise, fitter.residual).candidates(list(range(len(fit.effects))), number)
+    own = candidates.pop(effect.name)
+    log_p = log_p_value(drop, fit.dof - rest.dof, own.tried)
     found: list[tuple[float, str]] = []
-    for name, other in effects.items():
-        if other in fit.effects:
+    for name, candidate in candidates.items():
+        if own.drop - candidate.drop > OUT_OF_THE_QUESTION + LINEAR_SHARE * own.drop:
             continue
-        # with the noise that is left when the cause is known: it is the same for all that could be the cause
-        effects_then = [*rest.effects, other]
-        rival, tried = _best_start(fitter, rest, effects_then, fit.noise, fit.noise.deviance(rest.residual))
-        if rival.deviance - fit.deviance > OUT_OF_THE_QUESTION:
-            continue
-        rival = fitter.fit_with_noise(effects_then, fit.noise, rival.values, rounds=1)
+        effects = [*rest.effects, candidate.effect]
+        rival = fitter.fit_with_noise(effects, fit.noise, {**fit.values, name: candidate.values}, rounds=1)
         behind = rival.deviance - fit.deviance
-        rival_log_p = log_p_value(drop - behind, rival.dof - rest.dof, tried)
+        rival_log_p = log_p_value(drop - behind, rival.dof - rest.dof, candidate.tried)
         if rival_log_p - log_p < INDISTINGUISHABLE or behind < 2.0 * INDISTINGUISHABLE:
             found.append((rival_log_p, name))
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
-def _robust_about(fitter: Fitter, fit: Fit, problem: Problem) -> Array:
-    """The problem's residual robustified about a fit."""
-    explained = fitter.residual - fit.residual
-    return explained + fit.noise.robust(problem.residual - explained)
-
-
 def about(problem: Problem, fit: Fit) -> tuple[Fitter, Fit]:
-    """A fit once more, with the problem about its own calibration and motion."""
+    """A fit once more, with the problem about its own calibration and motion, and the noise that is left then.
+
+    What was drawn in as an outlier before may have been the effect.
+    """
     problem = relinearised(problem, fit)
     fitter = Fitter(problem, problem.residual)
-    again = fitter.fit(fit.effects, fit.noise, fit.values)
-    fitter = Fitter(problem, _robust_about(fitter, again, problem))
-    return fitter, fitter.fit_with_noise(fit.effects, fit.noise, again.values)
+    fit = fitter.fit(fit.effects, fit.noise, fit.values)
+    for _ in range(ROUNDS):
+        fit = refined(fitter, fit)
+        explained = fitter.residual - fit.residual
+        noise, left = estimated(problem, problem.residual - explained, fit.noise.rotation)
+        fitter = fitter.with_residual(explained + left)
+        fit = fitter.fit_with_noise(fit.effects, noise, fit.values, rounds=1)
+    return fitter, fit
 
 
-def refined(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
-    """A fit with the times at which an effect begins and ends made finer than the grid they were found on."""
-    times = [spec for spec in effect.parameters if is_time_of_run(spec)]
-    if all(fit.values[effect.name][spec.name] == spec.default for spec in times):
-        return fit
+def refined(fitter: Fitter, fit: Fit) -> Fit:
+    """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
+    moving = [
+        (effect.name, spec.name)
+        for effect in fit.effects
+        for spec in effect.parameters
+        if is_time_of_run(spec) and np.isfinite(fit.values[effect.name][spec.name])
+    ]
     step = seconds / WINDOW_STEPS
-    while step > seconds / 500.0:
+    while moving and step > seconds / FINEST:
         step /= 2.0
-        for spec in times:
+        for name, time in moving:
             for sign in (-1.0, 1.0):
-                values = dict(fit.values[effect.name])
-                values[spec.name] = float(np.clip(values[spec.name] + sign * step, 0.0, seconds))
-                trial = fitter.fit(fit.effects, fit.noise, {**fit.values, effect.name: values})
+                at = float(np.clip(fit.values[name][time] + sign * step, 0.0, seconds))
+                trial = fitter.fit(fit.effects, fit.noise, {**fit.values, name: {**fit.values[name], time: at}})
                 if trial.deviance < fit.deviance:
                     fit = trial
     return fit
@@ -226,14 +280,9 @@ def refined(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
 
 def relinearised(problem: Problem, fit: Fit) -> Problem:
     """The problem about the calibration of a fit, its motion without what the fit's effects add to the DVL."""
-    added = None
-    if fit.effects:
-        traces = [problem.traces(effect, fit.values[effect.name]) for effect in fit.effects if not on_reference(effect)]
-        if traces:
-            added = tuple(np.sum(parts, axis=0) for parts in zip(*traces, strict=True))
+    added = {
+        effect.name: tuple(problem.traces(effect, fit.values[effect.name]))
+        for effect in fit.effects
+        if effect.acts_on is not ActsOn.REFERENCE
+    }
     return replace(problem, calibration=problem.calibration.changed(fit.change), added=added)
-
-
-def on_reference(effect: Effect) -> bool:
-    """Whether an effect leaves the DVL's velocity as it is."""
-    return effect.acts_on is ActsOn.REFERENCE

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from .closure import HeldOutResiduals, held_out
 from .fitting import Fit, Fitter
+from .selection import Selection
 from .unexplained import Unexplained
 from .where import regimes
 
@@ -37,8 +38,9 @@ class DiagnosisSeries:
     rest: Unexplained
 
 
-def collect_series(fitter: Fitter, fit: Fit, rest: Unexplained) -> DiagnosisSeries:
-    """The series of a fit and of what it leaves."""
+def collect_series(selection: Selection, rest: Unexplained) -> DiagnosisSeries:
+    """The series of what was selected and of what it leaves."""
+    fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
     calibration = problem.calibration.changed(fit.change)
     traces = {effect.name: problem.trace(effect, fit.values[effect.name]) for effect in fit.effects}
@@ -47,7 +49,7 @@ def collect_series(fitter: Fitter, fit: Fit, rest: Unexplained) -> DiagnosisSeri
         recording_of=problem.recording_of,
         time=problem.time,
         segments=problem.segments,
-        held_out=held_out(fitter, fit, rest.columns),
+        held_out=held_out(selection, rest.columns),
         regimes=regimes(problem),
         traces={name: _not_absorbed(fitter, fit, trace) for name, trace in traces.items()},
         phi=calibration.phi,

@@ -7,7 +7,7 @@ not know the vehicle's motion, so what follows it is systematic, whatever its ca
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -19,6 +19,9 @@ from .problem import Problem
 
 LEVEL = 0.002
 TIME_KNOTS = 7
+HEADING_HARMONICS = 4
+# Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
+SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
 # Directions of the dictionary that hold less of their length than this beside the others are left out
 INDEPENDENT = 1e-3
 
@@ -26,7 +29,8 @@ INDEPENDENT = 1e-3
 @dataclass(frozen=True)
 class Unexplained:
     """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
-    variance, beyond what chance brings. about: what the rest follows. columns: (M, 3, f), the dictionary.
+    variance, beyond what chance brings. about: what the rest follows. columns: (M, 3, f), the dictionary; empty if
+    nothing is left, since it would only explain noise.
     """
 
     log_p: float
@@ -64,7 +68,8 @@ def _of_motion(problem: Problem, index: int) -> dict[str, Array]:
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
         once = np.column_stack([np.cos(yaw), np.sin(yaw)])
-        found["heading"] = np.column_stack([once, once * s[:, None], np.cos(2 * yaw), np.sin(2 * yaw)])
+        more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
+        found["heading"] = np.column_stack([once, once * s[:, None], *more])
         found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
         steps = np.diff(motion.time, prepend=motion.time[0])
         up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
@@ -94,6 +99,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     white = white - q @ (q.T @ white)
     variance = float(white @ white) / (len(white) - q.shape[1])
     tests: list[tuple[float, str]] = []
+    recoloured: list[tuple[float, str]] = []
     columns, energies = [], [0.0]
     for name, functions in dictionary(problem).items():
         raw = _along_axes(functions)
@@ -101,15 +107,60 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
         for block in _per_axis(raw):
             tests.append((explained(q, noise.whiten(block), white, variance)[0], name))
         if noise.is_coloured and name != "time":  # what changes with time alone may as well be noise
-            recoloured = _recoloured(noise, known, raw, fit.residual)
-            tests.append((recoloured[0], name))
-            energies.append(recoloured[1])
+            log_p, energy = _recoloured(noise, known, raw, fit.residual)
+            recoloured.append((log_p, name))
+            energies.append(energy)
+    for line in lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
+        tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
+        if line.log_p < np.log(LEVEL):  # the best of many would always explain some of the noise
+            columns.append(_along_axes(line.waves))
     raw = np.concatenate(columns, axis=2)
     log_p, energy = explained(q, noise.whiten(raw), white, variance)
+    looked_at = float(np.log(len(tests) + len(recoloured) + 1))
     best, name = min(tests)
-    best = best + np.log(len(tests) + 1)
-    together = log_p + np.log(len(tests) + 1)
-    return Unexplained(min(best, together, 0.0), max(energy, *energies), name, raw)
+    if best + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
+        best, name = min([*tests, *recoloured])
+    log_p = min(best, *(each for each, _ in recoloured), log_p) + looked_at
+    found = Unexplained(min(log_p, 0.0), max(energy, *energies), name, raw)
+    return found if found.found else replace(found, columns=raw[:, :, :0])
+
+
+@dataclass(frozen=True)
+class Line:
+    """The clearest line in the spectrum of one recording. log_p: adjusted for all frequencies looked at, up to a
+    factor. waves: (M, 2) cosine and sine, zero in other recordings.
+    """
+
+    period_s: float
+    log_p: float
+    waves: Array
+
+
+def lines(problem: Problem, innovations: Array) -> list[Line]:
+    """Lines in the innovations (M, 3), of unit variance, of each recording that is long enough.
+
+    Noise of the sky has no period, coloured as it may be. Waves have: what is left of them at the pairing of two
+    sensors is no finding, so only periods longer than theirs count.
+    """
+    found = []
+    for index, recording in enumerate(problem.recordings):
+        at = problem.recording_of == index
+        step = SHORTEST_PERIOD_S / 5.0
+        position = ((problem.time[at] - problem.time[at][0]) / step).astype(int)
+        sums = np.stack([np.bincount(position, series) for series in innovations[at].T])
+        n = 2 * sums.shape[1]  # twice as fine as independent frequencies are
+        frequency = np.fft.rfftfreq(n, step)
+        power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(at)  # chi-square of 2 degrees of freedom
+        inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
+        if not inside.any():
+            continue
+        log_p = np.vstack([chi2.logsf(power, 2), chi2.logsf(power.sum(axis=0), 6)])[:, inside]
+        best = int(np.argmin(log_p.min(axis=0)))
+        period = 1.0 / float(frequency[inside][best])
+        phase = 2.0 * np.pi * problem.time / period
+        waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
+        found.append(Line(period, float(log_p.min() + np.log(log_p.size)), waves))
+    return found
 
 
 def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:

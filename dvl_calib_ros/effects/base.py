@@ -149,6 +149,10 @@ class Effect(AnyEffect, ABC):
         """Whether the trace is linear in all parameters together."""
         return all(parameter.linear for parameter in self.parameters)
 
+    def delay(self, values: Mapping[str, float]) -> float:
+        """Seconds by which the effect delays what it acts on, beside all else that it does."""
+        return 0.0
+
     @abstractmethod
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """What the effect adds to (DVL velocity - ideal DVL velocity as expected from the reference).

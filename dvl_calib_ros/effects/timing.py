@@ -22,6 +22,10 @@ class DvlTimeOffset(Effect):
     acts_on = ActsOn.MOTION
     confounded_with = ("reference_time_offset", "reference_lag")
 
+    def delay(self, values: Mapping[str, float]) -> float:
+        """τ."""
+        return values["seconds"]
+
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """v(t - τ) - v(t), body frame."""
         return delayed(motion.time, motion.velocity_body, values["seconds"]) - motion.velocity_body
@@ -36,6 +40,10 @@ class ReferenceTimeOffset(Effect):
     parameters = DvlTimeOffset.parameters
     acts_on = ActsOn.REFERENCE
     confounded_with = ("dvl_time_offset", "reference_lag", "sideslip", "lever_arm")
+
+    def delay(self, values: Mapping[str, float]) -> float:
+        """τ."""
+        return values["seconds"]
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """g(t) - g(t - τ), in the frame in which the reference was recorded, turned into the body."""
@@ -52,6 +60,10 @@ class ReferenceLag(Effect):
     parameters = (ParameterSpec("time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False),)
     acts_on = ActsOn.REFERENCE
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
+
+    def delay(self, values: Mapping[str, float]) -> float:
+        """T: what is slow comes so much later."""
+        return values["time_constant_s"]
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """g - (g filtered), turned into the body."""
@@ -71,17 +83,20 @@ def delayed(time: Array, values: Array, delay: float) -> Array:
 
 
 def lag_error(time: Array, values: Array, time_constant: float) -> Array:
-    """First-order low-pass of `values` (N, 3) less `values`: exact for values that are straight between their times.
+    """First-order low-pass of `values` (N, 3) less `values`: exact where slopes are straight between their times.
 
-    With e = output - input, de/dt = -e / T - slope, so e_n = a_n e_(n-1) - T (1 - a_n) slope_n, a_n = exp(-h_n / T).
-    The filter begins settled.
+    With e = output - input, de/dt = -e / T - slope. Where the slope goes from s_0 to s_1 within a step of h, one
+    solution is p(t) = T² (s_1 - s_0) / h - T slope(t), so e_n = exp(-h / T) (e_(n-1) - p_(n-1)) + p_n. The filter
+    begins with the first value.
     """
     error = np.zeros_like(values)
     if time_constant <= 0.0 or len(time) < 2:
         return error
     steps = np.diff(time)[:, None]
     decay = np.vstack([[0.0], np.exp(-steps / time_constant)])
-    error[1:] = -time_constant * (1.0 - decay[1:]) * np.diff(values, axis=0) / steps
+    slope = np.gradient(values, time, axis=0)
+    bend = time_constant**2 * np.diff(slope, axis=0) / steps
+    error[1:] = bend - time_constant * slope[1:] - decay[1:] * (bend - time_constant * slope[:-1])
     # the recursion over any steps, by doubling: each pass adds what came twice as far before
     reach = 1
     while reach < len(time) and decay[reach:].max() > np.finfo(float).eps:

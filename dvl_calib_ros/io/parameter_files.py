@@ -53,15 +53,12 @@ def _node_parameters(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
     values: dict[str, Any] = {}
-    try:
-        sections = [found for key, section in content.items() for found in _sections(str(key), section)]
-        own = [(node, body) for node, body in sections if _is_for_node(node)]
-        for node, body in own:
-            if not isinstance(body, dict):
-                raise InputError(f"{path}: ros__parameters of {node} is not a list of name: value")
-            values.update(_flat(body))
-    except RecursionError as error:
-        raise InputError(f"{path}: no ROS 2 parameter file, it contains itself") from error
+    sections = [found for key, section in content.items() for found in _sections(str(key), section)]
+    own = [(node, body) for node, body in sections if _is_for_node(node)]
+    for node, body in own:
+        if not isinstance(body, dict):
+            raise InputError(f"{path}: ros__parameters of {node} is not a list of name: value")
+        values.update(_flat(body))
     if not sections:
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
     if not own:  # ROS would run with the defaults and say nothing

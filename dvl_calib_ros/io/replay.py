@@ -142,6 +142,14 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
         option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
         raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
+    _check_types(bag, where, topics, notes)
+    if not bag.message_counts[topics.dvl]:
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
+    if topics.gnss not in present:
+        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
+
+
+def _check_types(bag: BagReader, where: str, topics: Topics, notes: list[str]) -> None:
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
         types = bag.types_of(name)
@@ -154,14 +162,10 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
             )
         if bag.lacks_definition(name):
             notes.append(
-                f"the bag does not say how {present[name]} is laid out (recorded before ROS 2 Iron?); it is read as "
+                f"the bag does not say how {types.pop()} is laid out (recorded before ROS 2 Iron?); it is read as "
                 "the definitions known here say. If it cannot be decoded, run ros2 bag convert to MCAP where the "
                 "package is installed"
             )
-    if not bag.message_counts[topics.dvl]:
-        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
-    if topics.gnss not in present:
-        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": VELOCITY_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}

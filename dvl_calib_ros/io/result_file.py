@@ -24,7 +24,7 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import FLU, FRD
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
-from .errors import InputError
+from .errors import InputError, printable
 from .yaml_files import load_yaml
 
 FORMAT = "dvl_calib_ros result 1"
@@ -102,7 +102,8 @@ def static_transform_arguments(position: Any, quaternion: Any, parent: str, chil
     """Arguments of tf2's static_transform_publisher: position (3,) m and quaternion (x, y, z, w) of child in parent."""
     numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
     arguments = " ".join(f"--{name} {value:.9g}" for name, value in numbers)
-    frames = f"--frame-id {shlex.quote(parent)} --child-frame-id {shlex.quote(child)}"  # a bag may name any frame
+    parent, child = (shlex.quote(printable(name)) for name in (parent, child))  # a bag may name any frame
+    frames = f"--frame-id {parent} --child-frame-id {child}"
     return f"{arguments} {frames}"
 
 
@@ -111,9 +112,18 @@ def result_text(document: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(document), sort_keys=False, default_flow_style=None, width=120)
 
 
+def check_in_folder(path: Path, folder: Path) -> None:
+    """Raise InputError unless a result file is a .yaml file in this folder.
+
+    For what is named at run time: whoever can set a parameter must not be able to write wherever the node can.
+    """
+    if path.suffix != ".yaml" or Path(os.path.realpath(path)).parent != Path(os.path.realpath(folder)):
+        raise InputError(f"{path}: at run time only a .yaml file in {folder} can be named; name others at the start")
+
+
 def check_writable(path: Path) -> None:
     """Raise InputError if a result file could not be written there, before anything is collected for it."""
-    folder = path.parent
+    folder = _target(path).parent
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it, such as {path / 'calibration.yaml'}")
     if not folder.is_dir():
@@ -135,7 +145,7 @@ def save_bytes(path: Path, content: bytes) -> None:
 
     Raises InputError; then the old file is untouched.
     """
-    target = Path(os.path.realpath(path))  # a link stays a link
+    target = _target(path)
     temporary = backup = ""
     try:
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=".dvl_calib.", suffix=".tmp")
@@ -167,6 +177,13 @@ def backup_of(path: Path) -> Path:
     """Where the file is that `save_bytes` last replaced; beside what a link points to."""
     target = Path(os.path.realpath(path))
     return target.with_name(f"{target.name}.bak")
+
+
+def _target(path: Path) -> Path:
+    """Where a file is written: a link stays a link. One that another user has laid there raises InputError."""
+    if path.is_symlink() and path.lstat().st_uid not in (0, os.geteuid()):
+        raise InputError(f"{path}: is a link that another user has made; name another file")
+    return Path(os.path.realpath(path))
 
 
 def _second_name(path: Path, name: str) -> str:

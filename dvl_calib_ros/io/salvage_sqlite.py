@@ -31,24 +31,29 @@ class _Row(NamedTuple):
 def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
     """All whole messages in the order they were written; then DamagedError, unless none is missing."""
     with path.open("rb") as file:
-        pages = _Pages(file, path.stat().st_size)
-        topics: dict[int, tuple[str, str]] = {}
-        definitions: dict[str, tuple[str, str]] = {}
-        leaves: dict[int, int] = {}  # number of the first message -> page
-        for page in range(1, pages.count + 1):
-            for row in pages.rows(page):
-                if _is_message(row.columns):
-                    leaves.setdefault(row.number, page)
-                    break
-                _take_note(row, topics, definitions)
-        count, last = 0, 0
-        for page in (leaves[number] for number in sorted(leaves)):
-            for row in pages.rows(page):
-                if _is_message(row.columns) and row.columns[1] in topics:
-                    _, topic_id, log_ns, data = row.columns
-                    name, kind = topics[topic_id]
-                    count, last = count + 1, max(last, row.number)
-                    yield Salvaged(name, kind, *definitions.get(kind, ("", "")), log_ns, data)
+        yield from salvage_sqlite_stream(file, path.stat().st_size)
+
+
+def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
+    """As `salvage_sqlite`, of an open file of so many bytes."""
+    pages = _Pages(file, size)
+    topics: dict[int, tuple[str, str]] = {}
+    definitions: dict[str, tuple[str, str]] = {}
+    leaves: dict[int, int] = {}  # number of the first message -> page
+    for page in range(1, pages.count + 1):
+        for row in pages.rows(page):
+            if _is_message(row.columns):
+                leaves.setdefault(row.number, page)
+                break
+            _take_note(row, topics, definitions)
+    count, last = 0, 0
+    for page in (leaves[number] for number in sorted(leaves)):
+        for row in pages.rows(page):
+            if _is_message(row.columns) and row.columns[1] in topics:
+                _, topic_id, log_ns, data = row.columns
+                name, kind = topics[topic_id]
+                count, last = count + 1, max(last, row.number)
+                yield Salvaged(name, kind, *definitions.get(kind, ("", "")), log_ns, data)
     if leaves and not topics:
         raise DamagedError("the page with the names of the topics is damaged")
     if pages.missing:

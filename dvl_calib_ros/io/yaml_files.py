@@ -14,8 +14,15 @@ from .errors import InputError
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """SafeLoader that takes scalars for what rcl's YAML parser does.
 
-    1e-3 is a number (YAML 1.1 wants 1.0e-3), 2026-05-01 is text (YAML 1.1 has dates).
+    1e-3 is a number (YAML 1.1 wants 1.0e-3), 2026-05-01 is text (YAML 1.1 has dates). Aliases are refused: a few lines
+    of them that refer to each other stand for more than fits in memory.
     """
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, "write it out, without aliases (*name)", mark)
+        return super().compose_node(parent, index)
 
 
 _Loader.add_implicit_resolver(

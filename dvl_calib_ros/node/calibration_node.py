@@ -31,7 +31,14 @@ from ..io.drivers import velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
 from ..io.parameter_files import NODE_NAME
-from ..io.result_file import check_writable, load_initial_calibration, result_document, result_text, save_text
+from ..io.result_file import (
+    check_in_folder,
+    check_writable,
+    load_initial_calibration,
+    result_document,
+    result_text,
+    save_text,
+)
 from .diagnostics import RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems
 from .message_types import message_class
@@ -53,6 +60,7 @@ class CalibrationNode(Node):
         dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         gnss_type = velocity_type("gnss_type", parameters.gnss_type)
         dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
+        self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
         if parameters.result_file:
             check_writable(Path(parameters.result_file))
         initial = None
@@ -279,6 +287,7 @@ class CalibrationNode(Node):
         try:
             changed = self._changed(parameters)
             if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
+                check_in_folder(Path(changed.result_file), self._result_folder)
                 check_writable(Path(changed.result_file))
         except (ParameterError, InputError) as error:
             return SetParametersResult(successful=False, reason=str(error))

@@ -1,0 +1,246 @@
+"""What is fuzzed: functions from bytes, which must end well or raise an error made for the user, and their seeds."""
+
+from __future__ import annotations
+
+import os
+import struct
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
+from dvl_calib_ros.io.bags import BagReader
+from dvl_calib_ros.io.definitions import Definition, DefinitionError, typestore
+from dvl_calib_ros.io.drivers import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.io.errors import InputError
+from dvl_calib_ros.io.messages import MessageFeed
+from dvl_calib_ros.io.parameter_files import load_parameters
+from dvl_calib_ros.io.result_file import load_initial_calibration
+from dvl_calib_ros.io.salvage import DamagedError
+from dvl_calib_ros.io.salvage_mcap import salvage_mcap_stream
+from dvl_calib_ros.io.salvage_sqlite import salvage_sqlite_stream
+from dvl_calib_ros.io.yaml_files import parse_scalar
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
+JAZZY = get_typestore(Stores.ROS2_JAZZY)
+
+
+class Target(NamedTuple):
+    """run: takes an input; anything it raises is a finding. seeds: where the corpus begins."""
+
+    run: Callable[[bytes], None]
+    seeds: Callable[[], Iterator[bytes]]
+
+
+def _file(name: str, data: bytes) -> Path:
+    path = FOLDER / name
+    path.write_bytes(data)
+    return path
+
+
+def _read_bag(path: Path) -> None:
+    try:
+        with BagReader([path]) as bag:
+            topics = bag.topics
+            assert all(topic in topics for topic, _, _ in bag.raw_messages(topics))
+    except InputError as error:
+        assert str(error)
+
+
+def run_mcap(data: bytes) -> None:
+    _read_bag(_file("fuzzed.mcap", data))
+
+
+def run_sqlite(data: bytes) -> None:
+    _read_bag(_file("fuzzed.db3", data))
+
+
+def run_mcap_records(data: bytes) -> None:
+    """Only the reader of damaged files, in memory: it takes a tenth of the time."""
+    with suppress(DamagedError):
+        assert sum(len(message.data) for message in salvage_mcap_stream(BytesIO(data), len(data))) < 1 << 24
+
+
+def run_sqlite_pages(data: bytes) -> None:
+    with suppress(DamagedError):
+        assert sum(len(message.data) for message in salvage_sqlite_stream(BytesIO(data), len(data))) < 1 << 24
+
+
+def run_metadata(data: bytes) -> None:
+    folder = FOLDER / "bag"
+    folder.mkdir(exist_ok=True)
+    (folder / "fuzzed.mcap").write_bytes(_SMALLEST_BAG)
+    (folder / "metadata.yaml").write_bytes(data)
+    _read_bag(folder)
+
+
+def run_message(data: bytes) -> None:
+    """The first byte says which message, of which stream."""
+    if not data:
+        return
+    feed = MessageFeed(_CALIBRATOR, lambda _: None)
+    msgtype, take = [(TWIST_TYPE, feed.dvl), (TWIST_TYPE, feed.reference), (IMU_TYPE, feed.imu)][data[0] % 3]
+    half = 1 + (len(data) - 1) // 2
+    for part in (data[1:], data[1:half], data[half:]):
+        try:
+            take(JAZZY.deserialize_cdr(part, msgtype), 1)
+        except SerdeError:
+            continue
+    if _CALIBRATOR.n_given("M3") > 1000:
+        _CALIBRATOR.result()
+        _CALIBRATOR.reset()
+
+
+def run_definition(data: bytes) -> None:
+    """The first byte says whether it is MSG or IDL."""
+    kind = MessageDefinitionFormat.MSG if data[:1] < b"\x80" else MessageDefinitionFormat.IDL
+    try:
+        types = typestore(Definition(kind, data[1:].decode("utf-8", "replace")), "a/msg/B")
+    except DefinitionError:
+        return
+    try:
+        types.deserialize_cdr(b"\0\1\0\0" + bytes(64), "a/msg/B")
+    except Exception:  # the reader counts whatever a decoder raises as a message that cannot be decoded
+        return
+
+
+def run_result_file(data: bytes) -> None:
+    try:
+        load_initial_calibration(_file("result.yaml", data), (0.0, 0.0, 0.0))
+    except InputError as error:
+        assert len(str(error)) < 10_000
+
+
+def run_parameters(data: bytes) -> None:
+    try:
+        load_parameters(_file("parameters.yaml", data))
+    except (InputError, ParameterError) as error:
+        assert len(str(error)) < 10_000
+
+
+def run_override(data: bytes) -> None:
+    text = data.decode("utf-8", "replace")
+    parse_scalar(text)
+    try:
+        load_parameters(None, [f"model:={text}", f"mounting_rpy:={text}", f"min_speed:={text}", text])
+    except (InputError, ParameterError) as error:
+        assert len(str(error)) < 10_000
+
+
+# ---------------------------------------------------------------------- seeds
+
+
+def _small_run() -> list[tuple[str, int, bytes]]:
+    from io_fixtures import raw, run, write_bag
+
+    with tempfile.TemporaryDirectory() as folder:
+        messages = raw(write_bag(Path(folder) / "bag", run(6.0)))
+    return [next(message for message in messages if message[0] == topic) for topic in ("dvl/twist", "imu/data")]
+
+
+def _small_mcap(**options: Any) -> bytes:
+    """Two channels, three messages; no checksums: a changed byte must get further than to the checksum."""
+    output = BytesIO()
+    writer = Writer(output, **{"chunk_size": 60, "enable_crcs": False, **options})
+    writer.start("ros2", "")
+    schema = writer.register_schema("a/msg/B", "ros2msg", b"uint8 x")
+    channels = [writer.register_channel(topic, "cdr", schema) for topic in "ab"]
+    for log_ns in (1, 2, 3):
+        writer.add_message(channels[log_ns % 2], log_ns, b"\0\1\0\0abcdefgh", log_ns)
+    writer.finish()
+    return output.getvalue()
+
+
+def _mcap_seeds() -> Iterator[bytes]:
+    for compression in CompressionType:
+        whole = _small_mcap(compression=compression)
+        yield from (whole, whole[:-60], whole[: len(whole) // 2])
+    yield _small_mcap(use_chunking=False, compression=CompressionType.NONE)
+    yield _small_mcap(index_types=IndexType.NONE)
+
+
+def _sqlite_seeds() -> Iterator[bytes]:
+    import sqlite3
+
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+
+    for page_size in (512, 1024):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "seed.db3"
+            connection = sqlite3.connect(path)
+            connection.execute(f"PRAGMA page_size={page_size}")
+            connection.executescript(Sqlite3Writer.SQLITE_SCHEMA)
+            connection.execute("INSERT INTO topics VALUES (1, 'dvl/twist', ?, 'cdr', '', '')", (TWIST_TYPE,))
+            for i, (_, log_ns, data) in enumerate(_small_run() * 4):
+                connection.execute("INSERT INTO messages VALUES (?, 1, ?, ?)", (i + 1, log_ns, data * (1 + i)))
+            connection.commit()
+            connection.close()
+            yield path.read_bytes()
+
+
+def _definition_seeds() -> Iterator[bytes]:
+    for msgtype in (TWIST_TYPE, IMU_TYPE, "diagnostic_msgs/msg/DiagnosticArray"):
+        yield b"\0" + JAZZY.generate_msgdef(msgtype, ros_version=2)[0].encode()
+    yield b"\0int32 X=3\nfloat64[<=4] values\nstring<=5 name 'a'\nfloat64[9] covariance\n"
+    yield b"\xff" + (
+        b"================================================================================\nIDL: a/msg/B\n"
+        b"module a { module msg { typedef double double__9[9]; struct B { long x; double__9 covariance; "
+        b"sequence<string> names; }; }; };\n"
+    )
+
+
+def _message_seeds() -> Iterator[bytes]:
+    for number, (_, _, data) in enumerate(_small_run() * 2):
+        yield struct.pack("B", (0, 2, 1, 2)[number]) + data
+
+
+def _result_seeds() -> Iterator[bytes]:
+    yield b"""format: dvl_calib_ros result 1
+models:
+  M5: {state_names: [phi_x, phi_y, phi_z], state: [0.0, 0.1, 0.2], covariance: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+  M9: 3
+mounting: {nominal_rpy: [0.0, 0.0, 0.0]}
+parameters: {}
+"""
+
+
+def _parameter_seeds() -> Iterator[bytes]:
+    yield b"/**:\n  ros__parameters:\n    model: M3\n    lever_arm: [0.1, -2, 1e-3]\n    use_message_covariance: true\n"
+    yield b"/auv:\n  dvl_calibration:\n    ros__parameters: {qos_overrides: {a: {b: 1}}, min_speed: .5}\n"
+    yield _ALIASES
+
+
+def _metadata_seeds() -> Iterator[bytes]:
+    yield b"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths: [fuzzed.mcap, ../x.db3]\n"
+    yield _ALIASES
+
+
+def _override_seeds() -> Iterator[bytes]:
+    yield from (b"[0.0, 1e-3, -2]", b"M3", b"min_speed:=0.5", b"{a: [1, 2]}", b"1:30:00", b"0x1F", b"!!python/name:os")
+
+
+_ALIASES = b"a: &a [1.0e-3, .nan]\nb: *a\nc: {d: !!binary aGFsbG8=, <<: {x: 1}}\n"
+_CALIBRATOR = Calibrator(Parameters())
+_SMALLEST_BAG = _small_mcap()
+TARGETS = {
+    "mcap": Target(run_mcap, _mcap_seeds),
+    "sqlite": Target(run_sqlite, _sqlite_seeds),
+    "mcap_records": Target(run_mcap_records, _mcap_seeds),
+    "sqlite_pages": Target(run_sqlite_pages, _sqlite_seeds),
+    "metadata": Target(run_metadata, _metadata_seeds),
+    "message": Target(run_message, _message_seeds),
+    "definition": Target(run_definition, _definition_seeds),
+    "result_file": Target(run_result_file, _result_seeds),
+    "parameters": Target(run_parameters, _parameter_seeds),
+    "override": Target(run_override, _override_seeds),
+}
