@@ -103,7 +103,8 @@ class PriorOnErrors:
             x = x + step
             if np.abs(step).max() < _LAST_STEP:
                 break
-        return to_errors(GaussianState(x, np.linalg.inv(information)))
+        # the last step is so small that the errors after it need no new linearisation
+        return GaussianState(errors + _product(jacobian, step), _propagated(jacobian, np.linalg.inv(information)))
 
 
 def _information(state: GaussianState) -> tuple[Array, Array]:
@@ -114,7 +115,8 @@ def _information(state: GaussianState) -> tuple[Array, Array]:
 
 def _extended(jacobian: Array, n: int) -> Array:
     """(..., 5, 5) -> (..., n, n): further states are as they are."""
-    extended = np.tile(np.eye(n), (*jacobian.shape[:-2], 1, 1))
+    extended = np.zeros((*jacobian.shape[:-2], n, n))
+    extended[..., range(_N, n), range(_N, n)] = 1.0
     extended[..., :_N, :_N] = jacobian
     return extended
 

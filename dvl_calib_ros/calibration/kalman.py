@@ -102,14 +102,14 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
             p += process[i]
         h, r_i, weight = data.h[:, i], data.r[:, 0 if one_r else i], data.weight[:, i]
         pht = p @ h.transpose(0, 2, 1)
-        s = h @ pht + r_i
-        s_inverse = np.linalg.inv(s)
+        hpht = h @ pht
+        s_inverse = np.linalg.inv(hpht + r_i)
         innovation = data.z[:, i, :, None] - h @ x[:, :, None]
         nis_i = (innovation.transpose(0, 2, 1) @ s_inverse @ innovation)[:, 0, 0]
         used_i = data.usable[:, i] & (nis_i <= data.gate)
         if (weight != 1.0).any():  # the gate asks whether this sample fits; the update, how much news is in it
             r_i = r_i / weight[:, None, None]
-            s_inverse = np.linalg.inv(h @ pht + r_i)
+            s_inverse = np.linalg.inv(hpht + r_i)
         gain = (pht @ s_inverse) * used_i[:, None, None]  # a gain of zero leaves x and P exactly as they are
         x += (gain @ innovation)[:, :, 0]
         # Joseph form: a sum of two positive semidefinite terms, so rounding cannot make P indefinite

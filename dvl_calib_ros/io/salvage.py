@@ -25,21 +25,27 @@ class DamagedError(Exception):
 
 
 class Damage:
-    """Takes note of damaged places on the way, so that reading goes on after each."""
+    """Takes note of damaged places on the way, so that reading goes on after each.
+
+    skipped: bytes that are not used because of them; of what is compressed within a chunk, unpacked bytes.
+    """
 
     def __init__(self) -> None:
         self._first = ""
         self._places = 0
-        self._skipped = 0
+        self.skipped = 0
 
     def note(self, what: str, skipped: int) -> None:
         """One more damaged place, and how many bytes are not used because of it."""
         self._first = self._first or what
         self._places += 1
-        self._skipped += skipped
+        self.skipped += skipped
+
+    def __bool__(self) -> bool:
+        return self._places > 0
 
     def raise_if_any(self) -> None:
         """Raise DamagedError with all of it in one sentence."""
         if self._places:
             more = f" and {self._places - 1} more damaged places" if self._places > 1 else ""
-            raise DamagedError(f"{self._first}{more}, {self._skipped} bytes skipped")
+            raise DamagedError(f"{self._first}{more}, {self.skipped} bytes skipped")

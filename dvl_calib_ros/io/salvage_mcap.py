@@ -160,7 +160,7 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     while at is not None and at < size:
         found, at = walk.step(at)
         yield from map(tables.salvaged, found)
-    if at is not None:
+    if at is not None and not damage:
         damage.note(f"it stops at byte {size} without the end of the data", 0)
     damage.raise_if_any()
 
@@ -197,19 +197,24 @@ class _Walk:
     def _chunk(self, at: int, length: int) -> tuple[list[_Found], int]:
         self._holds_chunks = True
         chunk = _open_chunk(self._file, at, length, self._size)
-        # of what is not believed only the channels, where nothing better is known; later chunks need them
-        found = _messages(at, chunk.records, self._tables, self._damage if chunk.is_believed else Damage())
-        if chunk.damage:
-            return found if chunk.is_believed else [], self._go_on(at, chunk.damage)
-        return found, chunk.end
+        # of what is not believed only the channels, which later chunks need
+        within = Damage() if chunk.damage else self._damage
+        found = _messages(at, chunk.records, self._tables, within)
+        if not chunk.damage:
+            return found, chunk.end
+        if not chunk.is_believed:
+            return [], self._go_on(at, chunk.damage)
+        self._damage.note(chunk.damage, within.skipped)
+        return found, self._next_place(at)
 
     def _go_on(self, at: int, what: str) -> int:
-        """Where to go on after damage in the record at `at`: at its end, if records follow there; else search."""
+        """Where to go on after damage in the record at `at`, of which nothing is used."""
         place = self._next_place(at)
         self._damage.note(what, place - at)
         return place
 
     def _next_place(self, at: int) -> int:
+        """Where to go on after the damaged record at `at`: at its end, if records follow there; else search."""
         end = _sound_end(self._file, at, self._size, self._tables)
         if end is not None:
             return end

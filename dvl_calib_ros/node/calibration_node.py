@@ -26,7 +26,7 @@ from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
-from ..calibration.screening import usable_covariance
+from ..calibration.screening import CovarianceScreen
 from ..io.drivers import velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
@@ -70,6 +70,11 @@ class CalibrationNode(Node):
             self.get_logger().warning(INITIAL_WINDOW_WARNING)
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
         self._feed = MessageFeed(self._calibrator, self._warn)
+        # what every DVL message asks for; none of it changes at run time
+        self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
+        self._offset_ns = round(parameters.dvl_time_offset * 1e9)
+        self._lever_arm = parameters.lever_arm if any(parameters.lever_arm) else None
+        self._dvl_covariance = CovarianceScreen()
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
@@ -201,20 +206,20 @@ class CalibrationNode(Node):
 
     def _publish_corrected(self, sample: DvlSample) -> None:
         calibrator = self._calibrator
-        parameters = calibrator.parameters
-        if self._correction is None or self._corrected_by != calibrator.selected:
-            name = calibrator.selected
-            self._correction = Correction(MODELS[name], calibrator.state(name), parameters.rotation_dvl_from_body)
+        name = calibrator.selected
+        if self._correction is None or self._corrected_by != name:
+            rotation = calibrator.parameters.rotation_dvl_from_body
+            self._correction = Correction(MODELS[name], calibrator.state(name), rotation)
             self._corrected_by = name
-        _, noise = usable_covariance(sample.covariance)
-        if noise is None:
-            noise = np.eye(3) * parameters.gnss_free_std**2
-        velocity, covariance = self._correction.apply(np.array(sample.velocity), noise)
-        stamp_ns = sample.stamp_ns - round(parameters.dvl_time_offset * 1e9)
-        if any(parameters.lever_arm):
+        _, noise = self._dvl_covariance(sample.covariance)
+        velocity, covariance = self._correction.apply(
+            np.array(sample.velocity), self._unaided_noise if noise is None else noise
+        )
+        stamp_ns = sample.stamp_ns - self._offset_ns
+        if self._lever_arm is not None:
             rate = calibrator.latest_angular_velocity(stamp_ns)
             if rate is not None:
-                velocity = velocity - np.cross(rate, parameters.lever_arm)
+                velocity = velocity - np.cross(rate, self._lever_arm)
         message = self._corrected
         _set_stamp(message.header.stamp, stamp_ns)
         linear = message.twist.twist.linear

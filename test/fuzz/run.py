@@ -52,14 +52,16 @@ def fuzz_apart(name: str, inputs: int, corpus: Path) -> bool:
     folders = [str(folder), *([str(kept)] if kept.is_dir() else [])]
     command = [sys.executable, __file__, name, "--", *folders, f"-runs={inputs}", *LIMITS]
     command += [f"-artifact_prefix={corpus}/{name}-"]
-    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, errors="replace", env=_environment())
-    (corpus / f"{name}.log").write_text(done.stderr)
-    tried = re.findall(r"number_of_executed_units:\s*(\d+)|DONE\s+cov|^#(\d+)", done.stderr, re.MULTILINE)
-    count = max((int(number) for pair in tried for number in pair if number), default=0)
-    seconds = re.findall(r"Done \d+ runs in (\d+) second", done.stderr)
-    outcome = "nothing found" if done.returncode == 0 else f"FOUND something, see {corpus}/{name}.log"
-    print(f"{name}: {count} inputs, {seconds[0] if seconds else '?'} s, {outcome}", flush=True)
-    return done.returncode == 0
+    log = corpus / f"{name}.log"
+    with log.open("w") as errors:
+        subprocess.run(command, stderr=errors, env=_environment(), check=False)
+    text = log.read_text(errors="replace")
+    tried = re.findall(r"^(?:#|stat::number_of_executed_units: )(\d+)", text, re.MULTILINE)
+    rate = re.findall(r"^stat::average_exec_per_sec:\s+(\d+)", text, re.MULTILINE)
+    found = sorted(corpus.glob(f"{name}-*"))
+    outcome = f"FOUND {', '.join(map(str, found))}" if found else "nothing found"
+    print(f"{name}: {max(map(int, tried), default=0)} inputs, {' '.join(rate) or '?'} per s, {outcome}", flush=True)
+    return not found
 
 
 def _environment() -> dict[str, str]:
