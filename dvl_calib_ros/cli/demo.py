@@ -2,7 +2,8 @@
 
 Starts the real node in a process of its own, plays a bag with a GNSS outage to it over DDS (on this machine only, on
 a ROS domain of its own), shows the estimates converge, switches a model by the parameter service, then replays the
-same bag offline and prints both results beside the truth.
+same bag offline and prints both results beside the truth; last, it asks whether anything is left that a simulator
+would lack.
 """
 
 from __future__ import annotations
@@ -76,6 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")
         offline = _offline(bag, latency, with_history=write_report is not None)
         agree = _compare(out, saved, offline.result)
+    _show_diagnosis(out, bag)
     if write_report is not None:
         write_report(arguments.report, offline, [bag], list(MODELS))
         out.print(f"The replay's report is in {arguments.report}.")
@@ -153,3 +155,12 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     verdict = "agree" if worst < 1e-12 else "[red]DIFFER[/] (if the machine is too busy to keep up: --speed 5)"
     out.print(f"Live and offline {verdict}: the largest difference in any state or covariance is {worst:.1e}.")
     return worst < 1e-12
+
+
+def _show_diagnosis(out: Any, bag: Path) -> None:
+    from ..calibration.parameters import Parameters
+    from ..diagnosis.diagnose import diagnose
+
+    out.print("\n[bold]3. Diagnosis[/]: what a simulator would lack beside this bag, `dvl-calib diagnose`\n")
+    diagnosis = diagnose([bag], Parameters(min_speed=0.0))
+    out.print(f"[bold]{diagnosis.verdict.value}[/]: {diagnosis.sentence}", soft_wrap=True)
