@@ -17,7 +17,7 @@ from .fitting import Fit, Fitter
 from .noise import Noise
 from .problem import Problem
 
-LEVEL = 0.002
+LEVEL = 0.001
 TIME_KNOTS = 7
 HEADING_HARMONICS = 4
 # Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has

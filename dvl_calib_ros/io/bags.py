@@ -28,7 +28,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from .attachments import attach
 from .definitions import Definition, DefinitionError, is_empty, known_typestores, typestore
 from .drivers import IMU_TYPE, TWIST_TYPE, VELOCITY_TYPES
@@ -532,6 +532,10 @@ _COMPRESSION = {
 UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
 
 
+Sample = DvlSample | ReferenceSample | ImuSample
+FRAME_IDS = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
+
+
 class BagWriter:
     """Writes samples to a new rosbag2 folder. A context manager; log time is the stamp. Raises InputError."""
 
@@ -581,6 +585,16 @@ class BagWriter:
     def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:
         why = getattr(error, "strerror", None) or error
         return InputError(f"{self._writer.path}: cannot be written ({why}); free some space, or name another place")
+
+    def recording(self, *sensors: Iterable[Sample]) -> None:
+        """Write the samples of any sensors, each in order of time, to the node's topics in order of time."""
+        for sample in heapq.merge(*sensors, key=lambda sample: sample.stamp_ns):
+            if isinstance(sample, DvlSample):
+                self.dvl("dvl/twist", sample)
+            elif isinstance(sample, ReferenceSample):
+                self.reference("gnss/twist", sample, FRAME_IDS[sample.frame])
+            else:
+                self.imu("imu/data", sample)
 
     def dvl(self, topic: str, sample: DvlSample, frame_id: str = "dvl_link") -> None:
         """Write a DVL velocity as TwistWithCovarianceStamped."""

@@ -7,10 +7,8 @@ the axes it names.
 from __future__ import annotations
 
 import csv
-import heapq
 import re
 import shutil
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -174,9 +172,6 @@ class ImportOptions:
                 raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
 
 
-GNSS_FRAME_IDS = {"enu": "map", "ned": "ned", "flu": "base_link", "frd": "base_link"}
-
-
 def import_recording(
     dvl: Path, gnss: Path | None, attitude: Path | None, output: Path, options: ImportOptions
 ) -> dict[str, int]:
@@ -187,17 +182,8 @@ def import_recording(
     dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std)
     references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std) if gnss else []
     attitudes = read_attitude(attitude, start_ns) if attitude else []
-    samples: Iterable[DvlSample | ReferenceSample | ImuSample] = heapq.merge(
-        attitudes, references, dvl_samples, key=lambda sample: sample.stamp_ns
-    )
     with BagWriter(output, options.storage, options.compression) as bag:
-        for sample in samples:
-            if isinstance(sample, DvlSample):
-                bag.dvl("dvl/twist", sample)
-            elif isinstance(sample, ReferenceSample):
-                bag.reference("gnss/twist", sample, GNSS_FRAME_IDS[options.gnss_frame])
-            else:
-                bag.imu("imu/data", sample)
+        bag.recording(attitudes, references, dvl_samples)
     return {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import heapq
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -134,16 +133,7 @@ def write_bag(
         writer.attachment(TRUTH_NAME, "application/json", text.encode())
     run = simulate(scenario)
     with writer as bag:
-        samples: Iterable[DvlSample | ReferenceSample | ImuSample] = heapq.merge(
-            run.imu, run.gnss, run.dvl, key=lambda sample: sample.stamp_ns
-        )
-        for sample in samples:
-            if isinstance(sample, DvlSample):
-                bag.dvl("dvl/twist", sample)
-            elif isinstance(sample, ReferenceSample):
-                bag.reference("gnss/twist", sample, "base_link" if sample.frame is VelocityFrame.BODY else "map")
-            else:
-                bag.imu("imu/data", sample)
+        bag.recording(run.imu, run.gnss, run.dvl)
 
 
 def truth_document(scenario: Scenario) -> dict[str, Any]:

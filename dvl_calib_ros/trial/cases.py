@@ -40,6 +40,8 @@ STRAIGHT, ONE_SPEED_BOX = "straight", "one_speed_box"
 # Faults that a straight run at one speed hides in the calibration, and such that turns at one speed cannot tell apart
 HIDDEN = ("velocity_bias", "quadratic_scale", "mount_flexure", "water_lock", "heading_error", "lever_arm")
 ALIKE = ("lever_arm", "sideslip")
+# A fault that is to be hidden must not be stronger than this
+MAX_HIDDEN_Q = 1.0
 KINDS = (*TUNING_KINDS, *HELD_OUT_KINDS)
 MAX_DRAWS = 60
 MAX_STEPS = 8
@@ -255,6 +257,8 @@ def _unidentifiable(case: Case, scene: Scene, rng: np.random.Generator) -> Truth
     if not values:
         return None
     vector = yardstick.vector({case.name: values})
+    if case.kind == STRAIGHT and np.linalg.norm(vector) > MAX_HIDDEN_Q:
+        return None  # it came and went on the way, and so showed
     distances = yardstick.distances(case.name, vector, yardstick.spans())
     return _truth(case, scene, {case.name: values}, q={case.name: float(np.linalg.norm(vector))}, distances=distances)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,10 +174,4 @@ def _imu(motion: Motion, faults: Faults, noise: Noise, start_ns: int) -> list[Sa
 
 def _write(path: Path, sensors: list[list[Sample]]) -> None:
     with BagWriter(path) as bag:
-        for sample in heapq.merge(*sensors, key=lambda sample: sample.stamp_ns):
-            if isinstance(sample, DvlSample):
-                bag.dvl("dvl/twist", sample)
-            elif isinstance(sample, ReferenceSample):
-                bag.reference("gnss/twist", sample, "base_link" if sample.frame is VelocityFrame.BODY else "map")
-            else:
-                bag.imu("imu/data", sample)
+        bag.recording(*sensors)
