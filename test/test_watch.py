@@ -163,8 +163,10 @@ class Terminal:
             assert self._read() and time.monotonic() < deadline, f"no {text!r} in: {self.text[-2000:]}"
 
     def rest(self) -> str:
+        """What is drawn until the program ends."""
+        deadline = time.monotonic() + 2.0 * PATIENCE_S
         while self._read():
-            pass
+            assert time.monotonic() < deadline, f"it does not end: {self.text[-2000:]}"
         return self.text
 
     def _read(self) -> bool:

@@ -106,7 +106,7 @@ def show(
     is_running: Callable[[], bool] = lambda: True,
     log: Sequence[str] = (),
 ) -> None:
-    """Draw until the node ends or KeyboardInterrupt. statuses: waits so many s and returns the latest status.
+    """Draw while it is running. statuses: waits so many s and returns the latest status.
 
     On a terminal the view is drawn in place; elsewhere a line is written when something has changed, or now and then.
     """

@@ -11,9 +11,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
-from types import FrameType
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING
 
 from . import common
@@ -26,6 +25,8 @@ HELP = "watch a node that runs elsewhere, in the terminal"
 EXAMPLE = "dvl-calib watch"
 # How long a node may take to save, s.
 PATIENCE_S = 60.0
+# Signals that ask to save and end: Ctrl-C, kill, a terminal that is closed
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,8 +37,23 @@ def run(arguments: argparse.Namespace) -> None:
     """Watch until Ctrl-C."""
     from .live_view import show
 
-    with _listener() as listener, suppress(KeyboardInterrupt):
-        show(common.console(), listener.latest)
+    with _listener() as listener, _asked_to_end() as ending:
+        show(common.console(), listener.latest, lambda: not ending.is_set())
+
+
+@contextmanager
+def _asked_to_end() -> Iterator[threading.Event]:
+    """Whether Ctrl-C, SIGTERM or SIGHUP came.
+
+    Not KeyboardInterrupt: it may come up within a callback of the middleware, which swallows it.
+    """
+    ending = threading.Event()
+    before = {number: signal.signal(number, lambda *_: ending.set()) for number in ENDING}
+    try:
+        yield ending
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _listener() -> Listener:
@@ -60,24 +76,19 @@ def run_and_watch(ros_arguments: Sequence[str]) -> int:
     """
     from .live_view import show
 
-    with _listener() as listener:
+    # until the node has ended: a second Ctrl-C must not cut its saving short
+    with _listener() as listener, _asked_to_end() as ending:
         command = [sys.executable, "-m", "dvl_calib_ros.node.main", *ros_arguments]
         environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, _interrupt)
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, start_new_session=True
         )
-        said = 0  # lines that are on the screen already
         try:
             assert process.stdout is not None  # a pipe
             log = _Log(process.stdout)
-            show(common.console(), listener.latest, lambda: process.poll() is None, log.lines)
-        except KeyboardInterrupt:
-            said = len(log.lines)
+            show(common.console(), listener.latest, lambda: process.poll() is None and not ending.is_set(), log.lines)
+            said = len(log.lines) if ending.is_set() else 0  # lines that are on the screen already
         finally:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not cut the saving short
             code = _ended(process)
         for text in log.finished()[said:]:
             print(text, file=sys.stderr)
@@ -92,10 +103,6 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
         print(f"the node did not end within {PATIENCE_S:.0f} s and is killed; it may not have saved", file=sys.stderr)
         process.kill()
         return process.wait()
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 class _Log:
