@@ -368,7 +368,7 @@ def test_rollback_touches_nothing_when_one_file_has_no_backup(tmp_path, saved, c
         (["result.yaml", "--urdf", "missing.urdf"], "missing.urdf: cannot be read as URDF"),
         (["result.yaml", "-o", "x"], "name that, too"),
         (["result.yaml", "--joint", "x"], "name that, too"),
-        (["result.yaml", "--launch", "missing/x"], "the folder missing does not exist"),
+        (["result.yaml", "--launch", "missing/x"], "missing does not exist; create it"),
         (["--rollback"], "name the files again"),
     ],
 )

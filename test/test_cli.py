@@ -208,7 +208,7 @@ def test_replay_saves_a_result_file_that_replay_starts_from(capsys, bag, tmp_pat
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--save", "missing/r.yaml"], "missing/r.yaml: the folder missing does not exist"),
+        (["--save", "missing/r.yaml"], "missing does not exist; create it"),
         (["--json", "."], "is a folder"),
         (["--json", "same", "--save", "same"], "names of their own"),
         (["--params", "nowhere.yaml"], "nowhere.yaml: no such ROS 2 parameter file"),

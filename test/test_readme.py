@@ -57,7 +57,7 @@ def test_every_warning_of_the_node_has_a_row_in_the_troubleshooting_table(module
 
 
 def test_the_table_quotes_nothing_that_the_node_does_not_say():
-    said = [text for module in WARNING_MODULES for text in sentences(module)]
+    said = [text for module in (*WARNING_MODULES, "node/calibration_node.py") for text in sentences(module)]
     assert [phrase for phrase in phrases() if not any(phrase in text for text in said)] == []
 
 
