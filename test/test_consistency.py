@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 
-N_RUNS = 200
+N_RUNS = 100
 
 
 def normalised_estimation_error_squared(**options) -> dict[str, np.ndarray]:

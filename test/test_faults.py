@@ -40,6 +40,8 @@ from dvl_calib_ros.io.yaml_files import load_yaml
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms
 
+pytestmark = pytest.mark.faults
+
 SECOND = 1_000_000_000
 HOUR_S = 3600.0
 END_OF_TIME_NS = (2**31 - 2) * SECOND
