@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `cli.main` does, before numpy is imported
+
 import numpy as np
 import pytest
 

@@ -76,7 +76,7 @@ def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
     assert diagnosis.gap.noise_floor == pytest.approx(np.sqrt(3.0) * 0.05, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.parametrize("seed", range(1, 4))
 def test_noise_alone_is_not_taken_for_an_effect(seed):
     trajectory = ("box", "lawnmower", "figure8")[seed % 3]
     assert diagnosed(trajectory, seed=seed, seconds=400.0).verdict not in CLAIMS
