@@ -11,6 +11,8 @@ from report_fixtures import diagnosis, evaluation, replay_page
 
 from dvl_calib_ros.report import write_diagnosis_report, write_evaluation_report
 
+pytestmark = pytest.mark.slow
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 PHONE, DESKTOP = (375, 740), (1280, 900)
 A4_WIDTH = 695  # without margins, at 96 dpi

@@ -23,6 +23,8 @@ from dvl_calib_ros.io.errors import InputError
 from dvl_calib_ros.simulation.sensors import DvlErrors, measure_dvl
 from dvl_calib_ros.simulation.trajectories import make_motion
 
+pytestmark = pytest.mark.slow
+
 CLAIMS = (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
 
 

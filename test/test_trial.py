@@ -30,6 +30,8 @@ from dvl_calib_ros.trial.strength import Scene, Yardstick
 from dvl_calib_ros.trial.truth import Category, Truth, seal, unseal
 from dvl_calib_ros.trial.vehicle import FAULTS, Vehicle
 
+pytestmark = pytest.mark.slow
+
 TOPICS = ("dvl/twist", "gnss/twist", "imu/data")
 
 
