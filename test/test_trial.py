@@ -158,7 +158,6 @@ def test_recorded_motion_is_the_recording_turned_into_forward_left_up(snapir):
     ("name", "rates"),
     [
         ("lever_arm", (4.0, 4.0)),
-        ("velocity_bias", (8.0, 2.0)),
         ("heading_error", (2.0, 8.0)),
         ("reference_lag", (5.0, 5.0)),
     ],

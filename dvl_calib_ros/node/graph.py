@@ -10,6 +10,9 @@ from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_
 
 from ..io.drivers import TYPES_OF
 
+# What ROS 2 calls a node whose topic is discovered before it is
+UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
+
 
 def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[str]:
     """What is wrong with the publishers of one of the node's inputs, and the remedy.
@@ -71,6 +74,8 @@ def _in_full(own: QoSProfile) -> QoSProfile:
 
 
 def _name(info: Any) -> str:
+    if info.node_name == UNKNOWN_NAME:  # discovered later than its topic
+        return "unnamed node"
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
