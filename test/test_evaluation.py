@@ -35,6 +35,8 @@ from dvl_calib_ros.io.errors import InputError
 from dvl_calib_ros.io.replay import replay
 from dvl_calib_ros.io.trajectories import ImportOptions, angular_velocities, import_recording
 
+pytestmark = pytest.mark.slow
+
 COMBINATION = 7
 
 
