@@ -60,12 +60,11 @@ def held_out(selection: Selection, dictionary: Array, only: Effect | None = None
     """
     fitter, fit = selection.fitter, selection.fit
     block, fold = blocks_of(fitter.problem)
-    seen = selection.dictionary.seen(fit.noise, fitter.residual)
     before, after = np.empty_like(fitter.residual), np.empty_like(fitter.residual)
     floor = _floor(fitter, fit, dictionary)
     for held in np.unique(fold):
         test = fold[block] == held
-        train = seen.without(test)
+        train = selection.seen.without(test)
         before[test] = train.left(train.solved([]), [])[test]
         after[test] = before[test]
         if fit.effects:

@@ -177,20 +177,6 @@ class Dictionary:
         white = noise.whiten(raw)
         return Seen(self, raw, white, white.T @ white)
 
-    def beyond(self, noise: Noise, residual: Array) -> Array:
-        """What all effects together leave of a residual (M, 3), as large as noise would be without them."""
-        seen = self.seen(noise, residual)
-        first: dict[str, int] = {}
-        for index, variant in enumerate(self.variants):
-            small = float(np.abs(variant.centre).max(initial=0.0))
-            best = first.get(variant.effect.name)
-            if best is None or small < float(np.abs(self.variants[best].centre).max(initial=0.0)):
-                first[variant.effect.name] = index
-        chosen = list(first.values())
-        left = seen.left(seen.solved(chosen), chosen)
-        n, p = 3 * len(left), 6 + sum(len(self.columns[index]) for index in chosen)
-        return np.asarray(left * np.sqrt(n / max(n - p, 1)))
-
 
 @dataclass(frozen=True)
 class Seen:
@@ -202,6 +188,19 @@ class Seen:
     raw: Array
     white: Array
     gram: Array
+
+    def beyond(self) -> Array:
+        """What all effects together leave of the residual (M, 3), as large as noise would be without them."""
+        dictionary = self.dictionary
+        first: dict[str, int] = {}  # of each effect the variant with the smallest values
+        for index, variant in enumerate(dictionary.variants):
+            best = first.setdefault(variant.effect.name, index)
+            if np.abs(variant.centre).max(initial=0.0) < np.abs(dictionary.variants[best].centre).max(initial=0.0):
+                first[variant.effect.name] = index
+        chosen = list(first.values())
+        left = self.left(self.solved(chosen), chosen)
+        n, p = 3 * len(left), 6 + sum(len(dictionary.columns[index]) for index in chosen)
+        return np.asarray(left * np.sqrt(n / max(n - p, 1)))
 
     def without(self, held: NDArray[np.bool_]) -> Seen:
         """The same, with only those samples (M,) to see that are not held out."""

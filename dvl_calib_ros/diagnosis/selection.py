@@ -50,13 +50,15 @@ class Selected:
 
 @dataclass(frozen=True)
 class Selection:
-    """Outcome of a selection: the effects, strongest first, the fits without and with them, and the fitter."""
+    """Outcome of a selection: the effects, strongest first, the fits without and with them, the fitter, and all effects
+    through the noise that is left.
+    """
 
     selected: tuple[Selected, ...]
     base: Fit
     fit: Fit
     fitter: Fitter
-    dictionary: Dictionary
+    seen: Seen
 
     def withdrawn(self) -> Selection:
         """Without any effect."""
@@ -98,9 +100,10 @@ def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
         # with the noise that is left in the end, and about the end's calibration
         fitter, fit = about(fitter.problem, kept)
         dictionary = dictionary_about(fitter, fit, effects)
-    selected = [_selected(fitter, fit, number, dictionary) for number in range(len(fit.effects))]
+    seen = dictionary.seen(fit.noise, fitter.residual)
+    selected = [_selected(fitter, fit, number, seen) for number in range(len(fit.effects))]
     base = fitter.fit([], fit.noise, {})
-    return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter, dictionary)
+    return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter, seen)
 
 
 def log_threshold(dictionary: Dictionary) -> float:
@@ -144,11 +147,12 @@ def _best_added(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Tested | No
     had no colour: the noise may have taken an effect's colour, which then looks small.
     """
     chosen = list(range(dictionary.n_present))
-    beyond = fit.noise.like(dictionary.beyond(fit.noise, fitter.residual))
+    own = dictionary.seen(fit.noise, fitter.residual)
+    others = [fit.noise.like(own.beyond()), *([fit.noise.white] if fit.noise.is_coloured else [])]
+    looks = [(fit.noise, own), *((noise, dictionary.seen(noise, fitter.residual)) for noise in others)]
     worth: dict[str, tuple[float, Candidate, Noise]] = {}
-    for noise in (fit.noise, beyond, *([fit.noise.white] if fit.noise.is_coloured else [])):
-        candidates = sorted(dictionary.seen(noise, fitter.residual).candidates(chosen).values(), key=lambda c: c.log_p)
-        for candidate in candidates[:MAX_TESTED]:
+    for noise, seen in looks:
+        for candidate in sorted(seen.candidates(chosen).values(), key=lambda c: c.log_p)[:MAX_TESTED]:
             name = candidate.effect.name
             if candidate.log_p < WORTH_A_LOOK and (name not in worth or candidate.log_p < worth[name][0]):
                 worth[name] = candidate.log_p, candidate, noise
@@ -218,7 +222,7 @@ def _swapped(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Fit | None:
     return swapped if fit.deviance - swapped.deviance > 2.0 * (swapped.dof - fit.dof) else None
 
 
-def _selected(fitter: Fitter, fit: Fit, number: int, dictionary: Dictionary) -> Selected:
+def _selected(fitter: Fitter, fit: Fit, number: int, seen: Seen) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
     One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
@@ -228,7 +232,7 @@ def _selected(fitter: Fitter, fit: Fit, number: int, dictionary: Dictionary) -> 
     rest = _without(fitter, fit, effect)
     drop = rest.deviance - fit.deviance
     # with the noise that is left when the cause is known: it is the same for all that could be the cause
-    candidates = dictionary.seen(fit.noise, fitter.residual).candidates(list(range(len(fit.effects))), number)
+    candidates = seen.candidates(list(range(len(fit.effects))), number)
     own = candidates.pop(effect.name)
     log_p = log_p_value(drop, fit.dof - rest.dof, own.tried)
     found: list[tuple[float, str]] = []
