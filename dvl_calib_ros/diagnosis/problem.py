@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct, idct
 from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array, skew
 from ..calibration.samples import VelocityFrame
@@ -159,20 +159,12 @@ class Problem:
         return tuple(made_up)
 
     def _motion(self, recording: Recording, velocity: Array) -> EffectInput:
-        time = recording.time
-        fine = _finer(time, recording.finer)
-        rotation = rate = None
-        if Needs.ATTITUDE in self.available and recording.rotation_enu_from_body is not None:
-            attitude = Rotation.from_matrix(recording.rotation_enu_from_body)
-            rotation = Slerp(time, attitude)(fine).as_matrix()
-        if Needs.ANGULAR_VELOCITY in self.available and recording.angular_velocity is not None:
-            rate = make_interp_spline(time, recording.angular_velocity, k=1)(fine)
         return EffectInput(
-            time=fine,
-            velocity_body=make_interp_spline(time, velocity, k=3)(fine),
+            time=recording.fine_time,
+            velocity_body=make_interp_spline(recording.time, velocity, k=3)(recording.fine_time),
             rotation_dvl_from_body=self.calibration.rotation_dvl_from_body,
-            rotation_enu_from_body=rotation,
-            angular_velocity=rate,
+            rotation_enu_from_body=recording.fine_rotation_enu_from_body if Needs.ATTITUDE in self.available else None,
+            angular_velocity=recording.fine_angular_velocity if Needs.ANGULAR_VELOCITY in self.available else None,
             reference_frame=recording.reference_frame,
         )
 
@@ -416,9 +408,3 @@ def _straight_line_error(recording: Recording, around: Array, velocity_body: Arr
     share = np.divide(time - before, after - before, out=np.zeros_like(time), where=after > before)[:, None]
     error: Array = (1.0 - share) * curve(before) + share * curve(after) - velocity
     return error if rotation is None else np.einsum("nji,nj->ni", rotation, error)
-
-
-def _finer(time: Array, every: int) -> Array:
-    """Times with `every` - 1 more between each two."""
-    n = len(time)
-    return np.interp(np.arange((n - 1) * every + 1) / every, np.arange(n), time)

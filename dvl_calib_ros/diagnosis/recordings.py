@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.calibrator import SECOND_NS
 from ..calibration.frames import Array
@@ -77,6 +79,30 @@ class Recording:
     def finer(self) -> int:
         """How many times to compute traces at for each sample."""
         return max(1, int(np.ceil(MIN_TRACE_RATE_HZ * self.interval)))
+
+    @cached_property
+    def fine_time(self) -> Array:
+        """(F,) s: times with `finer` - 1 more between each two samples."""
+        n = len(self.time)
+        return np.interp(np.arange((n - 1) * self.finer + 1) / self.finer, np.arange(n), self.time)
+
+    @cached_property
+    def fine_rotation_enu_from_body(self) -> Array | None:
+        """(F, 3, 3) at the fine times, None without attitude."""
+        if self.rotation_enu_from_body is None:
+            return None
+        rotations: Array = Slerp(self.time, Rotation.from_matrix(self.rotation_enu_from_body))(
+            self.fine_time
+        ).as_matrix()
+        return rotations
+
+    @cached_property
+    def fine_angular_velocity(self) -> Array | None:
+        """(F, 3) rad/s at the fine times, None without."""
+        if self.angular_velocity is None:
+            return None
+        rates: Array = make_interp_spline(self.time, self.angular_velocity, k=1)(self.fine_time)
+        return rates
 
     @cached_property
     def interval(self) -> float:
