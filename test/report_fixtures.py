@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 from io_fixtures import run, write_bag
+from matplotlib.category import StrCategoryLocator
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator
 
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -76,6 +79,23 @@ class Page(HTMLParser):
 
     def images(self) -> list[dict[str, str | None]]:
         return [attributes for tag, attributes in self.tags if tag == "img"]
+
+
+def drawn(monkeypatch) -> list[Figure]:
+    """Figures as they are drawn from now on, in place of being saved."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **_: (figures.append(figure), file.write(b"<svg/>")))
+    return figures
+
+
+def assert_described(images, figures) -> None:
+    """Every figure has alternative text and labelled axes."""
+    assert len(images) == len(figures)
+    assert all(len(image["alt"]) > 10 for image in images)
+    for figure in figures:
+        (axes,) = figure.axes
+        has_names = isinstance(axes.yaxis.get_major_locator(), FixedLocator | StrCategoryLocator)
+        assert axes.get_xlabel() and (axes.get_ylabel() or has_names)
 
 
 def recorded(bag: Path, **parameters: Any) -> Replayed:

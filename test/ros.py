@@ -41,6 +41,14 @@ def answered(future: Any) -> bool:
     return done.wait(PATIENCE_S / 6)
 
 
+def refused_at_start(*arguments: str) -> str:
+    """What a node says on standard error that refuses to start with ROS arguments."""
+    command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert done.returncode == 2
+    return done.stderr
+
+
 class World:
     """A domain with a client node that is spun in the background."""
 

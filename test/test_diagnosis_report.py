@@ -6,10 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.category import StrCategoryLocator
-from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator
-from report_fixtures import OWN_EFFECT, Page, diagnosis
+from report_fixtures import OWN_EFFECT, Page, assert_described, diagnosis, drawn
 from test_cli import fail, succeed
 
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -116,15 +113,10 @@ def test_names_from_bags_and_plug_ins_are_text(page):
 
 
 def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **_: (seen.append(figure), file.write(b"<svg/>")))
+    figures = drawn(monkeypatch)
     images = page_of(tmp_path, diagnosis()).images()
-    assert len(images) == len(seen) >= 13
-    assert all(len(image["alt"]) > 10 for image in images)
-    for figure in seen:
-        (axes,) = figure.axes
-        has_names = isinstance(axes.yaxis.get_major_locator(), FixedLocator | StrCategoryLocator)
-        assert axes.get_xlabel() and (axes.get_ylabel() or has_names)
+    assert len(figures) >= 13
+    assert_described(images, figures)
 
 
 def test_the_gap_of_a_regime_is_what_lies_there_beyond_the_noise():

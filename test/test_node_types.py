@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -10,13 +9,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
-from conftest import ROOT
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, as_plain, write_driver_bag
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
 from nav_msgs.msg import Odometry
-from ros import World, until
+from ros import World, refused_at_start, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -47,10 +45,8 @@ def world():
     ],
 )
 def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(arguments, said):
-    command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1 and said in done.stderr
+    errors = refused_at_start(*arguments)
+    assert len(errors.splitlines()) == 1 and said in errors
 
 
 def test_the_node_and_the_replay_agree_on_other_types(world, tmp_path):

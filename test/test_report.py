@@ -9,10 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from io_fixtures import run, steady_run, write_bag
-from matplotlib.category import StrCategoryLocator
-from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator
-from report_fixtures import Page, evaluation, recorded, replay_page
+from report_fixtures import Page, assert_described, drawn, evaluation, recorded, replay_page
 from test_cli import fail, in_fresh_process, succeed
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -101,18 +98,13 @@ def test_warnings_are_shown(tmp_path):
 
 
 def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
-    seen = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **_: (seen.append(figure), file.write(b"<svg/>")))
+    figures = drawn(monkeypatch)
     page = Page(replay_page(tmp_path)[0])
     path = tmp_path / "evaluation.html"
     write_evaluation_report(path, evaluation())
     images = [*page.images(), *Page(path).images()]
-    assert len(images) == len(seen) > 25
-    assert all(len(image["alt"]) > 10 for image in images)
-    for figure in seen:
-        (axes,) = figure.axes
-        has_names = isinstance(axes.yaxis.get_major_locator(), FixedLocator | StrCategoryLocator)
-        assert axes.get_xlabel() and (axes.get_ylabel() or has_names)
+    assert len(figures) > 25
+    assert_described(images, figures)
 
 
 def test_models_can_be_told_apart_and_look_the_same_everywhere():
