@@ -137,9 +137,9 @@ def _whole_chunk(
     if chunk.damage:
         raise DamagedError(chunk.damage)
     damage = Damage()
-    found = _messages(at, chunk.records, tables, damage)
+    found = _messages(at, chunk.records, tables, damage, wanted)
     damage.raise_if_any()
-    return [message for message in found if message[1] in wanted]
+    return found
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
@@ -403,8 +403,13 @@ def _unpack_start(new: Callable[[], Any], packed: bytes, size: int) -> bytes:
     return bytes(output)
 
 
-def _messages(at: int, records: bytes, tables: _Tables, damage: Damage) -> list[_Found]:
-    """Messages of a chunk's records, in order of log time; what is damaged among them is skipped and noted."""
+def _messages(
+    at: int, records: bytes, tables: _Tables, damage: Damage, wanted: Collection[int] | None = None
+) -> list[_Found]:
+    """Messages of a chunk's records, in order of log time; what is damaged among them is skipped and noted.
+
+    wanted: the channels whose messages are given, None for all; the others' are checked, but not copied.
+    """
     found: list[_Found] = []
     channels, n = tables.channels, len(records)
     head, message_head = _RECORD_HEAD.unpack_from, _MESSAGE_HEAD.unpack_from
@@ -419,7 +424,8 @@ def _messages(at: int, records: bytes, tables: _Tables, damage: Damage) -> list[
                 channel_id, _, log_ns, _ = message_head(records, here + 9)
                 if length < 22 or channel_id not in channels:
                     raise DamagedError(f"in the chunk at byte {at}: a message is of no known channel")
-                found.append((log_ns, channel_id, records[here + 31 : end]))
+                if wanted is None or channel_id in wanted:
+                    found.append((log_ns, channel_id, records[here + 31 : end]))
             else:
                 tables.note(at, opcode, records[here + 9 : end])
             here = end
