@@ -53,11 +53,11 @@ _Found = tuple[int, int, bytes]
 
 
 class _Tables:
-    """The schemas and channels that are known."""
+    """The schemas and channels that are known; at the beginning, those of the summary."""
 
-    def __init__(self) -> None:
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
+    def __init__(self, summary: Summary | None) -> None:
+        self.schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
+        self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
 
     def note(self, at: int, opcode: int, content: bytes) -> None:
         """Take note of a schema or channel; DamagedError if it is none."""
@@ -84,9 +84,13 @@ class _Tables:
 def read_summary(path: Path) -> Summary | None:
     """The index at the end of the file if there is one that leads to messages; any error if it is damaged."""
     with path.open("rb") as file:
-        summary = SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
+        summary = _summary(file)
     usable = summary is not None and summary.statistics and summary.chunk_indexes and summary.channels
     return summary if usable else None
+
+
+def _summary(file: BinaryIO) -> Summary | None:
+    return SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
 
 
 def indexed_messages(path: Path, summary: Summary, channels: Collection[int]) -> Iterator[_Found]:
@@ -95,8 +99,7 @@ def indexed_messages(path: Path, summary: Summary, channels: Collection[int]) ->
     def read(index: ChunkIndex) -> Iterator[_Found]:
         yield from _whole_chunk(file, size, index, tables, wanted)
 
-    tables = _Tables()
-    tables.schemas, tables.channels = dict(summary.schemas), dict(summary.channels)
+    tables = _Tables(summary)
     wanted = frozenset(channels)
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -150,11 +153,10 @@ def salvage_mcap(path: Path) -> Iterator[Salvaged]:
 
 def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     """As `salvage_mcap`, of an open file of so many bytes."""
-    damage, tables = Damage(), _Tables()
+    damage, summary = Damage(), None
     with suppress(Exception):  # schemas and channels once more: the chunk that introduces them may be damaged
-        summary = SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
-        if summary is not None:
-            tables.schemas, tables.channels = dict(summary.schemas), dict(summary.channels)
+        summary = _summary(file)
+    tables = _Tables(summary)
     walk = _Walk(file, size, tables, damage)
     at: int | None = len(MCAP_MAGIC)
     while at is not None and at < size:
@@ -225,7 +227,7 @@ class _Walk:
             self._may_hold_chunks = False
         if self._holds_chunks:  # outside of chunks, with their checksums, what looks like messages is not believed
             return self._size
-        return _next_record(self._file, at, self._size, self._tables)
+        return _search_records(self._file, at, self._size, self._tables)
 
     def _is_chunk_at(self, at: int) -> bool:
         return _is_chunk(self._file, at, _head(self._file, at)[1])
@@ -266,9 +268,13 @@ def _sound_end(file: BinaryIO, at: int, size: int, tables: _Tables) -> int | Non
 def _next_record(file: BinaryIO, at: int, size: int, tables: _Tables) -> int:
     """Where schemas, channels or messages go on after damage in the record at `at`; `size` if nowhere."""
     end = _sound_end(file, at, size, tables)
-    if end is None:
-        end = _search(file, at + 1, size, _RECORD_BEGIN, lambda place: _records_follow(file, place, size, tables))
-    return size if end is None else end
+    return _search_records(file, at, size, tables) if end is None else end
+
+
+def _search_records(file: BinaryIO, at: int, size: int, tables: _Tables) -> int:
+    """As `_next_record`, of a record whose own end is known to lead nowhere."""
+    place = _search(file, at + 1, size, _RECORD_BEGIN, lambda place: _records_follow(file, place, size, tables))
+    return size if place is None else place
 
 
 def _records_follow(file: BinaryIO, at: int, size: int, tables: _Tables) -> bool:
