@@ -164,7 +164,8 @@ def test_the_node_needs_nothing_that_a_ros_machine_does_not_have():
 
 
 @contextmanager
-def node_here(world: World, **parameters):
+def stalled_node(world: World, **parameters):
+    """The node, and what lets it run."""
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
     node = CalibrationNode(context=world.context, parameter_overrides=overrides)
     executor = SingleThreadedExecutor(context=world.context)
@@ -175,13 +176,20 @@ def node_here(world: World, **parameters):
             executor.spin()
 
     thread = threading.Thread(target=spin, daemon=True)
-    thread.start()
     try:
-        yield node
+        yield node, thread.start
     finally:
         executor.shutdown()
-        thread.join()
+        if thread.ident is not None:
+            thread.join()
         node.destroy_node()
+
+
+@contextmanager
+def node_here(world: World, **parameters):
+    with stalled_node(world, **parameters) as (node, run):
+        run()
+        yield node
 
 
 def twist(seconds: float, velocity=(1.5, 0.0, 0.0), frame="dvl_link", variance=0.0):
@@ -292,6 +300,19 @@ def test_services_reset_and_save_answer_in_words(world, tmp_path, monkeypatch):
         tmp_path.rmdir()
         answer = world.call(Trigger, f"{NODE}/save")
         assert not answer.success and "could not be written" in answer.message
+
+
+def test_after_a_stall_no_topic_runs_ahead_of_another(world, bag):
+    """The bag comes while the node stands still, far longer than max_latency of it."""
+    with stalled_node(world) as (node, run):
+        play(world, bag)
+        run()
+        until(lambda: received(node) == 450 and received(node, "imu") == 1800, "all samples")
+        live = node._calibrator.result()
+    offline = replay([bag], Parameters()).result
+    assert live.counts == offline.counts
+    for name in MODELS:
+        np.testing.assert_allclose(live.estimates[name].state, offline.estimates[name].state, rtol=0, atol=1e-12)
 
 
 def test_best_effort_and_reliable_publishers_are_both_heard(world):

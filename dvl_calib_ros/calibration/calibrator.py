@@ -188,14 +188,14 @@ class Calibrator:
 
     # ------------------------------------------------------------------ input
 
-    def feed_dvl(self, sample: DvlSample) -> bool:
-        """Take a DVL sample; whether it is valid and in order."""
+    def feed_dvl(self, sample: DvlSample) -> DvlSample | None:
+        """Take a DVL sample; None unless it is valid and in order, else as it goes on: in time, covariance screened."""
         tally = self._tally["dvl"]
         tally["received"] += 1
         valid, covariance = self._dvl_covariance(sample.covariance)
         if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
             tally["invalid"] += 1
-            return False
+            return None
         sample = DvlSample(sample.stamp_ns - self._offset_ns, sample.velocity, covariance)
         order, admitted = self._dvl_order.admit(sample)
         self._count_order(tally, order)
@@ -209,9 +209,10 @@ class Calibrator:
             else:
                 self._note_interval(interval_ns)
             self._awaiting_imu.append(_Moving(one.stamp_ns, one.velocity, one.covariance, interval_ns))
-        if admitted:
-            self._advance()
-        return bool(admitted)
+        if not admitted:
+            return None
+        self._advance()
+        return sample
 
     def _note_interval(self, interval_ns: int) -> None:
         """Count it if it is a dropout. `longest_dropout_ns` is the longest since the start or the last restart."""

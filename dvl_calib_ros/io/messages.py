@@ -112,7 +112,7 @@ class MessageFeed:
         return next((frame for frame in self._reference_frames.values() if frame is not None), None)
 
     def dvl(self, message: Any, received_ns: int) -> DvlSample | None:
-        """Feed a message of dvl_type; the sample if it is valid and in order."""
+        """Feed a message of dvl_type; the sample as `Calibrator.feed_dvl` gives it back."""
         calibrator, kind = self.calibrator, self.dvl_type
         try:
             frame_id = kind.frame_id(message)
@@ -128,8 +128,7 @@ class MessageFeed:
         except _UNREADABLE as error:
             self.undecodable("dvl", f"{kind.name}, {type(error).__name__}: {error}")
             return None
-        sample = DvlSample(stamp, velocity, covariance)
-        return sample if calibrator.feed_dvl(sample) else None
+        return calibrator.feed_dvl(DvlSample(stamp, velocity, covariance))
 
     def reference(self, message: Any, received_ns: int) -> ReferenceSample | None:
         """Feed a message of gnss_type with the reference velocity; the sample, or None if refused."""

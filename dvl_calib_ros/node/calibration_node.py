@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
-from ..calibration.screening import CovarianceScreen
 from ..io.drivers import velocity_type
 from ..io.errors import InputError
 from ..io.messages import MessageFeed
@@ -41,6 +41,7 @@ from ..io.result_file import (
 )
 from .diagnostics import RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems
+from .inbox import Arrived, in_order_of_arrival, take
 from .message_types import message_class
 from .parameters import declare_parameters
 
@@ -72,9 +73,7 @@ class CalibrationNode(Node):
         self._feed = MessageFeed(self._calibrator, self._warn)
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
-        self._offset_ns = round(parameters.dvl_time_offset * 1e9)
         self._lever_arm = parameters.lever_arm if any(parameters.lever_arm) else None
-        self._dvl_covariance = CovarianceScreen()
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
@@ -94,9 +93,13 @@ class CalibrationNode(Node):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
-        self._subscribe(dvl_class, "dvl/twist", self._on_dvl)
-        self._subscribe(gnss_class, "gnss/twist", self._on_reference)
-        self._subscribe(Imu, "imu/data", self._on_imu)
+        self._feed_from = {
+            "dvl/twist": self._feed_dvl, "gnss/twist": self._feed.reference, "imu/data": self._feed.imu
+        }  # fmt: skip
+        self._takers: dict[str, Callable[[], Arrived | None]] = {}
+        self._subscribe(dvl_class, "dvl/twist")
+        self._subscribe(gnss_class, "gnss/twist")
+        self._subscribe(Imu, "imu/data")
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -122,11 +125,7 @@ class CalibrationNode(Node):
     # ------------------------------------------------------------------ input
 
     def _subscribe(
-        self,
-        message_type: type,
-        topic: str,
-        callback: Callable[[Any], None],
-        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+        self, message_type: type, topic: str, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE
     ) -> None:
         """Subscribe so that both kinds of publisher are heard.
 
@@ -142,36 +141,33 @@ class CalibrationNode(Node):
 
         def resubscribe() -> None:
             old = self._inputs[topic]
-            self._subscribe(message_type, topic, callback, ReliabilityPolicy.BEST_EFFORT)
+            self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
             self.destroy_subscription(old)
 
         profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
         self._inputs[topic] = self.create_subscription(
             message_type,
             topic,
-            callback,
+            partial(self._on_message, topic),
             profile,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
         )
+        self._takers[topic] = partial(take, self._inputs[topic])
+
+    def _on_message(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
+        for each, waiting in in_order_of_arrival(self._takers, topic, Arrived.of(message, info)):
+            self._feed_from[each](waiting, self._received_ns(waiting))
+            self._publish_if_updated()
 
     def _received_ns(self, message: Any) -> int:
         """Time of reception, asked of the clock only for a message that has no stamp of its own."""
         stamp = message.header.stamp
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
-    def _on_dvl(self, message: Any) -> None:
-        sample = self._feed.dvl(message, self._received_ns(message))
+    def _feed_dvl(self, message: Any, received_ns: int) -> None:
+        sample = self._feed.dvl(message, received_ns)
         if sample is not None:
             self._publish_corrected(sample)
-        self._publish_if_updated()
-
-    def _on_reference(self, message: Any) -> None:
-        self._feed.reference(message, self._received_ns(message))
-        self._publish_if_updated()
-
-    def _on_imu(self, message: Imu) -> None:
-        self._feed.imu(message, self._received_ns(message))
-        self._publish_if_updated()
 
     # ------------------------------------------------------------------ output
 
@@ -211,17 +207,14 @@ class CalibrationNode(Node):
             rotation = calibrator.parameters.rotation_dvl_from_body
             self._correction = Correction(MODELS[name], calibrator.state(name), rotation)
             self._corrected_by = name
-        _, noise = self._dvl_covariance(sample.covariance)
-        velocity, covariance = self._correction.apply(
-            np.array(sample.velocity), self._unaided_noise if noise is None else noise
-        )
-        stamp_ns = sample.stamp_ns - self._offset_ns
+        noise = self._unaided_noise if sample.covariance is None else sample.covariance
+        velocity, covariance = self._correction.apply(np.array(sample.velocity), noise)
         if self._lever_arm is not None:
-            rate = calibrator.latest_angular_velocity(stamp_ns)
+            rate = calibrator.latest_angular_velocity(sample.stamp_ns)
             if rate is not None:
                 velocity = velocity - np.cross(rate, self._lever_arm)
         message = self._corrected
-        _set_stamp(message.header.stamp, stamp_ns)
+        _set_stamp(message.header.stamp, sample.stamp_ns)
         linear = message.twist.twist.linear
         linear.x, linear.y, linear.z = velocity.tolist()
         message.twist.covariance.reshape(6, 6)[:3, :3] = covariance

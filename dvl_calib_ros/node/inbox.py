@@ -1,0 +1,59 @@
+"""Messages of several subscriptions in the order in which they arrived.
+
+An executor takes one message of each topic in turn. After a stall a DVL at 5 Hz would so run ahead of an IMU at 100 Hz
+by nearly the length of the stall, and go on without it where that is longer than max_latency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from rclpy.exceptions import InvalidHandle
+from rclpy.subscription import Subscription
+
+# Messages that are taken in one go; then services and timers have their turn.
+ROUND = 1000
+
+
+class Arrived(NamedTuple):
+    """A message and when it arrived (ns, system clock)."""
+
+    message: Any
+    at_ns: int
+
+    @classmethod
+    def of(cls, message: Any, info: Mapping[str, int]) -> Arrived:
+        """A message as rclpy gives it. A middleware that does not say when it came says when it was sent."""
+        return cls(message, info["received_timestamp"] or info["source_timestamp"])
+
+
+def take(subscription: Subscription) -> Arrived | None:
+    """The next message that waits in a subscription; None if there is none."""
+    try:
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+    except InvalidHandle:  # destroyed, as by the executor of a node that ends
+        return None
+    return None if taken is None else Arrived.of(*taken)
+
+
+def in_order_of_arrival(
+    takers: Mapping[str, Callable[[], Arrived | None]], topic: str, first: Arrived, at_most: int = ROUND
+) -> Iterator[tuple[str, Any]]:
+    """Topic and message of all that waits, oldest first; those of one topic in the order in which they are taken.
+
+    takers: by topic, what gives its next message. first: a message of a topic that was taken before. at_most: how many
+    more are taken.
+    """
+    heads = {topic: first}
+    left = at_most
+    while True:
+        for name, take_next in takers.items():
+            if left and name not in heads and (arrived := take_next()) is not None:
+                heads[name] = arrived
+                left -= 1
+        if not heads:
+            return
+        oldest = min(heads, key=lambda name: heads[name].at_ns)
+        yield oldest, heads.pop(oldest).message
