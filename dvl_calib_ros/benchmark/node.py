@@ -218,7 +218,10 @@ def _publish(environment: dict[str, str], **options: Any) -> subprocess.Popen[st
 
 
 def _report(publisher: subprocess.Popen[str]) -> dict[str, Any]:
-    return json.loads(publisher.communicate()[0])
+    said = publisher.communicate()[0]
+    if publisher.returncode:
+        raise RuntimeError("the benchmark's publisher failed, see above; does the node run?")
+    return json.loads(said)
 
 
 def _cpu_per_sample(command: list[str], rate: float, seconds: float) -> float:

@@ -41,9 +41,12 @@ class Vehicle:
         self._imu = node.create_publisher(Imu, "imu/data", profile)
 
     def wait_for_subscribers(self) -> None:
-        """Wait until the DVL, and where it has an IMU, all topics are heard."""
+        """Wait until the DVL, and where it has an IMU, all topics are heard. TimeoutError if they are not."""
+        until = time.monotonic() + PATIENCE_S
         for publisher in (self._dvl, self._gnss, self._imu) if self._with_imu else (self._dvl,):
             while publisher.get_subscription_count() < 1:
+                if time.monotonic() > until:
+                    raise TimeoutError(f"nobody subscribes to {publisher.topic_name}")
                 time.sleep(0.01)
 
     def wait_until_received(self) -> None:
