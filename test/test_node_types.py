@@ -25,6 +25,7 @@ from dvl_calib_ros.io.errors import InputError
 from dvl_calib_ros.io.messages import MessageFeed
 from dvl_calib_ros.io.replay import replay
 from dvl_calib_ros.io.yaml_files import load_yaml
+from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
@@ -90,6 +91,7 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
         return SimpleNamespace(topic_name=topic)
 
     monkeypatch.setattr(CalibrationNode, "create_subscription", subscribe)
+    monkeypatch.setattr(calibration_node, "take", lambda _: None)
     maker, samples = Maker(), [sample for sample in run() if isinstance(sample, DvlSample)]
     with node_here(world, dvl_type=dvl_type) as node:
         message_type, callback = subscribed["dvl/twist"]
@@ -98,7 +100,7 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
         messages = [as_plain(maker.velocity(dvl_type, sample)) for sample in samples]
         messages[3].altitude = -1.0
         for message in messages:
-            callback(message)
+            callback(message, {"received_timestamp": 0, "source_timestamp": 0})
         counts = node._calibrator.counts["dvl"]
         assert (received(node), counts["no_bottom"], counts["accepted"]) == (len(samples), 1, len(samples) - 1)
         assert node._feed.turns_dvl
