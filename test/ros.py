@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import subprocess
@@ -20,8 +19,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 
+from dvl_calib_ros.node.domain import free_domain
+
 PATIENCE_S = 20.0
-_domains = itertools.count(os.getpid())
 NODE = "dvl_calibration"
 
 
@@ -54,7 +54,7 @@ class World:
 
     def __init__(self) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        self.domain = next(_domains) % 100 + 1
+        self.domain = free_domain()
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=self.domain)
         self.node = rclpy.create_node("test_client", context=self.context)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from scipy.stats import theilslopes
 
 from ..calibration.frames import Array
 from ..io.yaml_files import load_yaml
+from ..node.domain import free_domain
 from . import Measurement
 
 CPU_TARGET = 2.0
@@ -203,7 +203,7 @@ def _latencies_s(command: list[str], echo: str) -> tuple[float, float]:
 
 
 def _environment() -> dict[str, str]:
-    return os.environ | {"ROS_DOMAIN_ID": str(random.randint(1, 100)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return os.environ | {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
 def _process(command: list[str], environment: dict[str, str]) -> subprocess.Popen[str]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -44,14 +43,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare."""
     from ..calibration.models import MODELS
     from ..io.errors import InputError
+    from ..node.domain import free_domain
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
     common.check_outputs(arguments, "report")
     write_report = report_writer(arguments, "write_replay_report")
     bag = common.share_folder() / "bags" / BAG
-    # its own domain: the demo must neither hear nor disturb a vehicle that is running
-    os.environ["ROS_DOMAIN_ID"] = str(random.randint(1, 100))
+    os.environ["ROS_DOMAIN_ID"] = str(free_domain())
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     try:
         import rclpy

@@ -1,0 +1,20 @@
+"""A ROS domain that nobody on this host is on."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="participants need ROS 2: pip install '.[ros]'")
+
+from ros import World
+
+from dvl_calib_ros.node import domain
+
+
+def test_a_domain_with_a_participant_is_not_free(monkeypatch):
+    world = World()
+    monkeypatch.setattr(domain, "DOMAINS", range(world.domain, world.domain + 1))
+    with pytest.raises(RuntimeError, match="every ROS domain"):
+        domain.free_domain()
+    world.close()
+    assert domain.free_domain() == world.domain
