@@ -321,6 +321,15 @@ def test_publishers_and_subscribers_that_do_not_fit_are_named_with_what_is_wrong
         rclpy.shutdown(context=context)
 
 
+def test_a_second_node_is_named_by_both_until_it_ends(node):
+    words = f"/{NODE}/estimate: 2 publishers (/{NODE}, /{NODE}); stop the second calibration node"
+    with node.world.calibration_node():
+        node.wait_until_it_says(words)
+        both = lambda: all(words in each.status[0].message for each in node.diagnostics[-2:])  # noqa: E731
+        until(both, "two nodes to say it in turn")
+    until(lambda: words not in node.status().message, "/diagnostics without it")
+
+
 def test_a_best_effort_publisher_that_comes_later_is_heard_and_the_reliable_one_loses_nothing(node):
     profile = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     first, second = as_messages(between(0, 20)), as_messages(between(20, 40))

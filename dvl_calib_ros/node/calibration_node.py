@@ -40,7 +40,7 @@ from ..io.result_file import (
     save_text,
 )
 from .diagnostics import RecentCounts, Silence, diagnose
-from .graph import input_problems, output_problems
+from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
 from .message_types import message_class
 from .parameters import declare_parameters
@@ -237,7 +237,7 @@ class CalibrationNode(Node):
             problems += input_problems(self, subscription, type_parameters.get(topic))
         for publisher in (self._estimate_publisher, self._corrected_publisher):
             problems += output_problems(self, publisher)
-        return problems
+        return problems + twin_problems(self, self._estimate_publisher)
 
     # ------------------------------------------------------------------ services, parameters
 

@@ -56,6 +56,18 @@ def output_problems(node: Node, publisher: Any) -> list[str]:
     return problems
 
 
+def twin_problems(node: Node, publisher: Any) -> list[str]:
+    """Whether others publish what the node alone should: their estimates mix, and their files replace each other."""
+    publishers = node.get_publishers_info_by_topic(publisher.topic_name)
+    if len(publishers) < 2:
+        return []
+    names = ", ".join(map(_name, publishers))
+    return [
+        f"{publisher.topic_name}: {len(publishers)} publishers ({names}); stop the second calibration node or the bag "
+        "that plays a recorded one, or give one a namespace and its own result_file"
+    ]
+
+
 def _incompatible(offered: QoSProfile, requested: QoSProfile) -> str | None:
     compatibility, reason = qos_check_compatible(offered, requested)
     return reason.removeprefix("ERROR: ").rstrip(";") if compatibility == QoSCompatibility.ERROR else None
