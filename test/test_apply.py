@@ -222,6 +222,8 @@ def test_another_file_leaves_the_urdf_as_it_is(tmp_path, saved):
         ),
         (("<robot ", "<!DOCTYPE robot><robot "), "document type declaration"),
         (("</robot>", ""), "not valid XML"),
+        (("encoding='UTF-8'", "encoding='klingon'"), "not valid XML: unknown encoding: klingon"),
+        (("encoding='UTF-8'", "encoding='utf-7'"), "not valid XML: multi-byte encodings"),
         (("<robot ", "<sdf "), "no URDF"),
     ],
 )

@@ -21,6 +21,8 @@ from .errors import InputError
 
 N_COLUMNS = 4
 SUFFIXES = ("csv", "npy")
+# How much of a bad row is shown, characters
+SHOWN = 200
 # Words of a header that tell which of the three values a column holds
 AXIS_NAMES = ({"x", "vx", "surge", "roll"}, {"y", "vy", "sway", "pitch"}, {"z", "vz", "heave", "yaw"})
 
@@ -63,7 +65,7 @@ def _read_csv(path: Path, unit: str) -> Array:
         try:
             values.append([float(cell) for cell in row])
         except ValueError:
-            raise InputError(f"{path}: data row {number} is not all numbers: {','.join(row)}") from None
+            raise InputError(f"{path}: data row {number} is not all numbers: {','.join(row)[:SHOWN]}") from None
     return np.array(values, dtype=float).reshape(-1, N_COLUMNS) if values else np.empty((0, N_COLUMNS))
 
 
@@ -81,13 +83,15 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
     for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
         if found and found.group(1).strip() != expected:
-            raise InputError(f"{path}: column {cell!r} is not in {expected}; convert it first")
+            raise InputError(f"{path}: column {cell[:SHOWN]!r} is not in {expected}; convert it first")
     if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp"):
-        raise InputError(f"{path}: the first column is {header[0]!r}, expected time")
+        raise InputError(f"{path}: the first column is {header[0][:SHOWN]!r}, expected time")
     for position, cell in enumerate(header[1:]):
         words = set(re.findall("[a-z]+", re.sub(r"[\[(].*", "", cell.lower())))
         if any(words & names for axis, names in enumerate(AXIS_NAMES) if axis != position):
-            raise InputError(f"{path}: column {cell!r} is at the place of {'xyz'[position]}; sort them: time, x, y, z")
+            raise InputError(
+                f"{path}: column {cell[:SHOWN]!r} is at the place of {'xyz'[position]}; sort them: time, x, y, z"
+            )
 
 
 def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:

@@ -161,7 +161,7 @@ class _Reader:
         parser.CommentHandler = self._comment
         try:
             parser.Parse(self.content, True)
-        except expat.ExpatError as error:
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two of its encoding
             raise InputError(f"{self.path}: no URDF, not valid XML: {error}") from error
         return Urdf(self.path, self.content, tuple(self._found), self._generated)
 

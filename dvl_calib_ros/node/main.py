@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from types import FrameType
 
 from ..calibration.parameters import ParameterError
-from ..io.errors import InputError
+from ..io.errors import InputError, printable
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -29,7 +29,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         rclpy.init(args=None if args is None else ["calibration_node", *args])
     except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
-        print(f"calibration_node: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return 2
     signal.signal(signal.SIGHUP, _stop)  # the operator's terminal is gone: save, like on SIGTERM
     node = None
@@ -37,7 +37,7 @@ def main(args: Sequence[str] | None = None) -> int:
         node = CalibrationNode()
         rclpy.spin(node)
     except (ParameterError, InputError) as error:
-        print(f"calibration_node: {error}", file=sys.stderr)
+        print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

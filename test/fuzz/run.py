@@ -16,8 +16,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 # of all inputs; the slow readers get less
 SHARES = {
-    "message": 0.4, "mcap_records": 0.3, "override": 0.1, "sqlite_pages": 0.06, "parameters": 0.03, "result_file": 0.03,
-    "mcap": 0.03, "definition": 0.02, "metadata": 0.02, "sqlite": 0.01,
+    "message": 0.3, "mcap_records": 0.25, "override": 0.1, "urdf": 0.1, "sqlite_pages": 0.06, "trajectory": 0.05,
+    "parameters": 0.03, "result_file": 0.03, "mcap": 0.03, "definition": 0.02, "metadata": 0.02, "sqlite": 0.01,
 }  # fmt: skip
 LIMITS = (
     "-timeout=20",

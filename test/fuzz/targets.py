@@ -11,12 +11,14 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.io.bags import BagReader
 from dvl_calib_ros.io.definitions import Definition, DefinitionError, typestore
@@ -28,6 +30,8 @@ from dvl_calib_ros.io.result_file import load_initial_calibration
 from dvl_calib_ros.io.salvage import DamagedError
 from dvl_calib_ros.io.salvage_mcap import salvage_mcap_stream
 from dvl_calib_ros.io.salvage_sqlite import salvage_sqlite_stream
+from dvl_calib_ros.io.trajectories import read_columns
+from dvl_calib_ros.io.urdf import read_urdf
 from dvl_calib_ros.io.yaml_files import parse_scalar
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -128,6 +132,31 @@ def run_parameters(data: bytes) -> None:
         assert len(str(error)) < 10_000
 
 
+def run_urdf(data: bytes) -> None:
+    """A mounting that is found is turned, and found again as it was turned."""
+    try:
+        urdf = read_urdf(_file("robot.urdf", data))
+        mounting = urdf.mounting("base_link", "dvl_link")
+        turned = rotation_from_rpy((0.1, -0.2, 0.3))
+        again = read_urdf(_file("robot.urdf", urdf.turned(mounting, turned))).mounting("base_link", "dvl_link")
+    except InputError as error:
+        assert len(str(error)) < 10_000
+        return
+    np.testing.assert_allclose(again.rotation_body_from_dvl, turned, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(again.position, mounting.position)
+
+
+def run_trajectory(data: bytes) -> None:
+    """The first byte says whether it is CSV or NPY."""
+    path = _file(f"fuzzed_dvl.{'csv' if data[:1] < b'a' else 'npy'}", data[1:])
+    try:
+        time, values = read_columns(path, "m/s")
+    except InputError as error:
+        assert len(str(error)) < 10_000
+        return
+    assert values.shape == (len(time), 3) and np.isfinite(values).all() and (np.diff(time) > 0.0).all()
+
+
 def run_override(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     parse_scalar(text)
@@ -225,6 +254,25 @@ def _metadata_seeds() -> Iterator[bytes]:
     yield _ALIASES
 
 
+def _urdf_seeds() -> Iterator[bytes]:
+    body = b'<joint name="j" type="fixed"><parent link="base_link"/><child link="%s"/>%s</joint>'
+    mast = b'<joint name="k" type="fixed"><parent link="base_link"/><child link="mast"/></joint>'
+    origin = b'<origin xyz="1 0 -0.5" rpy="3.1415 0 0"/>'
+    yield b'<?xml version="1.0"?><robot name="r"><link name="base_link"/>' + body % (b"dvl_link", origin) + b"</robot>"
+    yield b"<robot>" + mast + (body % (b"dvl_link", b"")).replace(b"base_link", b"mast") + b"</robot>"
+    yield b'<?xml version="1.0" encoding="latin-1"?><robot><!-- \xe9 -->' + body % (b"dvl_link", origin) + b"</robot>"
+    yield b'<robot xmlns:xacro="x"><xacro:arg name="a"/></robot>'
+
+
+def _trajectory_seeds() -> Iterator[bytes]:
+    yield b"Atime [s],x [m/s],y [m/s],z [m/s]\n0,1,2,3\n1,1.5,2,-3e-2\n"
+    yield b"A0;1;2;3\r\n1;2;3;4\r\n"
+    for kind in ("<f8", ">f4", "<i2"):
+        output = BytesIO()
+        np.save(output, np.array([[0, 1, 2, 3], [1, 1, 2, 3]], dtype=kind))
+        yield b"n" + output.getvalue()
+
+
 def _override_seeds() -> Iterator[bytes]:
     yield from (b"[0.0, 1e-3, -2]", b"M3", b"min_speed:=0.5", b"{a: [1, 2]}", b"1:30:00", b"0x1F", b"!!python/name:os")
 
@@ -243,4 +291,6 @@ TARGETS = {
     "result_file": Target(run_result_file, _result_seeds),
     "parameters": Target(run_parameters, _parameter_seeds),
     "override": Target(run_override, _override_seeds),
+    "urdf": Target(run_urdf, _urdf_seeds),
+    "trajectory": Target(run_trajectory, _trajectory_seeds),
 }
