@@ -21,7 +21,8 @@ from rclpy.parameter import Parameter
 
 from dvl_calib_ros.node.domain import free_domain
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
+RETRY_S = 3.0
 NODE = "dvl_calibration"
 
 
@@ -35,10 +36,10 @@ def until(condition: Callable[[], Any], what: str) -> Any:
 
 
 def answered(future: Any) -> bool:
-    """Whether an answer comes within a sixth of our patience."""
+    """Whether an answer comes before it is time to ask again."""
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
-    return done.wait(PATIENCE_S / 6)
+    return done.wait(RETRY_S)
 
 
 def refused_at_start(*arguments: str) -> str:
@@ -83,7 +84,7 @@ class World:
         if name not in self._clients:
             self._clients[name] = self.node.create_client(service_type, name)
             assert self._clients[name].wait_for_service(PATIENCE_S), f"no service {name}"
-        for _ in range(6):
+        for _ in range(round(PATIENCE_S / RETRY_S)):
             future = self._clients[name].call_async(request or service_type.Request())
             if answered(future):
                 return future.result()

@@ -40,7 +40,7 @@ def published() -> dict[str, Any]:
     topics = {"/diagnostics": DiagnosticArray}
     topics |= {f"/{NODE}/{name}": TwistWithCovarianceStamped for name in ("estimate", "calibrated_twist")}
     try:
-        with world.calibration_node():
+        with world.calibration_node("max_latency:=60.0"):  # 20 s of samples are sent at once
             received = {topic: world.received(kind, topic, 100) for topic, kind in topics.items()}
             dvl, gnss = (
                 world.node.create_publisher(TwistWithCovarianceStamped, f"{name}/twist", 1000)
