@@ -75,8 +75,8 @@ def feed(calibrator: Calibrator, samples) -> Calibrator:
     return calibrator
 
 
-def calibrate(samples, parameters: Parameters | None = None, **options) -> Calibrator:
-    return feed(Calibrator(parameters or Parameters(), **options), samples)
+def calibrate(samples, parameters: Parameters | None = None, block_size: int = 64, **options) -> Calibrator:
+    return feed(Calibrator(parameters or Parameters(), block_size=block_size, **options), samples)
 
 
 def only(samples, *kinds):
