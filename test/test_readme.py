@@ -69,3 +69,13 @@ def test_files_that_the_readme_names_are_there_and_its_pictures_are_small():
     assert len(named) > 5
     roots = (ROOT, ROOT / "dvl_calib_ros")
     assert [name for name in named if not any((root / name).exists() for root in roots)] == []
+
+
+def test_every_test_that_proves_a_promise_is_there():
+    section = (ROOT / "README.md").read_text().partition("## What is promised")[2].partition("\n## ")[0]
+    named = re.findall(r"`(test_\w+)(\.\.\.)?`", section)
+    there = re.findall(r"^def (test_\w+)", "\n".join(path.read_text() for path in (ROOT / "test").glob("*.py")), re.M)
+    assert len(named) > 30
+    assert [
+        name for name, cut in named if not any(each == name or (cut and each.startswith(name)) for each in there)
+    ] == []

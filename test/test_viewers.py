@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from ros import NODE, World, until
 
-from dvl_calib_ros.node.status import STATUS_NAME
+from dvl_calib_ros.node.status import status_name
 
 FOXGLOVE = ROOT / "config" / "foxglove_layout.json"
 PLOTJUGGLER = ROOT / "config" / "plotjuggler_layout.xml"
@@ -111,7 +111,7 @@ def test_the_diagnostics_panel_of_foxglove_selects_the_nodes_status(published):
     (panel,) = foxglove_panels("DiagnosticStatusPanel").values()
     (status,) = published[panel["topicToRender"]].status
     assert (panel["selectedHardwareId"], panel["selectedName"]) == (status.hardware_id, status.name)
-    assert status.name == STATUS_NAME
+    assert status.name == status_name(NODE)
 
 
 def test_foxglove_shows_every_panel_once():

@@ -241,6 +241,26 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
         assert node.poll() is None
 
 
+def test_of_two_nodes_the_one_is_shown_that_was_named(world):
+    """The other, in a namespace, is heard on the same /diagnostics and has another model."""
+    with world.calibration_node("model:=A1"):
+        port = subprocess.Popen(
+            command("run", "--watch", "-p", "model:=M5", "--ros-args", "-r", "__ns:=/port"), env=environment(world),
+            cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        elsewhere = [
+            subprocess.Popen(
+                command("watch", *named), env=environment(world), cwd=ROOT, stdout=subprocess.PIPE, text=True
+            )
+            for named in ([], ["--node", "/port/dvl_calibration"])
+        ]
+        shown = [each.stdout.readline().partition(" ")[0] for each in (port, *elsewhere)]
+        for each in (*elsewhere, port):
+            each.send_signal(signal.SIGINT)
+            each.communicate(timeout=PATIENCE_S)
+    assert shown == ["M5", "A1", "M5"]
+
+
 def test_a_node_that_cannot_start_says_why_and_watching_ends(world):
     done = subprocess.run(
         command("run", "--watch", "-p", "result_file:=/no/such/folder/r.yaml"),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 NAME = "watch"
 HELP = "watch a node that runs elsewhere, in the terminal"
-EXAMPLE = "dvl-calib watch"
+EXAMPLE = "dvl-calib watch --node /port/dvl_calibration"
 # How long a node may take to save, s.
 PATIENCE_S = 60.0
 # Signals that ask to save and end: Ctrl-C, kill, a terminal that is closed
@@ -30,14 +30,16 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command: none."""
+    """Arguments of the command."""
+    parser.add_argument("--node", metavar="NAME", help="full name of the node, if it was given another")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Watch until Ctrl-C."""
+    from ..io.parameter_files import NODE_NAME
     from .live_view import show
 
-    with _listener() as listener, _asked_to_end() as ending:
+    with _listener(arguments.node or NODE_NAME) as listener, _asked_to_end() as ending:
         show(common.console(), listener.latest, lambda: not ending.is_set())
 
 
@@ -56,7 +58,7 @@ def _asked_to_end() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _listener() -> Listener:
+def _listener(node: str) -> Listener:
     from ..io.errors import InputError
 
     try:
@@ -65,7 +67,7 @@ def _listener() -> Listener:
         from ..node.listener import Listener
     except ImportError as error:
         raise InputError(f"watching needs ROS 2 and rich ({error}); pip install 'dvl_calib_ros[ros]'") from error
-    return Listener()
+    return Listener(node)
 
 
 def run_and_watch(ros_arguments: Sequence[str]) -> int:
@@ -77,7 +79,7 @@ def run_and_watch(ros_arguments: Sequence[str]) -> int:
     from .live_view import show
 
     # until the node has ended: a second Ctrl-C must not cut its saving short
-    with _listener() as listener, _asked_to_end() as ending:
+    with _listener(_node_name(ros_arguments)) as listener, _asked_to_end() as ending:
         command = [sys.executable, "-m", "dvl_calib_ros.node.main", *ros_arguments]
         environment = os.environ | {"PYTHONUNBUFFERED": "1"}
         process = subprocess.Popen(
@@ -93,6 +95,14 @@ def run_and_watch(ros_arguments: Sequence[str]) -> int:
         for text in log.finished()[said:]:
             print(text, file=sys.stderr)
     return code
+
+
+def _node_name(ros_arguments: Sequence[str]) -> str:
+    """Full name of the node that is started with these: __ns and __node remap it."""
+    from ..io.parameter_files import NODE_NAME
+
+    rules = dict(word.split(":=", 1) for word in ros_arguments if ":=" in word)
+    return f"{rules.get('__ns', '')}/{rules.get('__node', NODE_NAME)}"
 
 
 def _ended(process: subprocess.Popen[bytes]) -> int:

@@ -44,6 +44,7 @@ from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
 from .message_types import message_class
 from .parameters import declare_parameters
+from .status import status_name
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
 QUEUE = 5000
@@ -226,6 +227,7 @@ class CalibrationNode(Node):
         if self._save_problem:
             problems.append(self._save_problem)
         status = diagnose(self._calibrator, feed.dvl_type, problems, self._silence, self._recent, time.monotonic())
+        status.name = status_name(self.get_fully_qualified_name())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)

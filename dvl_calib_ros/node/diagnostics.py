@@ -14,7 +14,6 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate
 from ..io.drivers import VelocityType
-from .status import STATUS_NAME
 
 # A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0
@@ -113,7 +112,7 @@ def diagnose(
     recent: RecentCounts,
     now_s: float,
 ) -> DiagnosticStatus:
-    """Status of the running calibration.
+    """Status of the running calibration, still without a name.
 
     dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock.
     """
@@ -125,7 +124,7 @@ def diagnose(
     warnings += dvl_type.advice(grown["dvl"])
     warnings += gate_advice(estimate) + consistency_advice(estimate)
     level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-    status = DiagnosticStatus(level=level, name=STATUS_NAME, hardware_id="dvl")
+    status = DiagnosticStatus(level=level, hardware_id="dvl")
     status.message = "; ".join(faults + warnings) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,

@@ -9,11 +9,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from .status import STATUS_NAME, Status
+from .status import Status, status_name
 
 
 class Listener:
-    """Use as a context: a node of its own, in a context of its own, without signal handlers."""
+    """Use as a context: a node of its own, in a context of its own, without signal handlers.
+
+    node: full name of the calibration node.
+    """
+
+    def __init__(self, node: str) -> None:
+        self._status_name = status_name(node)
 
     def __enter__(self) -> Listener:
         self._context = rclpy.Context()
@@ -39,6 +45,6 @@ class Listener:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == STATUS_NAME:
+            if status.name == self._status_name:
                 values = {item.key: item.value for item in status.values}
                 self._latest = Status(ord(status.level), status.message, values, time.monotonic())

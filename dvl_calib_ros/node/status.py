@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-STATUS_NAME = "dvl_calibration: calibration"
+
+def status_name(node: str) -> str:
+    """Name of a node's status, by the node's full name, as in /second/dvl_calibration."""
+    return f"{node.strip('/')}: calibration"
 
 
 @dataclass(frozen=True)
