@@ -75,18 +75,20 @@ def measure_cpu() -> list[Measurement]:
 def measure_latency() -> list[Measurement]:
     """From a DVL message's publishing to the return of the estimate with its stamp, at 50 Hz with GNSS at 10 Hz.
 
-    The node runs F1, which has an estimate for every DVL message; those with GNSS wait for the next GNSS sample.
+    The node runs F1, which has an estimate for every DVL message; those with GNSS wait for the next GNSS sample. In
+    turns with the peer, and the best of each: a machine that does something else at times must not decide.
     """
-    estimate = [*_NODE, "--ros-args", "-p", "model:=F1"]
-    ours = _latencies_s(estimate, "dvl_calibration/estimate")
-    peer = _latencies_s([sys.executable, "-c", _REPUBLISHER], "republished")
+    ours, peer = [], []
+    for _ in range(ROUNDS):
+        ours.append(_latencies_s([*_NODE, "--ros-args", "-p", "model:=F1"], "dvl_calibration/estimate"))
+        peer.append(_latencies_s([sys.executable, "-c", _REPUBLISHER], "republished"))
     return [
         Measurement(
             f"node, DVL message to estimate and back, 50 Hz: {name}",
             f"{1e3 * mine:.2f} ms", f"{1e3 * theirs:.2f} ms (rclpy subscriber that republishes)",
             f"{mine / theirs:.2f}", f"<= {LATENCY_TARGET:.0f}", mine <= LATENCY_TARGET * theirs,
         )
-        for name, mine, theirs in zip(("p50", "p99"), ours, peer, strict=True)
+        for name, mine, theirs in zip(("p50", "p99"), np.min(ours, axis=0), np.min(peer, axis=0), strict=True)
     ]  # fmt: skip
 
 
