@@ -27,7 +27,7 @@ def taken_in_rounds(queues, at_most):
     takers, got = takers_of(queues), []
     while any(queues.values()):
         topic = next(topic for topic, queue in queues.items() if queue)
-        got.append([message for _, message in in_order_of_arrival(takers, topic, queues[topic].pop(0), at_most)])
+        got.append([message for _, message in in_order_of_arrival(takers, {topic: queues[topic].pop(0)}, at_most)])
     return got
 
 

@@ -142,6 +142,7 @@ class CalibrationNode(Node):
 
         def resubscribe() -> None:
             old = self._inputs[topic]
+            self._deliver({})  # what waits in the old one would be lost
             self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
             self.destroy_subscription(old)
 
@@ -156,8 +157,12 @@ class CalibrationNode(Node):
         self._takers[topic] = partial(take, self._inputs[topic])
 
     def _on_message(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
-        for each, waiting in in_order_of_arrival(self._takers, topic, Arrived.of(message, info)):
-            self._feed_from[each](waiting, self._received_ns(waiting))
+        self._deliver({topic: Arrived.of(message, info)})
+
+    def _deliver(self, taken: Mapping[str, Arrived]) -> None:
+        """Feed messages that were taken, by topic, and all that wait."""
+        for topic, message in in_order_of_arrival(self._takers, taken):
+            self._feed_from[topic](message, self._received_ns(message))
             self._publish_if_updated()
 
     def _received_ns(self, message: Any) -> int:

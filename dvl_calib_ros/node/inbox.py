@@ -39,14 +39,14 @@ def take(subscription: Subscription) -> Arrived | None:
 
 
 def in_order_of_arrival(
-    takers: Mapping[str, Callable[[], Arrived | None]], topic: str, first: Arrived, at_most: int = ROUND
+    takers: Mapping[str, Callable[[], Arrived | None]], taken: Mapping[str, Arrived], at_most: int = ROUND
 ) -> Iterator[tuple[str, Any]]:
     """Topic and message of all that waits, oldest first; those of one topic in the order in which they are taken.
 
-    takers: by topic, what gives its next message. first: a message of a topic that was taken before. at_most: how many
-    more are taken.
+    takers: by topic, what gives its next message. taken: what was taken before of some of them. at_most: how many more
+    are taken.
     """
-    heads = {topic: first}
+    heads = dict(taken)
     left = at_most
     while True:
         for name, take_next in takers.items():
