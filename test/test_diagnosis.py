@@ -199,6 +199,18 @@ def test_the_calibration_is_recovered_from_a_run_without_noise():
     assert problem.calibration.scale[0] == pytest.approx(0.01, abs=1e-4)
 
 
+def test_the_calibration_beside_an_effect_is_as_good_as_its_standard_deviation_says():
+    scores = []
+    for seed in range(6):
+        run = recording("free", seed=seed, misalignment=0.0, effects={"lever_arm": {"x_m": 0.5}})
+        series = diagnose_recordings([run], Parameters(), with_series=True).series
+        assert "lever_arm" in series.traces
+        truth = np.array([0.0, 0.0, 0.0, 0.006, 0.006, 0.006])
+        scores.append((np.concatenate([series.phi, series.scale]) - truth) / series.calibration_std)
+    assert np.abs(scores).max() < 4.0
+    assert 0.5 < np.sqrt(np.mean(np.square(scores))) < 1.5
+
+
 @pytest.fixture
 def seen():
     """A dictionary of all effects through white noise, a residual of noise and a lever arm, and what it is made of."""

@@ -69,6 +69,10 @@ def test_places_noise_and_untestable_effects_have_their_tables(page):
     assert page.row("water_lock") == ["water_lock", "attitude"]
 
 
+def test_the_calibration_beside_the_effects_has_its_uncertainty(page):
+    assert "misalignment x +1.00 ± 0.10°, y −2.00 ± 0.20°, z +3.00 ± 0.30°; scale error x +1.00 ± 0.10 %" in page.text
+
+
 def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page):
     assert "Nothing in it follows motion or time" in page.text
     found = diagnosis()

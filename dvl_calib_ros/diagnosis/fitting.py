@@ -24,13 +24,14 @@ MAX_KEPT_VARIANTS = 100
 class Fit:
     """A hypothesis fitted: which effects, with which values.
 
-    values: by effect and parameter. change: (6,) of φ and δk. residual: (M, 3) m/s that is left. noise: as estimated
-    from it. deviance: -2 log likelihood with that noise. dof: that the effects use up.
+    values: by effect and parameter. change, change_std: (6,) of φ and δk. residual: (M, 3) m/s that is left. noise: as
+    estimated from it. deviance: -2 log likelihood with that noise. dof: that the effects use up.
     """
 
     effects: tuple[Effect, ...]
     values: Mapping[str, Values]
     change: Array
+    change_std: Array
     residual: Array
     noise: Noise
     deviance: float
@@ -40,11 +41,12 @@ class Fit:
 @dataclass(frozen=True)
 class _Step:
     """The least squares problem about some values, solved. steps: (6 + p,) to go from there. at: (6 + p,) with those
-    of the bent traces left where they are; residual (M, 3) and misfit are of that.
+    of the bent traces left where they are; residual (M, 3) and misfit are of that. std: (6,) of the calibration.
     """
 
     steps: Array
     at: Array
+    std: Array
     residual: Array
     misfit: float
     dof: float
@@ -104,7 +106,7 @@ class Fitter:
             if not is_bent(effect):
                 values = {**values, effect.name: variant.moved(part)}
         return Fit(
-            tuple(effects), values, self.problem.prior_change + step.at[:6], step.residual, noise,
+            tuple(effects), values, self.problem.prior_change + step.at[:6], step.std, step.residual, noise,
             noise.deviance(step.residual), step.dof,
         )  # fmt: skip
 
@@ -135,10 +137,12 @@ class Fitter:
         at[straight] = solve(normal[np.ix_(straight, straight)], seen[straight], assume_a="pos")
         centre = np.concatenate([np.zeros(6), *(one.centre for one in found)])
         misfit = float(gram[-1, -1] - 2.0 * at @ seen + at @ normal @ at + centre**2 @ prior)
-        held = np.diag(np.linalg.inv(normal)) * prior  # share that the prior has in each: no degree of freedom
+        variances = np.diag(np.linalg.inv(normal))
+        held = variances * prior  # share that the prior has in each: no degree of freedom
         return _Step(
             steps=at if straight.all() else solve(normal, seen, assume_a="pos"),
             at=at,
+            std=np.sqrt(variances[:6]),
             residual=target - raw @ at,
             misfit=misfit,
             dof=float(np.sum(1.0 - held[6:])),

@@ -23,7 +23,7 @@ class DiagnosisSeries:
     recordings: names. recording_of: (M,) index into them. time: (M,) s since the recording's start. segments: stretches
     without a gap. held_out: residuals before and after the effects, and the noise. regimes: name -> (M,) bool.
     traces: by effect (M, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
-    the calibration beside the effects, DVL frame. rest: what is left after them.
+    the calibration beside the effects, DVL frame; calibration_std: (6,) of both. rest: what is left after them.
     """
 
     recordings: tuple[str, ...]
@@ -35,6 +35,7 @@ class DiagnosisSeries:
     traces: Mapping[str, Array]
     phi: Array
     scale: Array
+    calibration_std: Array
     rest: Unexplained
 
 
@@ -54,6 +55,7 @@ def collect_series(selection: Selection, rest: Unexplained) -> DiagnosisSeries:
         traces={name: _not_absorbed(fitter, fit, trace) for name, trace in traces.items()},
         phi=calibration.phi,
         scale=calibration.scale,
+        calibration_std=fit.change_std,
         rest=rest,
     )
 

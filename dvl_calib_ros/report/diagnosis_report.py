@@ -139,15 +139,21 @@ def _numbers(d: Diagnosis) -> Iterable[dict[str, str]]:
 
 def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
     lengths = [float(np.ptp(series.time[series.recording_of == i])) for i in range(len(series.recordings))]
-    angles = ", ".join(f"{axis} {signed(math.degrees(value))}°" for axis, value in zip("xyz", series.phi, strict=True))
-    scales = ", ".join(f"{axis} {signed(100.0 * value)} %" for axis, value in zip("xyz", series.scale, strict=True))
+    angle_std, scale_std = np.split(series.calibration_std, 2)
+    angles = _with_std(np.degrees(series.phi), np.degrees(angle_std), "°")
+    scales = _with_std(100.0 * series.scale, 100.0 * scale_std, " %")
     held = "whole recordings in turn" if len(series.recordings) > 1 else "a fifth of the run in turn"
     return [
         ("Recordings", ", ".join(f"{n} ({s:.0f} s)" for n, s in zip(series.recordings, lengths, strict=True))),
         ("Samples tested", f"{len(series.time)}, averaged to at most 5 Hz"),
         ("Held out", held),
-        ("Calibration beside", f"misalignment {angles}; scale error {scales}"),
+        ("Calibration beside", f"misalignment {angles}; scale error {scales} (1σ)"),
     ]
+
+
+def _with_std(values: Array, std: Array, unit: str) -> str:
+    triples = zip("xyz", values, std, strict=True)
+    return ", ".join(f"{axis} {signed(value)} ± {sigma:.2f}{unit}" for axis, value, sigma in triples)
 
 
 def _left(d: Diagnosis) -> str:
