@@ -49,7 +49,7 @@ def demo(folder: Path) -> None:
     """The end of the demo."""
     output = dvl_calib("demo", "--speed", 5)  # slow enough for a busy machine
     lines = [line.rstrip() for line in output.splitlines() if not line.startswith("   playing")]
-    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 836)
+    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 916)
 
 
 def watch(folder: Path) -> None:
