@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from conftest import ROOT
 from io_fixtures import estimates, raw, rewrite, run, write_bag
 
 from dvl_calib_ros import __version__
@@ -58,6 +59,26 @@ def in_fresh_process(statement: str, modules: list[str]) -> list[str]:
 
 
 # ------------------------------------------------------------------ usage
+
+
+@pytest.mark.parametrize(
+    ("missing", "arguments"),
+    [
+        ("rosbags", ["replay", "bags/harbour_box"]),
+        ("mcap", ["simulate", "new_bag"]),
+        ("statsmodels", ["diagnose", "bags/harbour_box"]),
+    ],
+)
+def test_a_python_package_that_is_not_there_is_named_in_one_line(missing, arguments):
+    """As on a ROS machine, where colcon installs the package without others."""
+    start = "from dvl_calib_ros.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    script = f"import sys; sys.modules[{missing!r}] = None; {start}"
+    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, cwd=ROOT)
+    said = (
+        f"dvl-calib {arguments[0]}: needs the Python package {missing}, which is not installed; pip install {missing}\n"
+    )
+    assert (done.returncode, done.stderr) == (2, said)
+    assert not (ROOT / "new_bag").exists()
 
 
 @pytest.mark.parametrize("command", [None, *(module.NAME for module in COMMANDS)])

@@ -55,6 +55,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show φ must not end the run
             stream.reconfigure(errors="replace")
+    try:
+        return _run(argv)
+    except ModuleNotFoundError as error:  # where the package was built by colcon, which installs no other
+        name = (error.name or "").partition(".")[0]
+        if name in ("", __name__.partition(".")[0]):
+            raise
+        called = next(module.NAME for module in COMMANDS if module.NAME in argv)
+        return _fail(called, f"needs the Python package {name}, which is not installed; pip install {name}")
+
+
+def _run(argv: Sequence[str]) -> int:
     arguments = build_parser(argv).parse_args(argv)
     from ..calibration.parameters import ParameterError
     from ..io.errors import InputError
