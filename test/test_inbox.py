@@ -6,16 +6,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
-from functools import partial
-
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dvl_calib_ros.node.inbox import Arrived, in_order_of_arrival
 
 
-def takers_of(queues):
-    return {topic: partial(lambda queue: queue.pop(0) if queue else None, queue) for topic, queue in queues.items()}
+def take(queue):
+    return queue.pop(0) if queue else None
 
 
 def arrivals(topic, times):
@@ -24,10 +22,11 @@ def arrivals(topic, times):
 
 def taken_in_rounds(queues, at_most):
     """All messages, as an executor calls: again and again with the first of a topic on which something waits."""
-    takers, got = takers_of(queues), []
+    got = []
     while any(queues.values()):
         topic = next(topic for topic, queue in queues.items() if queue)
-        got.append([message for _, message in in_order_of_arrival(takers, {topic: queues[topic].pop(0)}, at_most)])
+        first = {topic: queues[topic].pop(0)}
+        got.append([message for _, message in in_order_of_arrival(queues, take, first, at_most)])
     return got
 
 

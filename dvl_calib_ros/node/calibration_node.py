@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,6 @@ class CalibrationNode(Node):
         self._feed_from = {
             "dvl/twist": self._feed_dvl, "gnss/twist": self._feed.reference, "imu/data": self._feed.imu
         }  # fmt: skip
-        self._takers: dict[str, Callable[[], Arrived | None]] = {}
         self._subscribe(dvl_class, "dvl/twist")
         self._subscribe(gnss_class, "gnss/twist")
         self._subscribe(Imu, "imu/data")
@@ -154,14 +153,13 @@ class CalibrationNode(Node):
             profile,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
         )
-        self._takers[topic] = partial(take, self._inputs[topic])
 
     def _on_message(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         self._deliver({topic: Arrived.of(message, info)})
 
     def _deliver(self, taken: Mapping[str, Arrived]) -> None:
         """Feed messages that were taken, by topic, and all that wait."""
-        for topic, message in in_order_of_arrival(self._takers, taken):
+        for topic, message in in_order_of_arrival(self._inputs, take, taken):
             self._feed_from[topic](message, self._received_ns(message))
             self._publish_if_updated()
 

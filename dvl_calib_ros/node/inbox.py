@@ -7,13 +7,14 @@ by nearly the length of the stall, and go on without it where that is longer tha
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
 # Messages that are taken in one go; then services and timers have their turn.
 ROUND = 1000
+Input = TypeVar("Input")
 
 
 class Arrived(NamedTuple):
@@ -39,18 +40,21 @@ def take(subscription: Subscription) -> Arrived | None:
 
 
 def in_order_of_arrival(
-    takers: Mapping[str, Callable[[], Arrived | None]], taken: Mapping[str, Arrived], at_most: int = ROUND
+    inputs: Mapping[str, Input],
+    take_from: Callable[[Input], Arrived | None],
+    taken: Mapping[str, Arrived],
+    at_most: int = ROUND,
 ) -> Iterator[tuple[str, Any]]:
     """Topic and message of all that waits, oldest first; those of one topic in the order in which they are taken.
 
-    takers: by topic, what gives its next message. taken: what was taken before of some of them. at_most: how many more
-    are taken.
+    inputs: by topic, what messages are taken from. taken: what was taken before of some of them. at_most: how many
+    more are taken.
     """
     heads = dict(taken)
     left = at_most
     while True:
-        for name, take_next in takers.items():
-            if left and name not in heads and (arrived := take_next()) is not None:
+        for name, each in inputs.items():
+            if left and name not in heads and (arrived := take_from(each)) is not None:
                 heads[name] = arrived
                 left -= 1
         if not heads:
