@@ -9,7 +9,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `cli.main` does, before nump
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 
+# a busy machine takes its time over an example
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -334,7 +334,7 @@ def numbers(rng: st.DataObject, value):
 
 @pytest.mark.parametrize("kind", TYPES)
 @given(rng=st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_no_garbage_in_the_fields_raises_and_every_message_is_counted(kind, rng):
     feed = Feed(kind, dvl_frame="dvl_link" if rng.draw(st.booleans()) else "")
@@ -348,7 +348,7 @@ def test_no_garbage_in_the_fields_raises_and_every_message_is_counted(kind, rng)
 
 @pytest.mark.parametrize("kind", [TWIST, TWIST_STAMPED, ODOMETRY])
 @given(rng=st.data())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_no_garbage_in_a_reference_raises_either(kind, rng):
     feed = Feed(TWIST, gnss_type=kind)

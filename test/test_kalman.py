@@ -58,7 +58,7 @@ def test_least_squares_over_growing_windows_equals_the_filter_after_each(rng, we
         np.testing.assert_allclose(after.p[index], expected.p, atol=1e-12)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_samples=st.integers(1, 80),

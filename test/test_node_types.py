@@ -81,14 +81,14 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
     """Stands in for a package that there is no wheel of: DDS is left out, all else is the node's."""
     package, kind = dvl_type.split("/msg/")
     stub = ModuleType(f"{package}.msg")
-    setattr(stub, kind, type(kind, (), {}))
+    setattr(stub, kind, type(kind, (), {"__module__": f"{package}.msg._{kind.lower()}"}))
     monkeypatch.setitem(sys.modules, package, ModuleType(package))
     monkeypatch.setitem(sys.modules, f"{package}.msg", stub)
     subscribed = {}
 
     def subscribe(node, message_type, topic, callback, *_, **__):
         subscribed[topic] = (message_type, callback)
-        return SimpleNamespace(topic_name=topic)
+        return SimpleNamespace(topic_name=f"/{topic}", msg_type=message_type)
 
     monkeypatch.setattr(CalibrationNode, "create_subscription", subscribe)
     monkeypatch.setattr(calibration_node, "take", lambda _: None)
