@@ -270,6 +270,16 @@ def test_a_node_that_cannot_start_says_why_and_watching_ends(world):
     assert "the folder /no/such/folder does not exist" in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_bad_ros_arguments_are_said_without_a_traceback(world):
+    done = subprocess.run(
+        command("run", "--watch", "--ros-args", "-r", "__ns:=bad//ns"),
+        env=environment(world), cwd=ROOT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2
+    last = done.stderr.splitlines()[-1]  # after rcl's own log
+    assert last.startswith("dvl-calib run: ") and "__ns:=bad//ns" in last and "Traceback" not in done.stderr
+
+
 def test_the_view_needs_no_ros():
     code = "import sys; sys.modules['rclpy'] = None; import dvl_calib_ros.cli.live_view, dvl_calib_ros.node.status"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0

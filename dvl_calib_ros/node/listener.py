@@ -9,13 +9,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from ..io.errors import InputError
 from .status import Status, status_name
 
 
 class Listener:
     """Use as a context: a node of its own, in a context of its own, without signal handlers.
 
-    node: full name of the calibration node.
+    node: full name of the calibration node. Raises InputError for bad --ros-args.
     """
 
     def __init__(self, node: str) -> None:
@@ -23,7 +24,10 @@ class Listener:
 
     def __enter__(self) -> Listener:
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rclpy raises types of its own for bad --ros-args, which it takes from sys.argv
+            raise InputError(" ".join(str(error).split())) from error
         self._node = rclpy.create_node("dvl_calib_watch", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
