@@ -19,7 +19,7 @@ from scipy.stats import theilslopes
 
 from ..calibration.frames import Array
 from ..io.yaml_files import load_yaml
-from ..node.domain import free_domain
+from ..node.domain import private_domain
 from . import Measurement
 
 CPU_TARGET = 2.0
@@ -205,7 +205,7 @@ def _latencies_s(command: list[str], echo: str) -> tuple[float, float]:
 
 
 def _environment() -> dict[str, str]:
-    return os.environ | {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return os.environ | private_domain()
 
 
 def _process(command: list[str], environment: dict[str, str]) -> subprocess.Popen[str]:

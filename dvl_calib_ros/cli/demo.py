@@ -43,15 +43,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare."""
     from ..calibration.models import MODELS
     from ..io.errors import InputError
-    from ..node.domain import free_domain
+    from ..node.domain import private_domain
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
     common.check_outputs(arguments, "report")
     write_report = report_writer(arguments, "write_replay_report")
     bag = common.share_folder() / "bags" / BAG
-    os.environ["ROS_DOMAIN_ID"] = str(free_domain())
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.update(private_domain())
     try:
         import rclpy
     except ImportError as error:

@@ -11,6 +11,11 @@ PORT_BASE, DOMAIN_GAIN, FIRST_PARTICIPANT = 7400, 250, 10
 DOMAINS = range(1, 101)
 
 
+def private_domain() -> dict[str, str]:
+    """Environment variables of processes that are on a free domain and heard on this host only."""
+    return {"ROS_DOMAIN_ID": str(free_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
 def free_domain() -> int:
     """A domain, at random, on which this host has no participant. Raises RuntimeError if there is none."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):

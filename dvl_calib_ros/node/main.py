@@ -29,16 +29,14 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         rclpy.init(args=None if args is None else ["calibration_node", *args])
     except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
-        print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
-        return 2
+        return _refused(error)
     signal.signal(signal.SIGHUP, _stop)  # the operator's terminal is gone: save, like on SIGTERM
     node = None
     try:
         node = CalibrationNode()
         rclpy.spin(node)
     except (ParameterError, InputError) as error:
-        print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
-        return 2
+        return _refused(error)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Exception:
@@ -52,6 +50,11 @@ def main(args: Sequence[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _refused(error: Exception) -> int:
+    print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+    return 2
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
