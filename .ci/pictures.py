@@ -54,11 +54,11 @@ def demo(folder: Path) -> None:
 
 def watch(folder: Path) -> None:
     """The live view 250 s into a run."""
+    from dvl_calib_ros.bags.reader import BagReader
     from dvl_calib_ros.calibration.calibrator import Calibrator
     from dvl_calib_ros.calibration.parameters import Parameters
     from dvl_calib_ros.cli.live_view import rendered
-    from dvl_calib_ros.io.bags import BagReader
-    from dvl_calib_ros.io.messages import MessageFeed
+    from dvl_calib_ros.messages.decode import MessageFeed
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
     from dvl_calib_ros.node.status import Status
 

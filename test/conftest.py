@@ -30,3 +30,12 @@ def snapir() -> Path:
     if not (folder / "T12_dvl.csv").is_file():
         pytest.skip(f"no Snapir data in {folder}; name its folder in DVL_CALIB_SNAPIR")
     return folder
+
+
+@pytest.fixture(scope="session")
+def snapir_ins(snapir: Path) -> Path:
+    """Folder of the sea trials with the vehicle's INS velocity: snapir_ins beside the other."""
+    folder = snapir.parent / "snapir_ins"
+    if not (folder / "T01_gnss.csv").is_file():
+        pytest.skip(f"no Snapir INS data in {folder}")
+    return folder

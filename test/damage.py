@@ -22,8 +22,8 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import Reader
 
-from dvl_calib_ros.io.bags import BagReader
-from dvl_calib_ros.io.errors import InputError
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.errors import InputError
 
 Recorded = tuple[str, int, bytes]
 GIGABYTES = struct.pack("<Q", 8 << 30)

@@ -14,11 +14,11 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.typesys import Stores, get_typestore
 
+from dvl_calib_ros.bags.reader import BagReader, BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.io.bags import BagReader, BagWriter, Compression, Storage
-from dvl_calib_ros.io.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.io.replay import Replayed, replay
+from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 

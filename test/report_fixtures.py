@@ -31,7 +31,7 @@ from dvl_calib_ros.evaluation.results import (
     HeldOut,
     Trace,
 )
-from dvl_calib_ros.io.replay import Replayed, replay
+from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.report.replay_report import write_replay_report
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates

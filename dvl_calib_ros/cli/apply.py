@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
-    from ..io.mounting import CalibratedMounting
+    from ..files.mounting import CalibratedMounting
 
 NAME = "apply"
 HELP = "give a saved calibration to URDF, TF or robot_localization, or take it back"
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Check everything, then write everything; or roll back."""
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     if arguments.urdf is None and (arguments.output is not None or arguments.joint is not None):
         raise InputError("--output and --joint go with --urdf; name that, too")
@@ -46,8 +46,8 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
-    from ..io.mounting import load_calibrated_mounting
-    from ..io.result_file import backup_of, save_bytes
+    from ..files.mounting import load_calibrated_mounting
+    from ..files.result_file import backup_of, save_bytes
 
     calibrated = load_calibrated_mounting(arguments.result)
     common.check_outputs(arguments, "urdf" if arguments.output is None else "output", "launch", "fusion")
@@ -74,8 +74,8 @@ def _targets(arguments: argparse.Namespace) -> list[Path]:
 
 
 def _contents(arguments: argparse.Namespace, calibrated: CalibratedMounting) -> dict[Path, bytes]:
-    from ..io.mounting import calibrated_urdf, fusion_file, launch_file
-    from ..io.urdf import read_urdf
+    from ..files.mounting import calibrated_urdf, fusion_file, launch_file
+    from ..files.urdf import read_urdf
 
     contents: dict[Path, bytes] = {}
     if arguments.urdf is not None:
@@ -97,8 +97,8 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
     import numpy as np
     from rich.markup import escape
 
-    from ..io.mounting import scale_advice
-    from ..io.urdf import numbers
+    from ..files.mounting import scale_advice
+    from ..files.urdf import numbers
 
     errors, out = common.console(stderr=True), common.console()
     for sentence in (*calibrated.objections, *calibrated.doubts):
@@ -117,8 +117,8 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
 
 
 def _roll_back(arguments: argparse.Namespace) -> None:
-    from ..io.errors import InputError
-    from ..io.result_file import backup_of, save_bytes
+    from ..errors import InputError
+    from ..files.result_file import backup_of, save_bytes
 
     targets = _targets(arguments)
     if not targets:

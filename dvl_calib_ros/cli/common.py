@@ -43,7 +43,7 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
 
 def add_storage_options(parser: argparse.ArgumentParser) -> None:
     """--storage and --compression of a bag to write."""
-    from ..io.bags import Compression, Storage
+    from ..bags.reader import Compression, Storage
 
     storages, compressions = [each.value for each in Storage], [each.value for each in Compression]
     parser.add_argument("--storage", choices=storages, default="mcap", help="default: %(default)s")
@@ -54,14 +54,14 @@ def add_storage_options(parser: argparse.ArgumentParser) -> None:
 
 def load(arguments: argparse.Namespace, defaults: Mapping[str, Any] | None = None) -> Parameters:
     """Parameters from --params and -p; defaults: values, other than the schema's own, of what neither sets."""
-    from ..io.parameter_files import load_parameters
+    from ..files.parameter_files import load_parameters
 
     return load_parameters(arguments.params, arguments.overrides, defaults)
 
 
 def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
     """What an option such as ``M3,M7`` or ``all`` names, each once. Raises InputError for what is not in names."""
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     if text == "all":
         return list(names)
@@ -76,8 +76,8 @@ def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
 
 def check_outputs(arguments: argparse.Namespace, *options: str) -> None:
     """Raise InputError if the file that an option names could not be written, before work is done for it."""
-    from ..io.errors import InputError
-    from ..io.result_file import check_writable
+    from ..errors import InputError
+    from ..files.result_file import check_writable
 
     named: dict[Path, str] = {}
     for option in options:
@@ -106,7 +106,7 @@ def print_warnings(notes: Sequence[str]) -> None:
     """What the user should know, on standard error."""
     from rich.markup import escape
 
-    from ..io.errors import printable
+    from ..errors import printable
 
     errors = console(stderr=True)
     for note in notes:
@@ -128,7 +128,7 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def write_json(path: Path, document: Any) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    from ..io.result_file import save_text
+    from ..files.result_file import save_text
 
     save_text(path, json.dumps(_finite(document), indent=1, allow_nan=False) + "\n")
 
@@ -191,7 +191,7 @@ def result_table(result: Result, models: Sequence[str], title: str) -> Table:
 
 def share_folder() -> Path:
     """Where bags/ and config/ are: in the source tree, or installed under share/dvl_calib_ros. Raises InputError."""
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     candidates = [
         Path(__file__).resolve().parents[2],

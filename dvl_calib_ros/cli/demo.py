@@ -22,7 +22,7 @@ from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..calibration.results import Result
-    from ..io.replay import Replayed
+    from ..replay.replay import Replayed
 
 NAME = "demo"
 HELP = "live node, replay and truth side by side on a shipped bag"
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare."""
     from ..calibration.models import MODELS
-    from ..io.errors import InputError
+    from ..errors import InputError
     from ..node.domain import private_domain
 
     if not 0.1 <= arguments.speed <= 1000.0:
@@ -118,8 +118,8 @@ def _truth() -> dict[str, float]:
 
 
 def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
-    from ..io.parameter_files import load_parameters
-    from ..io.replay import replay
+    from ..files.parameter_files import load_parameters
+    from ..replay.replay import replay
 
     return replay([bag], load_parameters(None, [latency]), with_history=with_history)
 
@@ -128,8 +128,8 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     import numpy as np
     from rich.table import Table
 
-    from ..io.result_file import load_initial_calibration
-    from ..io.yaml_files import load_yaml
+    from ..files.result_file import load_initial_calibration
+    from ..files.yaml_files import load_yaml
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     live = load_initial_calibration(saved)

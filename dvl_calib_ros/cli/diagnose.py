@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Diagnose, print, save; or run the trial."""
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     if arguments.trial:
         if arguments.bags:
@@ -57,8 +57,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.compensation import compensated, parameter_file
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.results import diagnosis_document
-    from ..io.replay import Topics
-    from ..io.result_file import save_text
+    from ..files.result_file import save_text
+    from ..replay.replay import Topics
 
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "apply", "report")

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ..evaluation.bags import CrossCheck
-    from ..evaluation.parallel import Workers
     from ..evaluation.results import Coverage, EachStudy, ErrorsInVariables, Evaluation
+    from ..parallel import Workers
 
 NAME = "evaluate"
 HELP = "run the published validation procedure, or check bags against each other"
@@ -52,10 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
     from ..calibration.models import MODELS
+    from ..errors import InputError
     from ..evaluation.evaluate import DEFAULTS, evaluate
-    from ..evaluation.parallel import Workers
     from ..evaluation.protocol import SETS
-    from ..io.errors import InputError
+    from ..parallel import Workers
 
     models = common.chosen("--models", arguments.models, tuple(MODELS))
     sets = common.chosen("--sets", arguments.sets, [each.name for each in SETS])
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _are_bags(paths: list[Path]) -> bool:
     """Whether bags were named, not a folder of trajectories."""
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     if not paths:
         return False
@@ -105,7 +105,7 @@ def _are_bags(paths: list[Path]) -> bool:
 
 def _save(arguments: argparse.Namespace, evaluation: Evaluation) -> None:
     from ..evaluation.documents import evaluation_csv, evaluation_document
-    from ..io.result_file import save_text
+    from ..files.result_file import save_text
 
     if arguments.json is not None:
         common.write_json(arguments.json, evaluation_document(evaluation))
@@ -281,9 +281,9 @@ def _set_columns(table: Table, first: Iterable[str], rest: Iterable[str]) -> Non
 
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
+    from ..errors import InputError
     from ..evaluation.bags import cross_check, cross_check_document
-    from ..io.errors import InputError
-    from ..io.replay import Topics
+    from ..replay.replay import Topics
 
     for option in ("csv", "report"):
         if getattr(arguments, option) is not None:

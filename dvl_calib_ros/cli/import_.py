@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Import one recording, or a folder of them."""
-    from ..io.bags import Compression, Storage
-    from ..io.errors import InputError
-    from ..io.trajectories import ImportOptions, import_folder, import_recording
+    from ..bags.reader import Compression, Storage
+    from ..errors import InputError
+    from ..files.trajectories import ImportOptions, import_folder, import_recording
 
     if not 0.0 <= arguments.start < 2.0**31:
         raise InputError("--start: give seconds since 1970, 0 .. 2147483647")

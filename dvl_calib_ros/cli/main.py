@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from .. import __version__
-from . import apply, benchmark, demo, diagnose, evaluate, import_, parameters, replay, run, salvage, simulate, watch
+from . import apply, demo, diagnose, evaluate, import_, parameters, replay, run, salvage, simulate, watch
 
-COMMANDS = (run, watch, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo, benchmark)
+COMMANDS = (run, watch, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str]) -> int:
     arguments = build_parser(argv).parse_args(argv)
     from ..calibration.parameters import ParameterError
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     try:
         code = int(arguments.run(arguments) or 0)
@@ -96,7 +96,7 @@ def _complete() -> NoReturn:
 
 
 def _fail(command: str, message: str) -> int:
-    from ..io.errors import printable
+    from ..errors import printable
 
     print(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
     return 2

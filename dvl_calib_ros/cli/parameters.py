@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Print."""
     if arguments.joint is not None and arguments.urdf is None:
-        from ..io.errors import InputError
+        from ..errors import InputError
 
         raise InputError("--joint goes with --urdf; name that, too")
     if arguments.effects:
@@ -36,17 +36,17 @@ def run(arguments: argparse.Namespace) -> None:
         print(effect_table(), end="")
         return
     if arguments.drivers:
-        from ..io.drivers import driver_table
+        from ..messages.drivers import driver_table
 
         print(driver_table(), end="")
         return
     if arguments.urdf is not None:
-        from ..io.mounting import urdf_parameters
-        from ..io.urdf import read_urdf
+        from ..files.mounting import urdf_parameters
+        from ..files.urdf import read_urdf
 
         print(urdf_parameters(read_urdf(arguments.urdf), arguments.base_frame, "dvl_link", arguments.joint), end="")
         return
-    from ..io.parameter_files import model_table, parameter_file_text, parameter_table
+    from ..files.parameter_files import model_table, parameter_file_text, parameter_table
 
     make = parameter_file_text if arguments.yaml else model_table if arguments.models else parameter_table
     print(make(), end="")

@@ -11,7 +11,7 @@ from . import common
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
-    from ..io.replay import Replayed
+    from ..replay.replay import Replayed
 
 NAME = "replay"
 HELP = "calibrate with recorded bags"
@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Replay, print, save."""
     from ..calibration.models import MODELS
-    from ..io.replay import Topics, replay, replay_document
-    from ..io.result_file import result_document, result_text, save_text
+    from ..files.result_file import result_document, result_text, save_text
+    from ..replay.replay import Topics, replay, replay_document
 
     models = common.chosen("--models", arguments.models, tuple(MODELS))
     parameters = common.load(arguments)

@@ -19,7 +19,7 @@ def report_writer(arguments: argparse.Namespace, name: str) -> Callable[..., Non
     """
     if arguments.report is None:
         return None
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     try:
         from .. import report

@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, say what was lost."""
-    from ..io.bags import BagReader, BagWriter, Compression, Storage
-    from ..io.errors import InputError, printable
+    from ..bags.reader import BagReader, BagWriter, Compression, Storage
+    from ..errors import InputError, printable
 
     counts: Counter[str] = Counter()
     with BagReader(arguments.bags) as reader:

@@ -87,8 +87,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Simulate and write."""
     import math
 
+    from ..bags.reader import Compression, Storage
     from ..calibration.samples import VelocityFrame
-    from ..io.bags import Compression, Storage
     from ..simulation.injection import injection
     from ..simulation.recorded import Recording
     from ..simulation.scenario import Scenario, write_bag
@@ -151,7 +151,7 @@ MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # no such sensor
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     if len(arguments.scale) not in (1, 3):
         raise InputError("--scale: give one number for all axes, or three")

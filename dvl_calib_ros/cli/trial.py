@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Run what is left of the trial, score it, print the tables and write them to the folder."""
-    from ..io.errors import InputError
-    from ..io.result_file import save_text
+    from ..errors import InputError
+    from ..files.result_file import save_text
     from ..trial.cases import KINDS, plan
     from ..trial.motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS, recordings_folder
     from ..trial.run import Trial
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     if arguments.cases is not None and arguments.cases < 1:
         raise InputError(f"--cases: {arguments.cases} is no number of cases; give 1 or more, or --full")

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Watch until Ctrl-C."""
-    from ..io.parameter_files import NODE_NAME
+    from ..files.parameter_files import NODE_NAME
     from .live_view import show
 
     with _listener(arguments.node or NODE_NAME) as listener, _asked_to_end() as ending:
@@ -59,7 +59,7 @@ def _asked_to_end() -> Iterator[threading.Event]:
 
 
 def _listener(node: str) -> Listener:
-    from ..io.errors import InputError
+    from ..errors import InputError
 
     try:
         import rich  # noqa: F401
@@ -99,7 +99,7 @@ def run_and_watch(ros_arguments: Sequence[str]) -> int:
 
 def _node_name(ros_arguments: Sequence[str]) -> str:
     """Full name of the node that is started with these: __ns and __node remap it."""
-    from ..io.parameter_files import NODE_NAME
+    from ..files.parameter_files import NODE_NAME
 
     rules = dict(word.split(":=", 1) for word in ros_arguments if ":=" in word)
     return f"{rules.get('__ns', '')}/{rules.get('__node', NODE_NAME)}"

@@ -13,8 +13,8 @@ from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
-from ..io.errors import InputError
-from ..io.replay import Topics
+from ..errors import InputError
+from ..replay.replay import Topics
 from .closure import Gap, measure_gap
 from .dictionary import is_time_of_run
 from .fitting import Fit, Fitter

@@ -19,8 +19,8 @@ from ..calibration.observations import Observations
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..effects.base import Needs
-from ..io.errors import InputError
-from ..io.replay import Topics, replay
+from ..errors import InputError
+from ..replay.replay import Topics, replay
 
 # Samples are thinned to the first and averaged to the second to test hypotheses: what the effects do lies below 1 Hz,
 # and five hours must fit. Traces are computed at the third at least, so that delays and lags are exact.

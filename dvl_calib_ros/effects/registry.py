@@ -13,7 +13,7 @@ from functools import cached_property, lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
-from ..io.errors import InputError
+from ..errors import InputError
 from .base import AnyEffect, Effect, NoiseEffect
 from .environment import HeadingError, WaterLock
 from .kinematic import LeverArm, Sideslip, TiltCoupling

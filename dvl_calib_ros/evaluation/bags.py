@@ -15,10 +15,10 @@ from ..calibration.error_model import correction_matrix
 from ..calibration.frames import Array
 from ..calibration.observations import Observations
 from ..calibration.parameters import Parameters
-from ..io.errors import InputError
-from ..io.replay import Topics, replay
+from ..errors import InputError
+from ..parallel import Workers, run_all
+from ..replay.replay import Topics, replay
 from .metrics import Moments, vrmse
-from .parallel import Workers, run_all
 
 
 @dataclass(frozen=True)

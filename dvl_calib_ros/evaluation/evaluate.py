@@ -14,10 +14,10 @@ from ..calibration.frames import Array
 from ..calibration.models import MODELS
 from ..calibration.observations import Observations
 from ..calibration.parameters import SCHEMA, Parameters
+from ..parallel import Workers, run_all
 from . import protocol
 from .holdout import verify_set
 from .metrics import coverage
-from .parallel import Workers, run_all
 from .procedure import (
     NOISE_STUDY_STD,
     Procedure,

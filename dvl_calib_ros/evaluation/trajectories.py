@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd
-from ..io.errors import InputError
-from ..io.trajectories import angular_velocities, read_columns
+from ..errors import InputError
+from ..files.trajectories import angular_velocities, read_columns
 from ..simulation.trajectories import make_motion
 from .protocol import SETS, TRAJECTORIES, WINDOWS_S
 

@@ -27,11 +27,9 @@ from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
-from ..io.drivers import velocity_type
-from ..io.errors import InputError
-from ..io.messages import MessageFeed
-from ..io.parameter_files import NODE_NAME
-from ..io.result_file import (
+from ..errors import InputError
+from ..files.parameter_files import NODE_NAME
+from ..files.result_file import (
     check_in_folder,
     check_writable,
     load_initial_calibration,
@@ -39,6 +37,8 @@ from ..io.result_file import (
     result_text,
     save_text,
 )
+from ..messages.decode import MessageFeed
+from ..messages.drivers import velocity_type
 from .diagnostics import RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take

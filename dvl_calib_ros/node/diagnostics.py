@@ -13,7 +13,7 @@ from ..calibration.advice import consistency_advice, data_advice, gate_advice, m
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate
-from ..io.drivers import VelocityType
+from ..messages.drivers import VelocityType
 
 # A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0

@@ -8,7 +8,7 @@ from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 
-from ..io.drivers import TYPES_OF
+from ..messages.drivers import TYPES_OF
 
 # What ROS 2 calls a node whose topic is discovered before it is
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from types import FrameType
 
 from ..calibration.parameters import ParameterError
-from ..io.errors import InputError, printable
+from ..errors import InputError, printable
 
 
 def main(args: Sequence[str] | None = None) -> int:

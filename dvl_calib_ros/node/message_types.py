@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from ..io.drivers import VELOCITY_TYPES
-from ..io.errors import InputError
+from ..errors import InputError
+from ..messages.drivers import VELOCITY_TYPES
 
 
 def message_class(what: str, name: str) -> Any:

@@ -8,7 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, Paramete
 from rclpy.node import Node
 
 from ..calibration.parameters import SCHEMA, Parameters, ParameterSpec
-from ..io.parameter_files import is_ros_parameter
+from ..files.parameter_files import is_ros_parameter
 
 _TYPES = {
     "string": ParameterType.PARAMETER_STRING,

@@ -21,8 +21,8 @@ from rich.console import Group
 from rich.table import Table
 
 from ..calibration.correction import NOT_ESTIMATED
-from ..io.parameter_files import NODE_NAME
-from .player import BagPlayer
+from ..demo.player import BagPlayer
+from ..files.parameter_files import NODE_NAME
 
 # place in ~/estimate's covariance diagonal, factor to what people read
 SHOWN = {

@@ -16,9 +16,9 @@ from ..calibration.models import MODELS, Model
 from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import HeldOutError, Verification
-from ..io.recorder import ModelHistory, RunHistory
-from ..io.replay import Replayed
-from ..io.result_file import result_document
+from ..files.result_file import result_document
+from ..replay.recorder import ModelHistory, RunHistory
+from ..replay.replay import Replayed
 from . import replay_figures as figures
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture

@@ -12,7 +12,7 @@ import numpy as np
 from ..calibration.frames import Array
 from ..effects.base import ActsOn, AnyEffect, Effect, EffectInput, NoiseEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
-from ..io.errors import InputError
+from ..errors import InputError
 
 FORM = "NAME:PARAMETER=VALUE,PARAMETER=VALUE"
 

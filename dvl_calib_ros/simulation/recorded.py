@@ -10,16 +10,16 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from ..bags.reader import BagReader
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, Array, Quaternion, Vector
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
-from ..io.bags import BagReader
-from ..io.drivers import IMU_TYPE, REFERENCE_TYPES
-from ..io.errors import InputError
-from ..io.messages import MessageFeed
-from ..io.replay import Topics
+from ..errors import InputError
+from ..messages.decode import MessageFeed
+from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES
+from ..replay.replay import Topics
 from .trajectories import Motion
 
 # Across longer gaps nothing is known of the motion

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..bags.reader import BagWriter, Compression, Storage
 from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..effects.base import ActsOn, EffectInput
-from ..io.bags import BagWriter, Compression, Storage
 from .injection import Injection, disturbed, injection_document, traces
 from .recorded import Recording, recorded_motion
 from .sensors import (

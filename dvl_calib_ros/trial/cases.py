@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io.errors import InputError
+from ..errors import InputError
 from .motion import (
     HELD_OUT_KINDS,
     RECORDED,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
+from ..bags.reader import BagWriter
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from ..io.bags import BagWriter
 from .cases import Case, Drawn, draw
 from .motion import Floats, Motion
 from .strength import Scene

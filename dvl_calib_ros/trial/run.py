@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from ..calibration.parameters import Parameters
-from ..evaluation.parallel import outcomes_on_cores
-from ..io.errors import InputError
-from ..io.result_file import save_text
+from ..errors import InputError
+from ..files.result_file import save_text
+from ..parallel import outcomes_on_cores
 from .cases import Case
 from .generator import record
 from .truth import seal

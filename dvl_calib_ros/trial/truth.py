@@ -9,8 +9,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from ..io.errors import InputError
-from ..io.result_file import save_text
+from ..errors import InputError
+from ..files.result_file import save_text
 
 
 class Category(str, Enum):

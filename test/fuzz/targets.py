@@ -17,22 +17,22 @@ from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 
+from dvl_calib_ros.bags.definitions import Definition, DefinitionError, typestore
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.salvage.damage import DamagedError
+from dvl_calib_ros.bags.salvage.mcap_file import salvage_mcap_stream
+from dvl_calib_ros.bags.salvage.sqlite_file import salvage_sqlite_stream
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
-from dvl_calib_ros.io.bags import BagReader
-from dvl_calib_ros.io.definitions import Definition, DefinitionError, typestore
-from dvl_calib_ros.io.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.io.errors import InputError
-from dvl_calib_ros.io.messages import MessageFeed
-from dvl_calib_ros.io.parameter_files import load_parameters
-from dvl_calib_ros.io.result_file import load_initial_calibration
-from dvl_calib_ros.io.salvage import DamagedError
-from dvl_calib_ros.io.salvage_mcap import salvage_mcap_stream
-from dvl_calib_ros.io.salvage_sqlite import salvage_sqlite_stream
-from dvl_calib_ros.io.trajectories import read_columns
-from dvl_calib_ros.io.urdf import read_urdf
-from dvl_calib_ros.io.yaml_files import parse_scalar
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.parameter_files import load_parameters
+from dvl_calib_ros.files.result_file import load_initial_calibration
+from dvl_calib_ros.files.trajectories import read_columns
+from dvl_calib_ros.files.urdf import read_urdf
+from dvl_calib_ros.files.yaml_files import parse_scalar
+from dvl_calib_ros.messages.decode import MessageFeed
+from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))

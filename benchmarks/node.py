@@ -1,0 +1,253 @@
+"""The live node: CPU and latency against a subscriber that only republishes, 1000 Hz for a minute, and the soak."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import theilslopes
+
+from dvl_calib_ros.calibration.frames import Array
+from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.node.domain import private_domain
+
+from . import Measurement
+
+CPU_TARGET = 2.0
+LATENCY_TARGET = 2.0
+# The soak: rates (Hz) of an ordinary vehicle, and how much faster they come.
+SOAK_MINUTES = 10.0
+SOAK_RATES = {"dvl": 5.0, "gnss": 5.0, "imu": 20.0}
+SOAK_SPEED = 10.0
+# First so much of operation comes at once: queues grow to what a stall of the machine may make of them, and then stay.
+SOAK_BURST_S = 200.0
+# Share of a soak after which memory and CPU are to be steady.
+SOAK_WARM_UP = 0.25
+MEMORY_TARGET_MB_PER_H = 1.0
+CPU_GROWTH_TARGET = 1.1
+ROUNDS = 3
+MEGABYTE = 1 << 20
+
+_NODE = [sys.executable, "-m", "dvl_calib_ros.node.main"]
+_CORRECTED = "dvl_calibration/calibrated_twist"
+_REPUBLISHER = """
+import rclpy
+from geometry_msgs.msg import TwistWithCovarianceStamped as Twist
+rclpy.init()
+node = rclpy.create_node("republisher")
+publisher = node.create_publisher(Twist, "republished", 10)
+node.create_subscription(Twist, "dvl/twist", publisher.publish, 1000)
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+    pass
+"""
+
+
+def measure_cpu() -> list[Measurement]:
+    """CPU per DVL sample at 50 Hz with GNSS at 10 Hz, every model in the bank; in turns with the peer."""
+    ours, peer = [], []
+    for _ in range(ROUNDS):
+        ours.append(_cpu_per_sample(_NODE, 50.0, 20.0))
+        peer.append(_cpu_per_sample([sys.executable, "-c", _REPUBLISHER], 50.0, 20.0))
+    ratio = min(ours) / min(peer)
+    return [
+        Measurement(
+            "node, CPU per DVL sample at 50 Hz (GNSS at 10 Hz, all models)",
+            f"{1e6 * min(ours):.0f} µs",
+            f"{1e6 * min(peer):.0f} µs (rclpy subscriber that republishes)",
+            f"{ratio:.2f}",
+            f"<= {CPU_TARGET:.0f}",
+            ratio <= CPU_TARGET,
+        )
+    ]
+
+
+def measure_latency() -> list[Measurement]:
+    """From a DVL message's publishing to the return of the estimate with its stamp, at 50 Hz with GNSS at 10 Hz.
+
+    The node runs F1, which has an estimate for every DVL message; those with GNSS wait for the next GNSS sample. In
+    turns with the peer, and the best of each: a machine that does something else at times must not decide.
+    """
+    ours, peer = [], []
+    for _ in range(ROUNDS):
+        ours.append(_latencies_s([*_NODE, "--ros-args", "-p", "model:=F1"], "dvl_calibration/estimate"))
+        peer.append(_latencies_s([sys.executable, "-c", _REPUBLISHER], "republished"))
+    return [
+        Measurement(
+            f"node, DVL message to estimate and back, 50 Hz: {name}",
+            f"{1e3 * mine:.2f} ms", f"{1e3 * theirs:.2f} ms (rclpy subscriber that republishes)",
+            f"{mine / theirs:.2f}", f"<= {LATENCY_TARGET:.0f}", mine <= LATENCY_TARGET * theirs,
+        )
+        for name, mine, theirs in zip(("p50", "p99"), np.min(ours, axis=0), np.min(peer, axis=0), strict=True)
+    ]  # fmt: skip
+
+
+def measure_rate() -> list[Measurement]:
+    """1000 Hz for 60 s from a reliable publisher: what the node received, and its memory early and late."""
+    with _running_node() as (node, environment):
+        publisher = _publish(environment, dvl_rate=1000.0, gnss_rate=10.0, seconds=60.0, echo=_CORRECTED)
+        time.sleep(15.0)
+        early = _resident(node.process.pid)
+        sent = _report(publisher)["sent"]
+        late = _resident(node.process.pid)
+        received = node.stop()["dvl"]["accepted"]
+    return [
+        Measurement(
+            "node at 1000 Hz for 60 s, reliable publisher: samples",
+            f"{received} used", f"{sent} sent", f"{sent - received} lost", "0 lost", received == sent,
+        ),
+        Measurement(
+            "node at 1000 Hz: memory after 60 s against after 15 s",
+            f"{late / MEGABYTE:.1f} MB", f"{early / MEGABYTE:.1f} MB", f"{(late - early) / MEGABYTE:+.1f} MB",
+            "flat (< 1 MB)", late - early < MEGABYTE,
+        ),
+    ]  # fmt: skip
+
+
+def measure_soak(minutes: float = SOAK_MINUTES) -> list[Measurement]:
+    """So many minutes of operation, at ten times the rates: samples lost, growth of memory and of CPU."""
+    with _running_node(f"max_latency:={SOAK_BURST_S}") as (node, environment):
+        rates = {f"{name}_rate": rate for name, rate in SOAK_RATES.items()}
+        publisher = _publish(
+            environment,
+            **rates,
+            seconds=60.0 * minutes + SOAK_BURST_S,
+            speed=SOAK_SPEED,
+            burst=SOAK_BURST_S,
+            echo=_CORRECTED,
+        )
+        usage = _watch(node.process.pid, publisher)
+        sent = _report(publisher)["sent"]
+        received = node.stop()["dvl"]["accepted"]
+    steady = usage[usage[:, 0] > usage[-1, 0] * SOAK_WARM_UP]
+    hours = steady[:, 0] * SOAK_SPEED / 3600.0
+    growth = float(theilslopes(steady[:, 1] / MEGABYTE, hours).slope)
+    first, second = _cpu_shares(steady)
+    what = f"soak, {minutes:g} min of operation at {SOAK_SPEED:.0f} times the rates (DVL 5, GNSS 5, IMU 20 Hz)"
+    return [
+        Measurement(
+            f"{what}: samples", f"{received} used", f"{sent} sent", f"{sent - received} lost", "0 lost",
+            received == sent,
+        ),
+        Measurement(
+            "soak: memory, trend over an hour of operation", f"{steady[-1, 1] / MEGABYTE:.1f} MB",
+            f"{steady[0, 1] / MEGABYTE:.1f} MB (at a quarter)", f"{growth:+.2f} MB/h",
+            f"< {MEMORY_TARGET_MB_PER_H:g} MB/h", growth < MEMORY_TARGET_MB_PER_H,
+        ),
+        Measurement(
+            "soak: CPU, second half of the rest against the first", f"{100 * second:.1f} %", f"{100 * first:.1f} %",
+            f"{second / first:.2f}", f"<= {CPU_GROWTH_TARGET}", second <= CPU_GROWTH_TARGET * first,
+        ),
+    ]  # fmt: skip
+
+
+def _watch(pid: int, publisher: subprocess.Popen[str]) -> Array:
+    """Time (s), resident memory (bytes) and CPU time (s) of a process, every second while the publisher runs (N, 3)."""
+    started, rows = time.monotonic(), []
+    while publisher.poll() is None:
+        rows.append((time.monotonic() - started, _resident(pid), _cpu_seconds(pid)))
+        time.sleep(1.0)
+    return np.array(rows)
+
+
+def _cpu_shares(usage: Array) -> tuple[float, float]:
+    """Share of a processor used in the first and in the second half."""
+    middle = len(usage) // 2
+    halves = (usage[: middle + 1], usage[middle:])
+    first, second = (float((half[-1, 2] - half[0, 2]) / (half[-1, 0] - half[0, 0])) for half in halves)
+    return first, second
+
+
+class _Node(NamedTuple):
+    process: subprocess.Popen[str]
+    result_file: Path
+
+    def stop(self) -> dict[str, Any]:
+        """Its counts at the end."""
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait(60)
+        return load_yaml(self.result_file, "result file")["counts"]
+
+
+@contextmanager
+def _running_node(*parameters: str) -> Iterator[tuple[_Node, dict[str, str]]]:
+    """The node with (name:=value) parameters, and the environment in which it is heard."""
+    with tempfile.TemporaryDirectory() as folder:
+        saved = Path(folder) / "result.yaml"
+        given = [word for each in (f"result_file:={saved}", *parameters) for word in ("-p", each)]
+        environment = _environment()
+        with _process([*_NODE, "--ros-args", *given], environment) as process:
+            try:
+                yield _Node(process, saved), environment
+            finally:
+                process.kill()
+
+
+def _latencies_s(command: list[str], echo: str) -> tuple[float, float]:
+    """p50 and p99."""
+    environment = _environment()
+    with _process(command, environment) as process:
+        publisher = _publish(environment, dvl_rate=50.0, gnss_rate=10.0, seconds=30.0, echo=echo)
+        report = _report(publisher)
+        process.send_signal(signal.SIGINT)
+        process.wait(30)
+    return report["p50"], report["p99"]
+
+
+def _environment() -> dict[str, str]:
+    return os.environ | private_domain()
+
+
+def _process(command: list[str], environment: dict[str, str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True)
+
+
+def _publish(environment: dict[str, str], **options: Any) -> subprocess.Popen[str]:
+    """The vehicle of `publisher`, with its options."""
+    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in options.items()]
+    command = [sys.executable, "-m", "benchmarks.publisher", *arguments]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def _report(publisher: subprocess.Popen[str]) -> dict[str, Any]:
+    said = publisher.communicate()[0]
+    if publisher.returncode:
+        raise RuntimeError("the benchmark's publisher failed, see above; does the node run?")
+    return json.loads(said)
+
+
+def _cpu_per_sample(command: list[str], rate: float, seconds: float) -> float:
+    """CPU time (s) of a process per message that is published to it, start-up and discovery left out."""
+    environment = _environment()
+    with _process(command, environment) as process:
+        publisher = _publish(environment, dvl_rate=rate, gnss_rate=10.0, seconds=seconds)
+        time.sleep(5.0)  # both are up and matched: the rest is steady
+        before, started = _cpu_seconds(process.pid), time.monotonic()
+        time.sleep(seconds - 7.0)
+        used, elapsed = _cpu_seconds(process.pid) - before, time.monotonic() - started
+        publisher.communicate(timeout=60)
+        process.send_signal(signal.SIGINT)
+        process.wait(30)
+    return used / (elapsed * rate)
+
+
+def _cpu_seconds(pid: int) -> float:
+    """CPU time of all threads of a process, to the nanosecond (Linux)."""
+    tasks = Path(f"/proc/{pid}/task")
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks.iterdir()) * 1e-9
+
+
+def _resident(pid: int) -> int:
+    """Resident memory of a process, bytes (Linux)."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")

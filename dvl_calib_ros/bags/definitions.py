@@ -1,0 +1,93 @@
+"""Message definitions that a recording brings along, made harmless before rosbags turns them into Python code.
+
+rosbags generates a class and its decoder from a definition and runs the code. What a definition decides in that code is
+names, numbers and values of constants; here names must be plain, numbers bounded, and constants are left out.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, NamedTuple
+
+from rosbags.interfaces import MessageDefinitionFormat, Nodetype
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ..messages.drivers import VELOCITY_TYPES
+
+# Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
+LONGEST_DEFINITION = 1 << 18
+LARGEST_ARRAYS = 1 << 16
+_FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
+_TYPE = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
+# rosbags evaluates the constants of IDL: a shift can take all memory, and nested brackets for ever to parse
+_EXPENSIVE_IDL = re.compile(r"<<|\(\s*\(\s*\(")
+_SEPARATOR = "=" * 80 + "\n"
+
+
+class Definition(NamedTuple):
+    """The text of a message definition."""
+
+    format: MessageDefinitionFormat
+    text: str
+
+
+class DefinitionError(Exception):
+    """A definition that cannot be used."""
+
+
+def is_empty(definition: Definition | None) -> bool:
+    """Whether a recording does not say how messages are laid out; those of before ROS 2 Iron do not."""
+    return definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
+
+
+def known_typestores(msgtype: str) -> list[Typestore]:
+    """Types for a message without a definition: Jazzy's, and each version of a driver's message that is known here."""
+    known = VELOCITY_TYPES[msgtype].definitions if msgtype in VELOCITY_TYPES else ()
+    stores = [get_typestore(Stores.ROS2_JAZZY) for _ in known or ("",)]
+    for store, text in zip(stores, known, strict=False):
+        store.register(get_types_from_msg(text, msgtype))
+    return stores
+
+
+def typestore(definition: Definition | None, msgtype: str) -> Typestore:
+    """Types for a message: from its definition, or Jazzy's if that is empty. Raises DefinitionError."""
+    if definition is None or is_empty(definition):
+        return get_typestore(Stores.ROS2_JAZZY)
+    try:
+        store = get_typestore(Stores.EMPTY)
+        store.register(_harmless(_parsed(definition, msgtype)))
+    except DefinitionError:
+        raise
+    except Exception as error:  # the parser raises all sorts of things
+        raise DefinitionError(f"the definition of {msgtype} is damaged ({type(error).__name__})") from error
+    return store
+
+
+def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
+    if len(definition.text) > LONGEST_DEFINITION:
+        raise DefinitionError(f"the definition of {msgtype} has {len(definition.text)} characters")
+    if definition.format is MessageDefinitionFormat.MSG:
+        return dict(get_types_from_msg(definition.text, msgtype))
+    if _EXPENSIVE_IDL.search(definition.text):
+        raise DefinitionError(f"the definition of {msgtype} has constants that are computed")
+    types: dict[str, Any] = {}
+    for part in definition.text.split(_SEPARATOR):
+        idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+        if idl.strip():
+            types.update(get_types_from_idl(idl))
+    return types
+
+
+def _harmless(types: dict[str, Any]) -> dict[str, Any]:
+    """The types without their constants. Raises DefinitionError for what no driver defines."""
+    arrays = 0
+    for name, (_, fields) in types.items():
+        for field, (kind, description) in fields:
+            if not _TYPE.fullmatch(name) or not _FIELD.fullmatch(field):
+                raise DefinitionError(f"{name!r} or its field {field!r} is no name")
+            if kind == Nodetype.ARRAY:  # decoders have a line of code for each element
+                arrays += description[1]
+    if arrays > LARGEST_ARRAYS:
+        raise DefinitionError(f"arrays of {arrays} elements")
+    return {name: ([], fields) for name, (_, fields) in types.items()}

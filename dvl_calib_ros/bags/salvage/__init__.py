@@ -1,0 +1,1 @@
+"""Reading on where a recording is damaged."""

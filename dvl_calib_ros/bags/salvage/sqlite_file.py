@@ -1,0 +1,183 @@
+"""rosbag2 databases read without SQLite, which gives up at the first damaged page: every leaf page stands for itself.
+
+https://www.sqlite.org/fileformat2.html. Tables are known by the shape of their rows, because the pages that say which
+table is where may be gone. Pages have no checksum: what is zeroed or cut is noticed, a changed byte of data is not.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+from .damage import LARGEST_RECORD, DamagedError, Salvaged
+
+SQLITE_MAGIC = b"SQLite format 3\x00"
+DEFAULT_PAGE_SIZE = 4096
+_FILE_HEADER = 100
+_LEAF, _LEAF_HEADER = 0x0D, 8
+_INTEGER_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
+_FORMATS = ("ros2msg", "ros2idl", "unknown")
+
+
+class _Row(NamedTuple):
+    """A row of a table: its number and its columns, where a column that is the number is None."""
+
+    number: int
+    columns: list[Any]
+
+
+def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
+    """All whole messages in the order they were written; then DamagedError, unless none is missing."""
+    with path.open("rb") as file:
+        yield from salvage_sqlite_stream(file, path.stat().st_size)
+
+
+def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
+    """As `salvage_sqlite`, of an open file of so many bytes."""
+    pages = _Pages(file, size)
+    topics: dict[int, tuple[str, str]] = {}
+    definitions: dict[str, tuple[str, str]] = {}
+    leaves: dict[int, int] = {}  # number of the first message -> page
+    for page in range(1, pages.count + 1):
+        for row in pages.rows(page):
+            if _is_message(row.columns):
+                leaves.setdefault(row.number, page)
+                break
+            _take_note(row, topics, definitions)
+    count, last = 0, 0
+    for page in (leaves[number] for number in sorted(leaves)):
+        for row in pages.rows(page):
+            if _is_message(row.columns) and row.columns[1] in topics:
+                _, topic_id, log_ns, data = row.columns
+                name, kind = topics[topic_id]
+                count, last = count + 1, max(last, row.number)
+                yield Salvaged(name, kind, *definitions.get(kind, ("", "")), log_ns, data)
+    if leaves and not topics:
+        raise DamagedError("the page with the names of the topics is damaged")
+    if pages.missing:
+        raise DamagedError(f"the file is {pages.missing} bytes short")
+    if last > count:  # rosbag2 numbers messages from 1
+        raise DamagedError(f"{last - count} messages lie on damaged pages")
+
+
+def _is_message(columns: list[Any]) -> bool:
+    """id, topic, log time, data."""
+    return (
+        len(columns) == 4
+        and columns[0] is None
+        and isinstance(columns[1], int)
+        and isinstance(columns[2], int)
+        and columns[2] >= 0
+        and isinstance(columns[3], bytes)
+    )
+
+
+def _take_note(row: _Row, topics: dict[int, tuple[str, str]], definitions: dict[str, tuple[str, str]]) -> None:
+    """Take note of a topic (id, name, type, cdr, QoS, ...) or a definition (id, type, format, text, ...)."""
+    number, columns = row
+    if len(columns) < 4 or columns[0] is not None or not all(isinstance(text, str) for text in columns[1:]):
+        return
+    if columns[2] in _FORMATS:
+        definitions[columns[1]] = (columns[2], columns[3])
+    elif "/" in columns[2]:
+        topics[number] = (columns[1], columns[2])
+
+
+class _Pages:
+    """The pages of a database file, numbered from 1. missing: bytes that the file is shorter than it says."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        header = file.read(_FILE_HEADER).ljust(_FILE_HEADER, b"\0")
+        (page_size,) = struct.unpack_from(">H", header, 16)
+        page_size = 65536 if page_size == 1 else page_size
+        is_sound = header.startswith(SQLITE_MAGIC) and page_size >= 512 and page_size & (page_size - 1) == 0
+        self._page_size = page_size if is_sound else DEFAULT_PAGE_SIZE
+        self._usable = self._page_size - (header[20] if is_sound and header[20] <= 32 else 0)
+        self._file = file
+        self.count = -(-size // self._page_size)  # the last may be cut
+        (said,) = struct.unpack_from(">I", header, 28)
+        self.missing = max(0, said * self._page_size - size) if is_sound else 0
+
+    def rows(self, number: int) -> Iterator[_Row]:
+        """The whole rows of a page, if it is a leaf of a table."""
+        page = self._read(number)
+        start = _FILE_HEADER if number == 1 else 0
+        if len(page) < start + _LEAF_HEADER or page[start] != _LEAF:
+            return
+        (n_cells,) = struct.unpack_from(">H", page, start + 3)
+        for i in range(min(n_cells, self._page_size // 4)):
+            try:
+                (cell,) = struct.unpack_from(">H", page, start + _LEAF_HEADER + 2 * i)
+                yield self._row(page, cell)
+            except (IndexError, struct.error, ValueError):  # a row that is no row
+                continue
+
+    def _read(self, number: int) -> bytes:
+        self._file.seek((number - 1) * self._page_size)
+        return self._file.read(self._page_size)
+
+    def _row(self, page: bytes, at: int) -> _Row:
+        size, at = _varint(page, at)
+        number, at = _varint(page, at)
+        if size > min(LARGEST_RECORD, self.count * self._page_size):
+            raise ValueError("longer than the file")
+        return _Row(number, _columns(self._payload(page, at, size)))
+
+    def _payload(self, page: bytes, at: int, size: int) -> bytes:
+        """The content of a row; what does not fit in its page is on a chain of overflow pages."""
+        largest, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
+        if size <= largest:
+            local = size
+        else:
+            local = least + (size - least) % (self._usable - 4)
+            local = least if local > largest else local
+        if at + local > min(self._usable, len(page)):
+            raise ValueError("cut off by the end of its page")
+        content = bytearray(page[at : at + local])
+        chain = page[at + local :]
+        while len(content) < size:
+            (following,) = struct.unpack_from(">I", chain)
+            if not 0 < following <= self.count:
+                raise ValueError("its chain of pages is broken")
+            chain = self._read(following)
+            if not any(chain):  # what file systems leave of what was never written
+                raise ValueError("zeroed")
+            content += chain[4 : 4 + min(self._usable - 4, size - len(content))]
+        return bytes(content)
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for i in range(8):
+        byte = data[at + i]
+        value = value << 7 | byte & 0x7F
+        if byte < 0x80:
+            return value, at + i + 1
+    return value << 8 | data[at + 8], at + 9
+
+
+def _columns(payload: bytes) -> list[Any]:
+    """The values of a record; ValueError if they are not exactly what its header says."""
+    header_size, at = _varint(payload, 0)
+    values: list[Any] = []
+    here = header_size
+    while at < header_size:
+        kind, at = _varint(payload, at)
+        if kind >= 12:
+            size = (kind - 12) // 2
+            value: Any = payload[here : here + size]
+            value = value.decode() if kind % 2 else value
+        elif kind in _INTEGER_SIZES:
+            size = _INTEGER_SIZES[kind]
+            value = int.from_bytes(payload[here : here + size], "big", signed=True)
+        elif kind in (0, 8, 9):
+            size, value = 0, {0: None, 8: 0, 9: 1}[kind]
+        else:
+            raise ValueError("no column of a recording")
+        here += size
+        values.append(value)
+    if here != len(payload):
+        raise ValueError("not as long as it says")
+    return values

@@ -1,0 +1,1 @@
+"""Files of results, parameters, mountings and trajectories."""

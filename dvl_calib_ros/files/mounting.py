@@ -1,0 +1,260 @@
+"""What a result file says of the mounting, in the forms that others take it in: URDF, TF, robot_localization."""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import yaml
+
+from .. import __version__
+from ..calibration.error_model import corrected_mounting
+from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.kalman import GaussianState
+from ..calibration.models import MODELS, Model
+from ..calibration.observability import Convergence, observability
+from ..calibration.parameters import FRD, ParameterError, Parameters
+from ..calibration.verification import Word
+from ..errors import InputError
+from .parameter_files import NODE_NAME, changed_parameters
+from .result_file import load_result, static_transform_arguments
+from .urdf import Mounting, Urdf, numbers
+
+# A mounting written by hand with three digits is meant to be the one that the calibration began with, rad.
+SAME_MOUNTING = 2e-3
+# Below this there is nothing to write, rad.
+ALREADY = 1e-7
+FUSION_NODE = "ekf_filter_node"
+
+
+@dataclass(frozen=True)
+class CalibratedMounting:
+    """The selected model's calibration of a result file.
+
+    rotation_body_from_dvl (3, 3): corrected, of the forward-left-up axes that are calibrated. turned: whether the
+    driver's data, in dvl_frame, are forward-right-down, and were turned to those. scale (3,): δk per DVL axis, 0 where
+    not estimated; scale_ahead: of motion ahead. objections: why it should not be applied; doubts: what to know when it
+    is; both in sentences.
+    """
+
+    path: Path
+    model: Model
+    parameters: Parameters
+    base_frame: str
+    dvl_frame: str
+    rotation_body_from_dvl: Array
+    scale: Array
+    objections: tuple[str, ...]
+    doubts: tuple[str, ...]
+    turned: bool = False
+
+    @property
+    def rotation_body_from_dvl_frame(self) -> Array:
+        """Corrected mounting (3, 3) of dvl_frame itself, for those who use the driver's data as they come."""
+        return self.rotation_body_from_dvl @ FLU_FROM_FRD if self.turned else self.rotation_body_from_dvl
+
+    @property
+    def rpy(self) -> Array:
+        """Corrected mounting (3,) rad of dvl_frame, as in a URDF origin."""
+        return rpy_from_rotation(self.rotation_body_from_dvl_frame)
+
+    @property
+    def scale_ahead(self) -> float:
+        """Scale-factor error of motion ahead: what the DVL measures too much of it, as a share."""
+        return float(self.parameters.rotation_dvl_from_body[:, 0] ** 2 @ self.scale)
+
+    @property
+    def static_transform(self) -> str:
+        """Arguments of tf2's static_transform_publisher."""
+        quaternion = quaternion_from_rotation(self.rotation_body_from_dvl_frame)
+        return static_transform_arguments(self.parameters.lever_arm, quaternion, self.base_frame, self.dvl_frame)
+
+
+def load_calibrated_mounting(path: Path) -> CalibratedMounting:
+    """Read a result file. Raises InputError for what is none, is damaged, or was changed by hand."""
+    content, states = load_result(path)
+    try:
+        model = MODELS[content["model"]]
+        state = states[model.name]
+        parameters = Parameters.from_mapping(content["parameters"])
+        saved = rotation_from_rpy(np.array(content["mounting"]["corrected_rpy"], dtype=float).reshape(3))
+        frames = (str(content["mounting"]["frame_id"]), str(content["mounting"]["child_frame_id"]))
+        turned = content["mounting"].get("dvl_data_axes") == FRD
+        convergence = Convergence(content["models"][model.name]["convergence"])
+        objections, doubts = _judged(content.get("verification"), convergence)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
+    except ParameterError as error:
+        raise InputError(f"{path}: parameters: {error}") from error
+    for frame in frames:
+        if not re.fullmatch(r"[\w./-]+", frame, re.ASCII):  # a launch file would evaluate $(...) in it
+            raise InputError(f"{path}: {frame!r} is no name of a frame; letters, digits and _ . / - make one")
+    errors = model.error_terms_from_state @ state.x
+    rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
+    if not angle_between(rotation, saved) < 1e-6:
+        raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
+    doubts += _unseen(model, state, parameters)
+    return CalibratedMounting(path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned)
+
+
+def _judged(
+    verification: Mapping[str, Any] | None, convergence: Convergence
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Objections and doubts from the verdict and the convergence that a result file states."""
+    objections, doubts = [], []
+    if convergence is Convergence.COLLECTING:
+        objections.append("it has converged in nothing yet (collecting)")
+    elif convergence is Convergence.COARSE:
+        doubts.append(
+            "its convergence is coarse: standard deviations are above fine_std_misalignment or fine_std_scale"
+        )
+    if verification is None:
+        doubts.append("it is not verified on held-out data, as the node cannot; `dvl-calib replay` of a recording does")
+        return tuple(objections), tuple(doubts)
+    verdict, reason = Word(verification["verdict"]), str(verification["reasons"][0])
+    if verdict is Word.REJECT:
+        objections.append(f"its verdict is reject: {reason}")
+    elif verdict is Word.MARGINAL:
+        doubts.append(f"its verdict is marginal: {reason}")
+    return tuple(objections), tuple(doubts)
+
+
+def _unseen(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
+    entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
+    return tuple(
+        f"{each.name} ({each.axis}) was not shown by the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
+        for each in entries
+    )
+
+
+def angle_between(a: Array, b: Array) -> float:
+    """Angle of the rotation that takes one rotation (3, 3) to another, rad; exact for small ones."""
+    between = a.T @ b
+    sine = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
+    return math.atan2(0.5 * float(np.linalg.norm(sine)), 0.5 * (float(np.trace(between)) - 1.0))
+
+
+# ---------------------------------------------------------------------- URDF
+
+
+def calibrated_urdf(urdf: Urdf, mounting: Mounting, calibrated: CalibratedMounting, force: bool = False) -> bytes:
+    """The URDF with the calibrated mounting; its own bytes if it has it already.
+
+    Raises InputError if its mounting is another than the one the calibration began with, unless force is set.
+    """
+    now, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
+    begun_with = calibrated.parameters.rotation_dvl_from_body.T
+    if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
+        corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
+    if angle_between(now, corrected) < ALREADY:
+        return urdf.content
+    if angle_between(now, begun_with) > SAME_MOUNTING and not force:
+        raise InputError(
+            f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(now))} in {calibrated.base_frame} (joint "
+            f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
+            f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
+            "or write the calibrated one all the same with --force"
+        )
+    return urdf.turned(mounting, corrected)
+
+
+def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -> str:
+    """A ROS 2 parameter file that starts a calibration from a URDF's mounting. Raises InputError."""
+    mounting = urdf.mounting(base, dvl, joint)
+    rpy = rpy_from_rotation(mounting.rotation_body_from_dvl)
+    return f"""# Mounting of the DVL from {urdf.path.name!r}, joint {mounting.joint.name!r}.
+/**:
+  ros__parameters:
+    base_frame: {_flow(base)}
+    mounting_rpy: {_flow([float(word) for word in numbers(rpy).split()])}
+    # if the reference velocity is that of {base}'s origin:
+    # lever_arm: {_flow([float(word) for word in numbers(mounting.position).split()])}
+"""
+
+
+def _flow(value: Any) -> str:
+    """A value as YAML on one line; doubles keep a decimal point, without which ROS takes them for integers."""
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
+
+
+# ---------------------------------------------------------------------- TF
+
+
+def launch_file(calibrated: CalibratedMounting) -> str:
+    """A launch file (XML) that publishes the calibrated mounting as a static transform."""
+    arguments = quoteattr(calibrated.static_transform)
+    return f"""<launch>
+  <!-- {_origin(calibrated)}. A transform holds no scale. Not beside a robot_state_publisher with the same joint. -->
+  <node pkg="tf2_ros" exec="static_transform_publisher" name="dvl_mounting" args={arguments}/>
+</launch>
+"""
+
+
+def _origin(calibrated: CalibratedMounting) -> str:
+    name = re.sub(r"[^\w. ]", "_", calibrated.path.name)
+    return f"dvl_calib_ros {__version__}, model {calibrated.model.name} of {name}"
+
+
+def scale_advice(calibrated: CalibratedMounting) -> str:
+    """What a transform leaves out, and what to do about it, in one sentence."""
+    if not calibrated.model.scale_axes:
+        return f"{calibrated.model.name} estimates no scale: a scale error of the DVL stays in"
+    error = calibrated.scale_ahead
+    return (
+        f"a transform holds no scale: {100.0 * error:+.2f} % ahead stays in ({abs(1000.0 * error):.1f} m per km). Use "
+        "~/calibrated_twist, which is corrected in both, or multiply the driver's speed of sound by "
+        f"{1 / (1 + error):.5f} (not with a phased array, which measures ahead without it)"
+    )
+
+
+# ---------------------------------------------------------------------- robot_localization
+
+
+def fusion_file(calibrated: CalibratedMounting) -> str:
+    """Parameters for robot_localization and for our node beside it, as one ROS 2 parameter file."""
+    base, dvl, name = calibrated.base_frame, calibrated.dvl_frame, calibrated.model.name
+    used = [index in (6, 7, 8) for index in range(15)]  # x y z, roll pitch yaw, vx vy vz, their rates, accelerations
+    own = {
+        **{key: value for key, value in changed_parameters(calibrated.parameters).items() if key != "result_file"},
+        "model": name,
+        "initial_calibration": str(calibrated.path.resolve()),
+    }
+    learns = "only while GNSS comes: in a dive it stays as it is" if calibrated.model.aided else "on in the dive"
+    return "\n".join(
+        [
+            *_comment(f"{_origin(calibrated)}: the DVL for robot_localization. Take A or B, never both."),
+            *_comment(
+                f"A. Corrected in misalignment and scale, in {base}, covariance of sensor and calibration together. "
+                "Our node runs in the dive with the parameters below; its mounting_rpy is the one that the calibration "
+                f"began with. {name} learns {learns}. It is the velocity of the point that lever_arm is measured from: "
+                f"let that be the origin of {base}. The 0 of twist0 is any that is free."
+            ),
+            f"{FUSION_NODE}:",
+            "  ros__parameters:",
+            f"    twist0: /{NODE_NAME}/calibrated_twist",
+            f"    twist0_config: {_flow(used)}",
+            "    twist0_queue_size: 10",
+            f"{NODE_NAME}:",
+            "  ros__parameters:",
+            *(f"    {key}: {_flow(value)}" for key, value in own.items()),
+            *_comment(
+                f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, turned by TF (URDF or "
+                "static transform, calibrated), which has the lever arm, too. Our node does not run. Corrected in "
+                "misalignment only: "
+                f"{scale_advice(calibrated)}. The covariance is the driver's, without the calibration's. As above, but:"
+            ),
+            "#   twist0: /dvl/twist",
+            "",
+        ]
+    )
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, 118, initial_indent="# ", subsequent_indent="#   ", break_on_hyphens=False)

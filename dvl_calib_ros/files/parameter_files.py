@@ -1,0 +1,154 @@
+"""ROS 2 parameter files, read without ROS, and written from the schema."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..calibration.models import MODELS
+from ..calibration.parameters import SCHEMA, ParameterError, Parameters
+from ..errors import InputError
+from ..messages.drivers import TYPES_OF, velocity_type
+from .yaml_files import load_yaml, parse_scalar
+
+NODE_NAME = "dvl_calibration"
+# rclpy's own parameters, which a file for the node may hold as well
+ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+
+
+def load_parameters(
+    path: Path | None, overrides: Sequence[str] = (), defaults: Mapping[str, Any] | None = None
+) -> Parameters:
+    """Parameters of a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
+
+    defaults: values, other than the schema's own, of what neither sets.
+    """
+    values = dict(defaults or {}) | ({} if path is None else _node_parameters(path))
+    try:
+        Parameters.from_mapping(values)
+    except ParameterError as error:
+        raise InputError(f"{path}: {error}") from error
+    for override in overrides:
+        name, separator, text = override.partition(":=")
+        if not separator:
+            raise InputError(f"{override!r}: give parameters as name:=value")
+        value = parse_scalar(text)
+        if not is_ros_parameter(name):
+            values[name] = "" if value is None else value
+    try:
+        parameters = Parameters.from_mapping(values)
+    except ParameterError as error:
+        raise InputError(f"-p {error}") from error
+    for name in TYPES_OF:
+        velocity_type(name, getattr(parameters, name))
+    return parameters
+
+
+def _node_parameters(path: Path) -> dict[str, Any]:
+    content = load_yaml(path, "ROS 2 parameter file")
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
+    values: dict[str, Any] = {}
+    sections = [found for key, section in content.items() for found in _sections(str(key), section)]
+    own = [(node, body) for node, body in sections if _is_for_node(node)]
+    for node, body in own:
+        if not isinstance(body, dict):
+            raise InputError(f"{path}: ros__parameters of {node} is not a list of name: value")
+        values.update(_flat(body))
+    if not sections:
+        raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
+    if not own:  # ROS would run with the defaults and say nothing
+        others = ", ".join(node for node, _ in sections)
+        raise InputError(f"{path}: nothing in it is for node {NODE_NAME}, only for {others}; use '/**:' or the name")
+    return {name: value for name, value in values.items() if not is_ros_parameter(name)}
+
+
+def is_ros_parameter(name: str) -> bool:
+    """Whether a parameter is rclpy's own."""
+    return name.split(".")[0] in ROS_PARAMETERS
+
+
+def _sections(prefix: str, section: Any) -> list[tuple[str, Any]]:
+    """(node, parameters) pairs of a file, with namespaces written nested or as a path."""
+    if not isinstance(section, dict):
+        return []
+    found = []
+    for key, value in section.items():
+        if key == "ros__parameters":
+            found.append((prefix, value))
+        else:
+            found += _sections(f"{prefix}/{str(key).strip('/')}", value)
+    return found
+
+
+def _is_for_node(node: str) -> bool:
+    """Whether a section's name (with wildcards * and **) can be this node's, in whatever namespace it runs."""
+    return fnmatch.fnmatchcase(NODE_NAME, node.rsplit("/", 1)[-1])
+
+
+def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for key, value in body.items():
+        name = f"{prefix}{key}"
+        values |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return values
+
+
+def changed_parameters(parameters: Parameters) -> dict[str, Any]:
+    """Name -> value of what is not at its default, as `Parameters.as_dict`."""
+    default = Parameters().as_dict()
+    return {name: value for name, value in parameters.as_dict().items() if value != default[name]}
+
+
+def parameter_file_text() -> str:
+    """`config/calibration.yaml`: every parameter at its default, described."""
+    lines = [
+        "# Every parameter of dvl_calib_ros at its default. An ordinary ROS 2 parameter file:",
+        "#   ros2 run dvl_calib_ros calibration_node --ros-args --params-file calibration.yaml",
+        "#   dvl-calib replay BAG --params calibration.yaml",
+        "/**:",
+        "  ros__parameters:",
+    ]
+    for name, spec in SCHEMA.items():
+        about = "; ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
+        lines.append(f"    # {spec.description}" + (f" [{about}]" if about else ""))
+        value = list(spec.default) if isinstance(spec.default, tuple) else spec.default
+        text = yaml.safe_dump(value, default_flow_style=True).removesuffix("...\n").strip()
+        lines.append(f"    {name}: {text}")
+    return "\n".join(lines) + "\n"
+
+
+def parameter_table() -> str:
+    """The README's table of parameters, in Markdown."""
+    lines = ["| parameter | default | unit, range | at run time | meaning |", "|---|---|---|---|---|"]
+    for name, spec in SCHEMA.items():
+        about = " ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
+        lines.append(
+            f"| `{name}` | {_shown(spec.default)} | {about} | {'' if spec.read_only else 'yes'} | {spec.description} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def model_table() -> str:
+    """The README's table of models, in Markdown."""
+    lines = ["| model | states | assumes | is wrong |", "|---|---|---|---|"]
+    for model in MODELS.values():
+        lines.append(f"| {model.name} | {' '.join(model.state_names)} | {model.assumes} | {model.wrong_when} |")
+    return "\n".join(lines) + "\n"
+
+
+def _shown(default: Any) -> str:
+    if isinstance(default, tuple):
+        return " ".join(f"{value:g}" for value in default)
+    if isinstance(default, bool):
+        return str(default).lower()
+    return f"{default:.6g}" if isinstance(default, float) else default or "''"
+
+
+def _range(name: str) -> str:
+    spec = SCHEMA[name]
+    return "" if spec.low is None or spec.high is None else f"{spec.low:.4g} .. {spec.high:.4g}"

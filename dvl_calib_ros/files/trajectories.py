@@ -1,0 +1,213 @@
+"""Trajectories as CSV or NPY: a time column and three of values.
+
+Columns are told by their order, and where there is a header checked by its units (``Time [s]`` and m/s or rad) and by
+the axes it names.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..bags.reader import BagWriter, Compression, Storage
+from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ..errors import InputError
+
+N_COLUMNS = 4
+SUFFIXES = ("csv", "npy")
+# How much of a bad row is shown, characters
+SHOWN = 200
+# Words of a header that tell which of the three values a column holds
+AXIS_NAMES = ({"x", "vx", "surge", "roll"}, {"y", "vy", "sway", "pitch"}, {"z", "vz", "heave", "yaw"})
+
+
+def read_columns(path: Path, unit: str) -> tuple[Array, Array]:
+    """Time (N,) s and values (N, 3) in `unit` of a CSV or NPY file. Raises InputError naming file and row."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    table = _read_npy(path) if path.suffix == ".npy" else _read_csv(path, unit)
+    if table.ndim != 2 or table.shape[1] != N_COLUMNS or not len(table):
+        raise InputError(f"{path}: expected rows of time and three values, found shape {table.shape}")
+    bad = ~np.isfinite(table).all(axis=1)
+    if bad.any():
+        raise InputError(f"{path}: row {int(np.argmax(bad)) + 1} holds a value that is not a finite number")
+    backwards = np.diff(table[:, 0]) <= 0.0
+    if backwards.any():
+        raise InputError(f"{path}: time does not increase at row {int(np.argmax(backwards)) + 2}")
+    return table[:, 0], table[:, 1:]
+
+
+def _read_npy(path: Path) -> Array:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False), dtype=float)
+    except Exception as error:  # damaged files raise all sorts of things, MemoryError among them
+        raise InputError(f"{path}: not a NumPy array file of numbers ({error})") from error
+
+
+def _read_csv(path: Path, unit: str) -> Array:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error})") from error
+    if rows and not _is_number(rows[0][0]):
+        _check_header(path, rows.pop(0), unit)
+    values = []
+    for number, row in enumerate(rows, start=1):
+        if len(row) != N_COLUMNS:
+            raise InputError(f"{path}: data row {number} has {len(row)} columns, expected time and three values")
+        try:
+            values.append([float(cell) for cell in row])
+        except ValueError:
+            raise InputError(f"{path}: data row {number} is not all numbers: {','.join(row)[:SHOWN]}") from None
+    return np.array(values, dtype=float).reshape(-1, N_COLUMNS) if values else np.empty((0, N_COLUMNS))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _check_header(path: Path, header: list[str], unit: str) -> None:
+    if len(header) != N_COLUMNS:
+        raise InputError(f"{path}: has {len(header)} columns, expected time and three values")
+    units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
+    for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
+        if found and found.group(1).strip() != expected:
+            raise InputError(f"{path}: column {cell[:SHOWN]!r} is not in {expected}; convert it first")
+    if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp"):
+        raise InputError(f"{path}: the first column is {header[0][:SHOWN]!r}, expected time")
+    for position, cell in enumerate(header[1:]):
+        words = set(re.findall("[a-z]+", re.sub(r"[\[(].*", "", cell.lower())))
+        if any(words & names for axis, names in enumerate(AXIS_NAMES) if axis != position):
+            raise InputError(
+                f"{path}: column {cell[:SHOWN]!r} is at the place of {'xyz'[position]}; sort them: time, x, y, z"
+            )
+
+
+def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:
+    """Times (N,) s of a file from a start, as integer nanoseconds. Raises InputError for what no stamp can hold."""
+    stamps = [start_ns + round(float(t) * 1e9) for t in time]
+    if stamps[0] < 0 or stamps[-1] >= 2**31 * 1_000_000_000:
+        raise InputError(f"{path}: from {time[0]:g} to {time[-1]:g} s, after --start, is not in 1970 .. 2038")
+    return stamps
+
+
+def body_from(frame: str) -> Array:
+    """(3, 3) that takes vectors of a trajectory's body frame (flu or frd) to forward-left-up."""
+    return FLU_FROM_FRD if frame == "frd" else np.eye(3)
+
+
+def read_dvl(path: Path, start_ns: int, frame: str, std: float) -> list[DvlSample]:
+    """Velocities in `frame` (flu, frd) as DVL samples in forward-left-up; std (m/s) 0: covariance not given."""
+    time, velocity = read_columns(path, "m/s")
+    covariance = np.eye(3) * std**2 if std else None
+    rows = (velocity @ body_from(frame).T).tolist()
+    return [
+        DvlSample(at, (x, y, z), covariance)
+        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
+    ]
+
+
+def read_reference(path: Path, start_ns: int, frame: str, std: float) -> list[ReferenceSample]:
+    """Reference velocities, in the body (frame flu, frd) or the earth (enu, ned)."""
+    time, velocity = read_columns(path, "m/s")
+    covariance = np.eye(3) * std**2 if std else None
+    earth = {"enu": VelocityFrame.ENU, "ned": VelocityFrame.NED}.get(frame, VelocityFrame.BODY)
+    rows = (velocity @ body_from(frame).T).tolist()
+    return [
+        ReferenceSample(at, (x, y, z), covariance, earth)
+        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
+    ]
+
+
+def read_attitude(path: Path, start_ns: int) -> list[ImuSample]:
+    """Roll, pitch, yaw of a forward-right-down body in north-east-down, with the angular velocity they imply.
+
+    The angular velocity is that of the rotation from each sample to the next (at the last, from the one before).
+    """
+    time, rpy = read_columns(path, "rad")
+    rotations = attitude_enu_flu_from_ned_frd(rpy)
+    rates = angular_velocities(time, rotations)
+    return [
+        ImuSample(at, quaternion_from_rotation(rotation), (x, y, z))
+        for at, rotation, (x, y, z) in zip(stamps_ns(path, time, start_ns), rotations, rates.tolist(), strict=True)
+    ]
+
+
+def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
+    """Angular velocity (N, 3) rad/s in the body frame of a run of attitudes (N, 3, 3) at times (N,) s."""
+    from scipy.spatial.transform import Rotation
+
+    if len(time) < 2:
+        return np.zeros((len(time), 3))
+    steps = Rotation.from_matrix(np.swapaxes(rotation_enu_from_body[:-1], 1, 2) @ rotation_enu_from_body[1:])
+    rates = steps.as_rotvec() / np.diff(time)[:, None]
+    return np.vstack([rates, rates[-1:]])
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """How recordings become bags: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given).
+
+    Raises InputError.
+    """
+
+    frame: str = "frd"
+    gnss_frame: str = "frd"
+    dvl_std: float = 0.0
+    gnss_std: float = 0.0
+    start_ns: int = 1_600_000_000_000_000_000
+    storage: Storage = Storage.MCAP
+    compression: Compression = Compression.NONE
+
+    def __post_init__(self) -> None:
+        for name, std in (("--dvl-std", self.dvl_std), ("--gnss-std", self.gnss_std)):
+            if not 0.0 <= std <= 100.0:
+                raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
+
+
+def import_recording(
+    dvl: Path, gnss: Path | None, attitude: Path | None, output: Path, options: ImportOptions
+) -> dict[str, int]:
+    """Write one recording to a new bag; topic -> number of messages. Raises InputError, and then writes nothing."""
+    if output.exists():
+        raise InputError(f"{output}: exists already; give another name, or remove it first")
+    start_ns = options.start_ns
+    dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std)
+    references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std) if gnss else []
+    attitudes = read_attitude(attitude, start_ns) if attitude else []
+    with BagWriter(output, options.storage, options.compression) as bag:
+        bag.recording(attitudes, references, dvl_samples)
+    return {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
+
+
+def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, dict[str, int]]:
+    """Write every recording of a folder (NAME_dvl.csv or .npy, _gnss, _attitude) to output/NAME. Raises InputError."""
+    names = sorted({path.stem.removesuffix("_dvl") for kind in SUFFIXES for path in folder.glob(f"*_dvl.{kind}")})
+    if not names:
+        raise InputError(f"{folder}: no recordings in it; they are named NAME_dvl.csv or NAME_dvl.npy")
+    written: dict[Path, dict[str, int]] = {}
+    try:
+        for name in names:
+            dvl, gnss, attitude = (_file(folder, f"{name}_{role}") for role in ("dvl", "gnss", "attitude"))
+            assert dvl is not None
+            written[output / name] = import_recording(dvl, gnss, attitude, output / name, options)
+    except BaseException:  # all or nothing, so that the corrected folder can be imported again
+        for bag in written:
+            shutil.rmtree(bag, ignore_errors=True)
+        raise
+    return written
+
+
+def _file(folder: Path, stem: str) -> Path | None:
+    return next((path for kind in SUFFIXES if (path := folder / f"{stem}.{kind}").is_file()), None)

@@ -1,0 +1,229 @@
+"""Mountings in a URDF: read from its fixed joints, and one joint's rotation changed with every other byte kept."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from ..calibration.frames import Array, rotation_from_rpy, rpy_from_rotation
+from ..errors import InputError
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a URDF. rpy: rad about fixed axes; ``parent_from_child`` is its rotation.
+
+    tag: where its start tag is in the file, origin: where its origin's is (first byte, one past the last), None if it
+    has none.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    xyz: tuple[float, ...]
+    rpy: tuple[float, ...]
+    tag: tuple[int, int]
+    origin: tuple[int, int] | None
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Where a URDF has the DVL: the fixed joints from the body to it, the last of which is its own.
+
+    rotation_body_from_dvl (3, 3), rotation_body_from_parent (3, 3): of the joint's parent. position: m, in the body.
+    """
+
+    joint: Joint
+    rotation_body_from_dvl: Array
+    rotation_body_from_parent: Array
+    position: Array
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A URDF file. generated: xacro says in it that it is overwritten with the next run."""
+
+    path: Path
+    content: bytes
+    joints: tuple[Joint, ...]
+    generated: bool
+
+    def mounting(self, base: str, dvl: str, joint: str | None = None) -> Mounting:
+        """Follow fixed joints from the DVL's link up to the body's. Raises InputError.
+
+        base, dvl: frame ids, with or without a namespace before the link's name. joint: the DVL's own, if it is not
+        the one above link `dvl`.
+        """
+        chain = [self._joint(joint) if joint is not None else self._above(dvl)]
+        while not _is_link(chain[0].parent, base):
+            above = self._above(chain[0].parent, f"; joint {chain[-1].name} does not lead to {base}")
+            if above in chain:
+                raise InputError(f"{self.path}: joint {above.name} is above itself")
+            chain.insert(0, above)
+        for each in chain:
+            if each.kind != "fixed":
+                what = f"joint {each.name} between {base} and the DVL is {each.kind}"
+                raise InputError(f"{self.path}: {what}; only fixed joints make a mounting")
+        rotation, position = np.eye(3), np.zeros(3)
+        for each in chain:
+            parent = rotation
+            position = position + rotation @ each.xyz
+            rotation = rotation @ rotation_from_rpy(each.rpy)
+        return Mounting(chain[-1], rotation, parent, position)
+
+    def _joint(self, name: str) -> Joint:
+        found = [each for each in self.joints if each.name == name]
+        if len(found) != 1:
+            many = "more than one" if found else "no"
+            raise InputError(f"{self.path}: {many} joint {name!r}; {self._fixed()}")
+        return found[0]
+
+    def _above(self, link: str, why: str = "") -> Joint:
+        found = [each for each in self.joints if _is_link(each.child, link)]
+        if len(found) != 1:
+            what = f"{'more than one' if found else 'no'} joint above link {link!r}{why}"
+            raise InputError(f"{self.path}: {what}; name the DVL's joint with --joint; {self._fixed()}")
+        return found[0]
+
+    def _fixed(self) -> str:
+        return "its fixed joints: " + (", ".join(each.name for each in self.joints if each.kind == "fixed") or "none")
+
+    def turned(self, mounting: Mounting, rotation_body_from_dvl: Array) -> bytes:
+        """The file with the DVL's own joint turned so that the mounting is this (3, 3); all other bytes as they are."""
+        rpy = rpy_from_rotation(mounting.rotation_body_from_parent.T @ rotation_body_from_dvl)
+        text = numbers(rpy).encode()
+        joint = mounting.joint
+        if joint.origin is None:
+            start = end = joint.tag[1]
+            tag = b'<origin xyz="0 0 0" rpy="' + text + b'"/>'
+        else:
+            start, end = joint.origin
+            tag = _with_rpy(self.content[start:end], text)
+        return self.content[:start] + tag + self.content[end:]
+
+
+def numbers(values: Sequence[float] | Array) -> str:
+    """Numbers as in a URDF attribute: nine digits, no minus zero."""
+    return " ".join(f"{float(value) + 0.0:.9g}" for value in values)
+
+
+def _is_link(link: str, frame: str) -> bool:
+    """Whether a frame id is a link's, with the namespace that robot_state_publisher may put before it."""
+    return link == frame or link == frame.rsplit("/", 1)[-1]
+
+
+_RPY = re.compile(rb"""(?<=\s)rpy\s*=\s*("[^"]*"|'[^']*')""")
+
+
+def _with_rpy(tag: bytes, rpy: bytes) -> bytes:
+    found = _RPY.search(tag)
+    if found is not None:
+        first, last = found.span(1)
+        return tag[: first + 1] + rpy + tag[last - 1 :]
+    end = len(tag) - (2 if tag.endswith(b"/>") else 1)
+    return tag[:end].rstrip() + b' rpy="' + rpy + b'"' + tag[end:]
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Read a URDF's joints. Raises InputError for what is none, or still holds xacro macros."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as URDF ({error.strerror})") from error
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{path}: is UTF-16, which cannot be edited byte for byte; save it as UTF-8")
+    return _Reader(path, content).read()
+
+
+@dataclass
+class _Reader:
+    """Walks through the elements; only joints directly under the robot count."""
+
+    path: Path
+    content: bytes
+    _open: list[str] = field(default_factory=list)
+    _found: list[Joint] = field(default_factory=list)
+    _joint: dict[str, dict[str, str]] = field(default_factory=dict)
+    _spans: dict[str, tuple[int, int]] = field(default_factory=dict)
+    _generated: bool = False
+
+    def read(self) -> Urdf:
+        self._parser = parser = expat.ParserCreate()
+        parser.StartElementHandler = self._start
+        parser.EndElementHandler = self._end
+        parser.StartDoctypeDeclHandler = self._refuse_doctype
+        parser.CommentHandler = self._comment
+        try:
+            parser.Parse(self.content, True)
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two of its encoding
+            raise InputError(f"{self.path}: no URDF, not valid XML: {error}") from error
+        return Urdf(self.path, self.content, tuple(self._found), self._generated)
+
+    def _refuse_doctype(self, *_: object) -> None:
+        raise InputError(f"{self.path}: has a document type declaration, which no URDF needs; take it out")
+
+    def _comment(self, text: str) -> None:
+        self._generated = self._generated or "autogenerated by xacro" in text
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        if name.startswith("xacro:"):
+            raise InputError(
+                f"{self.path}:{self._parser.CurrentLineNumber}: holds xacro macros ({name}); put the rpy that "
+                "'dvl-calib apply RESULT' prints into them by hand, or expand them first: xacro FILE > robot.urdf"
+            )
+        if not self._open and name != "robot":
+            raise InputError(f"{self.path}: no URDF, its root is <{name}> and not <robot>")
+        self._open.append(name)
+        if self._open == ["robot", "joint"]:
+            self._joint, self._spans = {"joint": attributes}, {"joint": self._span()}
+        elif self._open[:2] == ["robot", "joint"] and len(self._open) == 3:
+            self._joint.setdefault(name, attributes)
+            self._spans.setdefault(name, self._span())
+
+    def _end(self, name: str) -> None:
+        if self._open == ["robot", "joint"]:
+            self._found.append(self._finished())
+        self._open.pop()
+
+    def _span(self) -> tuple[int, int]:
+        """Bytes of the start tag that the parser is at."""
+        start = self._parser.CurrentByteIndex
+        found = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""").match(self.content, start)
+        if found is None:
+            raise InputError(f"{self.path}: its encoding cannot be edited byte for byte; save it as UTF-8")
+        return found.span()
+
+    def _finished(self) -> Joint:
+        attributes, origin = self._joint["joint"], self._joint.get("origin", {})
+        name = attributes.get("name", "")
+        where = f"{self.path}: joint {name}"
+        return Joint(
+            name,
+            attributes.get("type", ""),
+            self._joint.get("parent", {}).get("link", ""),
+            self._joint.get("child", {}).get("link", ""),
+            _vector(where, "xyz", origin.get("xyz", "0 0 0")),
+            _vector(where, "rpy", origin.get("rpy", "0 0 0")),
+            self._spans["joint"],
+            self._spans.get("origin"),
+        )
+
+
+def _vector(where: str, name: str, text: str) -> tuple[float, ...]:
+    if "$" in text:
+        raise InputError(
+            f"{where}: origin {name}={text!r} holds a xacro expression; expand it: xacro FILE > robot.urdf"
+        )
+    try:
+        values = tuple(float(word) for word in text.split())
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not np.isfinite(values).all():
+        raise InputError(f"{where}: origin {name}={text!r} is not three numbers")
+    return values

@@ -1,0 +1,1 @@
+"""ROS messages to samples; rclpy's objects and rosbags' alike."""

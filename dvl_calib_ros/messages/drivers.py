@@ -1,0 +1,295 @@
+"""The message types that velocities are read from: what each holds, when it is invalid, and which way its axes point.
+
+A driver is one entry in `VELOCITY_TYPES`; bags, the node, and the README's table go by it. The rules follow the
+definitions and what the drivers do with them: the Water Linked driver (waterlinked_dvl, marine_acoustic_msgs/Dvl) and
+dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.waterlinked.com/dvl/dvl-json-protocol).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.parameters import Parameters
+from ..errors import InputError
+
+TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+IMU_TYPE = "sensor_msgs/msg/Imu"
+BOTTOM_TRACK, WATER_TRACK = 1, 2
+# a velocity in three axes takes as many beams
+ENOUGH_BEAMS = 3
+
+
+class Rule(NamedTuple):
+    """When a message's velocity is not to be believed, however plausible it looks.
+
+    counter: under which such messages are counted. says: what is wrong with them, in words. remedy: what to do.
+    """
+
+    counter: str
+    says: str
+    broken: Callable[[Any, Parameters], bool]
+    remedy: str
+
+    @property
+    def in_words(self) -> str:
+        """What is wrong, for a terminal."""
+        return self.says.replace("`", "")
+
+
+@dataclass(frozen=True)
+class VelocityType:
+    """One message type.
+
+    velocity: message -> something with x, y, z, m/s. covariance: message -> of that velocity, row-major, 9 numbers or
+    36 of a twist, (m/s)²; None where it gives none. frame_id: message -> frame of the velocity. points_down: its axes
+    are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
+    is_reference: whether reference velocities come in this type, too. definitions: for bags that embed none, the
+    versions of it that are about. install: how to get its package, where ROS does not bring it.
+    """
+
+    name: str
+    sent_by: str
+    velocity: Callable[[Any], Any]
+    covariance: Callable[[Any], Any]
+    covariance_says: str
+    frame_id: Callable[[Any], str] = attrgetter("header.frame_id")
+    frame_says: str = "`header.frame_id`"
+    points_down: bool = False
+    rules: tuple[Rule, ...] = ()
+    is_reference: bool = False
+    definitions: tuple[str, ...] = ()
+    install: str = ""
+
+    def broken_rule(self, message: Any, parameters: Parameters) -> Rule | None:
+        """The first rule that a message breaks."""
+        for rule in self.rules:
+            if rule.broken(message, parameters):
+                return rule
+        return None
+
+    def advice(self, counts: Mapping[str, int]) -> list[str]:
+        """What is wrong with the messages that were not used for breaking rules; from `Calibrator.counts` of dvl."""
+        return [
+            f"{counts[rule.counter]} DVL messages are not used: {rule.in_words}; {rule.remedy}"
+            for rule in self.rules
+            if counts.get(rule.counter)
+        ]
+
+
+def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
+    def broken(message: Any, _: Parameters) -> bool:
+        velocity = read(message)
+        return bool(velocity.x == 0.0 and velocity.y == 0.0 and velocity.z == 0.0)
+
+    # no sensor measures exactly nothing on three axes, but drivers send it for want of a measurement
+    return Rule("zero_velocity", "exactly zero on all three axes", broken, "check bottom lock, and the driver")
+
+
+def _flagged(field: str) -> Rule:
+    flag = attrgetter(field)
+    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: not flag(message), _CHECK_LOCK)
+
+
+_CHECK_LOCK = "check that the bottom is in range and nothing is before the beams"
+# the sensor sends altitude -1 without bottom lock; 0 is what a driver leaves that does not fill it
+_NO_BOTTOM = Rule(
+    "no_bottom",
+    "`altitude` is negative or not finite",
+    lambda message, _: not 0.0 <= message.altitude < math.inf,
+    _CHECK_LOCK,
+)
+
+
+def _few_beams_listed(message: Any, _: Parameters) -> bool:
+    beams = message.beams
+    return len(beams) > 0 and sum(1 for beam in beams if beam.valid) < ENOUGH_BEAMS
+
+
+def _marine_covariance(message: Any) -> Any:
+    covariance = message.velocity_covar
+    return None if covariance[0] == -1.0 else covariance
+
+
+def _dvl_msgs_covariance(message: Any) -> Any:
+    """The covariance where this version of the message has one, else fom²: fom is the worst axis' standard deviation.
+
+    (Water Linked: fom is calculated from the covariance. On their examples it is the root of its largest eigenvalue.)
+    """
+    covariance = getattr(message, "covariance", ())
+    if len(covariance):
+        return covariance
+    return None if message.fom == 0.0 else message.fom**2 * np.eye(3)
+
+
+_LINEAR, _TWIST_LINEAR, _VELOCITY = attrgetter("twist.linear"), attrgetter("twist.twist.linear"), attrgetter("velocity")
+
+_MARINE_DVL = """std_msgs/Header header
+uint8 DVL_MODE_BOTTOM=1
+uint8 DVL_MODE_WATER=2
+uint8 DVL_TYPE_PISTON=0
+uint8 DVL_TYPE_PHASED_ARRAY=1
+uint8 velocity_mode
+uint8 dvl_type
+geometry_msgs/Vector3 velocity
+float64[9] velocity_covar
+float64 altitude
+float64 course_gnd
+float64 speed_gnd
+uint8 num_good_beams
+float32 sound_speed
+bool beam_ranges_valid
+bool beam_velocities_valid
+geometry_msgs/Vector3[4] beam_unit_vec
+float64[4] range
+float32[4] range_covar
+float32[4] beam_quality
+float32[4] beam_velocity
+float32[4] beam_velocity_covar
+"""
+_DVL_BEAM = f"""{"=" * 80}
+MSG: dvl_msgs/DVLBeam
+int64 id
+float64 velocity
+float64 distance
+float64 rssi
+float64 nsd
+bool valid
+"""
+
+
+def _dvl_msgs_definition(covariance: str = "", beams: str = "DVLBeam[]", times: str = "") -> str:
+    return (
+        "std_msgs/Header header\nfloat64 time\ngeometry_msgs/Vector3 velocity\nfloat64 fom\n"
+        f"{covariance}float64 altitude\n{beams} beams\nbool velocity_valid\nint64 status\n{times}string form\n"
+        f"{_DVL_BEAM}"
+    )
+
+
+_TIMES = "int64 time_of_validity\nint64 time_of_transmission\n"
+
+VELOCITY_TYPES: Mapping[str, VelocityType] = {
+    each.name: each
+    for each in (
+        VelocityType(
+            name=TWIST_TYPE,
+            sent_by="any driver, the default",
+            velocity=_TWIST_LINEAR,
+            covariance=attrgetter("twist.covariance"),
+            covariance_says="`twist.covariance`; zero: not given, negative: invalid",
+            is_reference=True,
+        ),
+        VelocityType(
+            name="geometry_msgs/msg/TwistStamped",
+            sent_by="simple drivers and simulators",
+            velocity=_LINEAR,
+            covariance=lambda _: None,
+            covariance_says="none",
+            rules=(_zero_velocity(_LINEAR),),
+            is_reference=True,
+        ),
+        VelocityType(
+            name="nav_msgs/msg/Odometry",
+            sent_by="drivers that track a position as well",
+            velocity=_TWIST_LINEAR,
+            covariance=attrgetter("twist.covariance"),
+            covariance_says="`twist.covariance`; zero: not given, negative: invalid",
+            frame_id=attrgetter("child_frame_id"),  # the header's is that of the pose
+            frame_says="`child_frame_id`",
+            rules=(_zero_velocity(_TWIST_LINEAR),),
+            is_reference=True,
+        ),
+        VelocityType(
+            name="marine_acoustic_msgs/msg/Dvl",
+            sent_by="Water Linked's driver, others",
+            velocity=_VELOCITY,
+            covariance=_marine_covariance,
+            covariance_says="`velocity_covar`; -1 or zero: not given",
+            points_down=True,  # the definition: z in the direction the DVL points, x forward
+            rules=(
+                Rule(
+                    "water_track",
+                    "`velocity_mode` is water track",
+                    lambda message, _: message.velocity_mode == WATER_TRACK,
+                    "that is velocity through the water, not over ground; let the DVL track the bottom",
+                ),
+                Rule(
+                    "unknown_mode",
+                    "`velocity_mode` is neither bottom nor water track",
+                    lambda message, _: message.velocity_mode != BOTTOM_TRACK,
+                    "let the driver fill velocity_mode (DVL_MODE_BOTTOM is 1)",
+                ),
+                _flagged("beam_velocities_valid"),  # where Water Linked's drivers put the sensor's velocity_valid
+                Rule(
+                    "few_beams",
+                    f"`num_good_beams` below {ENOUGH_BEAMS}",
+                    lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
+                    _CHECK_LOCK,
+                ),
+                _NO_BOTTOM,
+                _zero_velocity(_VELOCITY),
+            ),
+            definitions=(_MARINE_DVL,),
+            install="sudo apt install ros-$ROS_DISTRO-marine-acoustic-msgs",
+        ),
+        VelocityType(
+            name="dvl_msgs/msg/DVL",
+            sent_by="dvl-a50 (Water Linked A50, A125)",
+            velocity=_VELOCITY,
+            covariance=_dvl_msgs_covariance,
+            covariance_says="`covariance` where the version has it, else `fom`²",
+            points_down=True,  # the sensor's axes (docs.waterlinked.com/dvl/axes), handed on as they are
+            rules=(
+                _flagged("velocity_valid"),
+                Rule(
+                    "few_beams", f"fewer than {ENOUGH_BEAMS} of its `beams` are `valid`", _few_beams_listed, _CHECK_LOCK
+                ),
+                _NO_BOTTOM,
+                Rule(
+                    "poor_fom",
+                    "`fom` (m/s) above `max_fom`, negative or not finite",
+                    lambda message, parameters: not 0.0 <= message.fom <= parameters.max_fom,
+                    _CHECK_LOCK,
+                ),
+                _zero_velocity(_VELOCITY),
+            ),
+            definitions=(
+                _dvl_msgs_definition("float64[9] covariance\n", "DVLBeam[4]", _TIMES),
+                _dvl_msgs_definition("float64[] covariance\n", times=_TIMES),
+                _dvl_msgs_definition(),
+            ),
+            install="build the driver's dvl_msgs in your workspace",
+        ),
+    )
+}
+REFERENCE_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
+# what the parameters of these names may name
+TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": VELOCITY_TYPES, "gnss_type": REFERENCE_TYPES}
+
+
+def velocity_type(parameter: str, name: str) -> VelocityType:
+    """The type that parameter dvl_type or gnss_type names, as package/msg/Name or package/Name. Raises InputError."""
+    types = TYPES_OF[parameter]
+    package, _, rest = name.partition("/")
+    found = types.get(f"{package}/msg/{rest.removeprefix('msg/')}")
+    if found is None:
+        raise InputError(f"{parameter}: {name!r} is none of {', '.join(types)}")
+    return found
+
+
+def driver_table() -> str:
+    """The README's table of message types, in Markdown."""
+    lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
+    for each in VELOCITY_TYPES.values():
+        axes = "forward-right-down" if each.points_down else "forward-left-up"
+        rules = "; ".join(f"`{rule.counter}`: {rule.says}" for rule in each.rules)
+        lines.append(
+            f"| {each.name.replace('/msg/', '/')} | {each.sent_by} | {each.frame_says}, {axes} | "
+            f"{each.covariance_says} | {rules} |"
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,288 @@
+"""The calibration over recorded bags: the same estimator as the node's, fed from files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from ..bags.reader import BagReader
+from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice, message_advice
+from ..calibration.calibrator import Calibrator
+from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
+from ..calibration.observations import Observations
+from ..calibration.parameters import Parameters
+from ..calibration.results import Result
+from ..calibration.samples import VelocityFrame
+from ..calibration.screening import is_valid_velocity, unit_quaternion
+from ..calibration.verification import verification_document
+from ..errors import InputError
+from ..files.result_file import estimate_document, load_initial_calibration
+from ..messages.decode import MessageFeed
+from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
+from .recorder import Recorder, RunHistory
+
+BLOCK_SIZE = 512
+# Samples read between two reports of progress
+PROGRESS_EVERY = 2000
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topic names; the node's by default."""
+
+    dvl: str = "dvl/twist"
+    gnss: str = "gnss/twist"
+    imu: str = "imu/data"
+
+    def found_in(self, present: dict[str, str]) -> Topics:
+        """These topics as the bag spells them: with or without a leading slash."""
+        return Topics(*(_spelled(name, present) for name in (self.dvl, self.gnss, self.imu)))
+
+
+def _spelled(name: str, present: dict[str, str]) -> str:
+    return next((spelling for spelling in (name, f"/{name}", name.lstrip("/")) if spelling in present), name)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id.
+
+    history: the run over time, if it was asked for. reference_frame: of the reference's messages, None without any.
+    dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
+    """
+
+    result: Result
+    notes: tuple[str, ...]
+    dvl_frame: str
+    history: RunHistory | None = None
+    reference_frame: VelocityFrame | None = None
+    dvl_type: str = TWIST_TYPE
+    turned: bool = False
+
+    @property
+    def dvl_data(self) -> str:
+        """Type and axes of the DVL's data, in words."""
+        return self.dvl_type + (", turned from forward-right-down to forward-left-up" if self.turned else "")
+
+
+def replay(
+    paths: Sequence[Path],
+    parameters: Parameters,
+    topics: Topics | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
+    *,
+    with_history: bool = False,
+    on_block: Callable[[Sequence[int], Observations], None] = lambda *_: None,
+) -> Replayed:
+    """Calibrate with the bags at `paths`, read as one in order of log time.
+
+    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way,
+    else on_block is told as by `Calibrator`. Raises InputError if there is no bag or no usable DVL topic.
+    """
+    saved = parameters.initial_calibration
+    initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
+    topics = topics or Topics()
+    prior = reference_prior(paths, parameters, topics) if parameters.prior_source == "reference" else None
+    notes: list[str] = []
+    if parameters.prior_source == "initial_window":
+        notes.append(INITIAL_WINDOW_WARNING)
+    recorder = Recorder() if with_history else None
+    with BagReader(paths) as bag:
+        chosen = topics.found_in(bag.topics)
+        _check_topics(bag, paths, chosen, notes)
+        calibrator = Calibrator(
+            _of_types(bag, chosen, parameters),
+            prior_sway_heave=prior,
+            initial=initial,
+            block_size=BLOCK_SIZE,
+            on_event=notes.append,
+            on_block=recorder.observe if recorder else on_block,
+            verified=True,
+        )
+        feed = MessageFeed(calibrator, notes.append)
+        if recorder:
+            recorder.expect(bag.message_counts[chosen.dvl])
+        _feed_all(bag, chosen, feed, recorder, on_progress)
+        notes = bag.notes + notes
+    result = calibrator.result()
+    notes += _warnings(result, topics, feed)
+    history = recorder.history(calibrator) if recorder else None
+    return Replayed(
+        result,
+        tuple(notes),
+        feed.dvl_frame or "dvl_link",
+        history,
+        feed.reference_frame,
+        feed.dvl_type.name,
+        feed.turns_dvl,
+    )
+
+
+def _of_types(bag: BagReader, topics: Topics, parameters: Parameters) -> Parameters:
+    """The parameters with the message types that the bag has on these (checked) topics."""
+    types = bag.topics
+    return parameters.replace(dvl_type=types[topics.dvl], gnss_type=types.get(topics.gnss, parameters.gnss_type))
+
+
+def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
+    present = bag.topics
+    where = ", ".join(map(str, paths))
+    if not present:
+        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
+    if len({topics.dvl, topics.gnss, topics.imu}) < 3:
+        raise InputError("--dvl-topic, --gnss-topic and --imu-topic must be different topics")
+    if topics.dvl not in present:
+        listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
+        option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
+        raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
+    _check_types(bag, where, topics, notes)
+    if not bag.message_counts[topics.dvl]:
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
+    if topics.gnss not in present:
+        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
+
+
+def _check_types(bag: BagReader, where: str, topics: Topics, notes: list[str]) -> None:
+    for role, wanted in _WANTED.items():
+        name = getattr(topics, role)
+        types = bag.types_of(name)
+        if types - wanted:
+            held, expected = " and ".join(sorted(types)), " or ".join(wanted)
+            raise InputError(f"{where}: topic {name} holds {held}, expected {expected}; set --{role}-topic")
+        if len(types) > 1:
+            raise InputError(
+                f"{where}: topic {name} holds {' and '.join(sorted(types))}; replay bags of one type together"
+            )
+        if bag.lacks_definition(name):
+            notes.append(
+                f"the bag does not say how {types.pop()} is laid out (recorded before ROS 2 Iron?); it is read as "
+                "the definitions known here say. If it cannot be decoded, run ros2 bag convert to MCAP where the "
+                "package is installed"
+            )
+
+
+_WANTED: Mapping[str, Set[str]] = {"dvl": VELOCITY_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
+
+
+def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
+    """Topics that may be the DVL's: of a type that only DVLs have, else with dvl in the name, else of any fitting."""
+    fitting = sorted(name for name, kind in present.items() if kind in VELOCITY_TYPES and name != topics.gnss)
+    only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
+    return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
+
+
+def _feed_all(
+    bag: BagReader, topics: Topics, feed: MessageFeed, recorder: Recorder | None, on_progress: Callable[[float], None]
+) -> None:
+    feed_dvl = feed.dvl if recorder is None else partial(_feed_and_note, feed, recorder)
+    take: dict[str, Callable[[Any, int], Any]] = {
+        topics.imu: feed.imu, topics.gnss: feed.reference, topics.dvl: feed_dvl,
+    }  # fmt: skip
+    streams = {topics.imu: "imu", topics.gnss: "reference", topics.dvl: "dvl"}
+    start_ns, end_ns = bag.span_ns
+    span_ns = max(end_ns - start_ns, 1)
+    for count, (topic, log_ns, message, undecodable) in enumerate(bag.messages(take)):
+        if undecodable:
+            feed.undecodable(streams[topic], undecodable)
+        else:
+            take[topic](message, log_ns)
+        if count % PROGRESS_EVERY == 0:
+            on_progress((log_ns - start_ns) / span_ns)
+    on_progress(1.0)
+
+
+def _feed_and_note(feed: MessageFeed, recorder: Recorder, message: Any, received_ns: int) -> None:
+    if feed.dvl(message, received_ns) is not None:
+        recorder.note(feed.calibrator)
+
+
+def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
+    """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError."""
+    rotation = None
+    velocities: list[Any] = []
+    first_ns: int | None = None
+    with BagReader(paths) as bag:
+        chosen = topics.found_in(bag.topics)
+        _check_topics(bag, paths, chosen, [])
+        typed = _of_types(bag, chosen, parameters)
+        feed = MessageFeed(Calibrator(typed.replace(prior_source="fixed")), lambda _: None)
+        for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
+            if undecodable:
+                continue
+            if topic == chosen.imu:
+                orientation = unit_quaternion(feed.imu(message, log_ns).orientation)
+                rotation = None if orientation is None else rotation_from_quaternion(orientation).T
+                continue
+            sample = feed.reference(message, log_ns)
+            if sample is None or not is_valid_velocity(sample.velocity, parameters.max_speed):
+                continue
+            first_ns = sample.stamp_ns if first_ns is None else first_ns
+            if sample.stamp_ns - first_ns >= parameters.prior_window * 1e9:
+                break
+            velocity = np.array(sample.velocity)
+            if sample.frame is not VelocityFrame.BODY:
+                if rotation is None:
+                    continue
+                velocity = rotation @ (ENU_FROM_NED @ velocity if sample.frame is VelocityFrame.NED else velocity)
+            velocities.append(velocity)
+    if not velocities:
+        raise InputError(
+            f"prior_source reference: topic {topics.gnss} has no velocity that can be turned into the body frame in "
+            f"its first {parameters.prior_window:g} s; set --gnss-topic, or use prior_source fixed"
+        )
+    _, sway, heave = np.mean(velocities, axis=0).tolist()
+    return sway, heave
+
+
+def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
+    """What the counts say that a user should not overlook."""
+    dvl = result.counts["dvl"]
+    if not dvl["accepted"]:
+        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
+    notes = message_advice(result.counts) + feed.dvl_type.advice(dvl) + data_advice(result.counts)
+    if feed.zero_stamps:
+        notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
+    for estimate in result.estimates.values():
+        notes += gate_advice(estimate)
+    return notes
+
+
+def _remedy(feed: MessageFeed) -> str:
+    """What is known of the DVL's messages that were refused."""
+    known = [sentence for kind, sentence in feed.problems.items() if kind.startswith("dvl")]
+    known += feed.dvl_type.advice(feed.calibrator.counts["dvl"])
+    return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
+
+
+def _counted(counts: Any) -> str:
+    return ", ".join(f"{value} {name}" for name, value in counts.items() if value) or "none received"
+
+
+def replay_document(result: Result, models: Sequence[str]) -> dict[str, Any]:
+    """`replay --json`: plain data of the models asked for. Segments are in s since the first DVL sample."""
+    segments = []
+    with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
+        ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
+        segments = [
+            {
+                "from_s": (segment.from_ns - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "to_s": (end - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "model": segment.model,
+            }
+            for segment, end in zip(result.segments, ends, strict=True)
+        ]
+    return {
+        "models": {name: estimate_document(result.estimates[name]) for name in models},
+        "verification": {name: verification_document(result.verifications[name]) for name in models},
+        "selected": segments,
+        "counts": {name: dict(counts) for name, counts in result.counts.items()},
+        "parameters": dict(result.parameters),
+        "version": __version__,
+    }

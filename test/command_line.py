@@ -1,0 +1,35 @@
+"""Commands run in this process or a fresh one, and what they must say."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from dvl_calib_ros.cli.main import main
+
+
+def succeed(capsys, *arguments) -> tuple[str, str]:
+    """Output and errors of a command that must end well."""
+    assert main([str(argument) for argument in arguments]) == 0
+    output = capsys.readouterr()
+    return output.out, output.err
+
+
+def fail(capsys, *arguments) -> str:
+    """The one line of a command that must be refused."""
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        code = stop.code
+    output = capsys.readouterr()
+    assert code == 2 and output.out == ""
+    assert output.err.count("\n") == 1 and output.err.startswith("dvl-calib")
+    return output.err
+
+
+def in_fresh_process(statement: str, modules: list[str]) -> list[str]:
+    """Which of these modules a statement imports."""
+    shown = f"print(*(m for m in {modules} if m in sys.modules))"
+    script = f"import sys\ntry:\n    {statement}\nexcept SystemExit: pass\n{shown}"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[-1].split()

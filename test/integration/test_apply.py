@@ -1,0 +1,407 @@
+"""A saved calibration in URDF, TF and robot_localization: what is meant is written, and nothing else."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from io_fixtures import replayed, run, write_bag
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.bags.reader import Compression, Storage
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.error_model import distort
+from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting, scale_advice
+from dvl_calib_ros.files.parameter_files import load_parameters
+from dvl_calib_ros.files.result_file import load_initial_calibration, result_document, result_text
+from dvl_calib_ros.simulation.scenario import Scenario
+from dvl_calib_ros.simulation.scenario import write_bag as write_scenario
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+MOUNTING = (0.1, -0.2, 0.7)
+CHAIN = (0.3, 0.2, -1.1)  # of the frame that carries the DVL, in the body
+ODD = """<?xml version='1.0' encoding='UTF-8'?>\r
+<robot name="auv" xmlns:xacro="http://www.ros.org/wiki/xacro">\r
+  <!-- <joint name="dvl_joint" type="fixed"><origin rpy="9 9 9"/></joint> > é -->
+\t<link name="base_link"/><link   name="frame"/><link name="dvl_link"><visual><origin rpy="1 2 3"/></visual></link>
+  <joint name="frame_joint" type="fixed">
+    <parent link="base_link"/><child link="frame"/><origin rpy="{chain}" xyz="0.5 0 -0.1"/>
+  </joint>
+  <joint type='fixed' name='dvl_joint'><calibration note="rpy='1 1 1' > 0"/>
+    <origin
+        {rpy}   xyz='0 0.2 0.3' />
+    <parent link="frame"/><child link="dvl_link"/></joint>
+  <transmission name="t"><joint name="dvl_joint"/></transmission>
+</robot>
+"""
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """A bag and its calibration."""
+    bag = tmp_path_factory.mktemp("apply") / "bag"
+    errors = DvlErrors((0.02, -0.03, 0.05), (0.004,) * 3, beam_std=0.002)
+    scenario = Scenario("box", 120.0, imu_rate=20, errors=errors, mounting_rpy=MOUNTING, gnss_std=0.01)
+    write_scenario(scenario, bag, Storage.MCAP, Compression.NONE)
+    return bag, replayed(bag, mounting_rpy=MOUNTING).result
+
+
+@pytest.fixture
+def saved(tmp_path, result) -> Path:
+    return change(tmp_path / "result.yaml", result[1])
+
+
+def change(path: Path, result, turned: bool = False, **changes) -> Path:
+    """The result file with other values at the top of its document."""
+    path.write_text(result_text({**result_document(result, turned=turned), **changes}))
+    return path
+
+
+def corrected(saved: Path) -> Rotation:
+    return Rotation.from_euler("xyz", yaml.safe_load(saved.read_text())["mounting"]["corrected_rpy"])
+
+
+def words(values) -> str:
+    return " ".join(f"{value:.12g}" for value in values)
+
+
+def robot(path: Path, text: str = ODD, mounting=MOUNTING) -> Path:
+    """A URDF whose DVL is mounted so in the body, by way of a frame that is turned itself."""
+    local = (Rotation.from_euler("xyz", CHAIN).inv() * Rotation.from_euler("xyz", mounting)).as_euler("xyz")
+    path.write_bytes(text.format(chain=words(CHAIN), rpy=f"rpy = '{words(local)}'").encode())
+    return path
+
+
+def mounted(path: Path) -> Rotation:
+    """Rotation of the DVL in the body by an oracle's reading of a URDF."""
+    joints = ElementTree.parse(path).getroot().findall("joint")
+    turns = {joint.get("name"): joint.find("origin").get("rpy") for joint in joints}
+    chain = [
+        Rotation.from_euler("xyz", [float(w) for w in turns[name].split()]) for name in ("frame_joint", "dvl_joint")
+    ]
+    return chain[0] * chain[1]
+
+
+def apply(*arguments) -> int:
+    return main(["apply", *map(str, arguments)])
+
+
+def refused(capsys, *arguments) -> str:
+    assert apply(*arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+def difference(a: Rotation, b: Rotation) -> float:
+    return float((a.inv() * b).magnitude())
+
+
+# ---------------------------------------------------------------- URDF
+
+
+def test_the_urdf_has_the_corrected_mounting_and_every_other_byte_as_before(tmp_path, saved):
+    urdf = robot(tmp_path / "robot.urdf")
+    before = urdf.read_bytes()
+    assert difference(mounted(urdf), corrected(saved)) > math.radians(1.0)
+    assert apply(saved, "--urdf", urdf) == 0
+    assert difference(mounted(urdf), corrected(saved)) < 1e-8
+    spans = [re.search(rb"rpy = '([^']*)'", content).span(1) for content in (before, urdf.read_bytes())]
+    (first, last), (_, new_last) = spans
+    assert before[:first] == urdf.read_bytes()[:first]
+    assert before[last:] == urdf.read_bytes()[new_last:]
+    assert (tmp_path / "robot.urdf.bak").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("origin", "expected"),
+    [
+        ("", '<joint type="fixed" name="j"><origin xyz="0 0 0" rpy="{}"/><parent'),
+        ("<origin/>", '<origin rpy="{}"/>'),
+        ("<origin xyz='1 2 3' />", "<origin xyz='1 2 3' rpy=\"{}\"/>"),
+        ('<origin rpy="0 0 0"></origin>', '<origin rpy="{}"></origin>'),
+        ("<origin\n\trpy='0  0\n0'\n/>", "<origin\n\trpy='{}'\n/>"),
+    ],
+)
+def test_an_origin_may_be_written_in_any_way(tmp_path, result, origin, expected):
+    _, found = result
+    document = result_document(found)
+    rpy = words(Rotation.from_euler("xyz", document["mounting"]["corrected_rpy"]).as_euler("xyz"))
+    joint = f'<joint type="fixed" name="j"><parent link="base_link"/>{origin}<child link="dvl_link"/></joint>'
+    urdf = tmp_path / "r.urdf"
+    urdf.write_text(f"\ufeff<robot>{joint}</robot>")
+    assert apply(change(tmp_path / "r.yaml", found), "--urdf", urdf, "--force") == 0
+    text = urdf.read_text()
+    written = [float(word) for word in re.search(r"rpy=['\"]([^'\"]*)", text)[1].split()]
+    assert written == pytest.approx([float(word) for word in rpy.split()], abs=1e-8)
+    assert expected.format(" ".join(f"{value:.9g}" for value in written)) in text
+    assert ElementTree.fromstring(text.removeprefix("\ufeff")).tag == "robot"
+
+
+def test_a_calibration_that_starts_from_the_applied_urdf_finds_nothing_more(tmp_path, result, saved, capsys):
+    bag, found = result
+    urdf, parameters = robot(tmp_path / "robot.urdf"), tmp_path / "vehicle.yaml"
+    assert apply(saved, "--urdf", urdf) == 0
+    capsys.readouterr()
+    assert main(["parameters", "--urdf", str(urdf)]) == 0
+    parameters.write_text(capsys.readouterr().out)
+    assert load_parameters(parameters).base_frame == "base_link"
+    again = replayed(bag, mounting_rpy=load_parameters(parameters).mounting_rpy).result
+    assert np.linalg.norm(found.estimates["G1"].misalignment) > 0.05
+    assert np.linalg.norm(again.estimates["G1"].misalignment) < 0.003
+    text = parameters.read_text().replace("# lever_arm", "lever_arm")
+    parameters.write_text(text)
+    frame = Rotation.from_euler("xyz", CHAIN).apply([0.0, 0.2, 0.3])
+    assert load_parameters(parameters).lever_arm == pytest.approx(np.array([0.5, 0.0, -0.1]) + frame, abs=1e-8)
+
+
+@pytest.mark.parametrize("urdf_has", ["the calibrated axes", "the driver's own frame"])
+def test_of_a_driver_that_points_down_the_urdf_keeps_its_axes_and_the_transform_is_the_drivers(
+    tmp_path, result, capsys, urdf_has
+):
+    saved = change(tmp_path / "result.yaml", result[1], turned=True)
+    flip = Rotation.from_euler("x", math.pi)
+    axes = flip if urdf_has == "the driver's own frame" else Rotation.identity()
+    path = robot(tmp_path / "robot.urdf", mounting=(Rotation.from_euler("xyz", MOUNTING) * axes).as_euler("xyz"))
+    assert apply(saved, "--urdf", path) == 0
+    assert difference(mounted(path), corrected(saved) * axes) < 1e-8  # nine digits are written
+    line = yaml.safe_load(saved.read_text())["mounting"]["static_transform_publisher"]
+    assert line in capsys.readouterr().out
+    given = shlex.split(line)
+    quaternion = [float(given[given.index(f"--q{axis}") + 1]) for axis in "xyzw"]
+    assert difference(Rotation.from_quat(quaternion), corrected(saved) * flip) < 1e-8
+
+
+def test_applied_twice_is_applied_once_and_the_file_before_is_still_kept(tmp_path, saved, capsys):
+    urdf = robot(tmp_path / "robot.urdf")
+    before = urdf.read_bytes()
+    assert apply(saved, "--urdf", urdf) == 0
+    after = urdf.read_bytes()
+    assert apply(saved, "--urdf", urdf) == 0
+    assert "is so already" in capsys.readouterr().out
+    assert (urdf.read_bytes(), (tmp_path / "robot.urdf.bak").read_bytes()) == (after, before)
+
+
+def test_a_urdf_of_another_mounting_is_refused_unless_forced(tmp_path, saved, capsys):
+    urdf = robot(tmp_path / "robot.urdf", mounting=(0.1, -0.2, 0.9))
+    before = urdf.read_bytes()
+    error = refused(capsys, saved, "--urdf", urdf)
+    assert "0.1 -0.2 0.9" in error and "0.1 -0.2 0.7" in error and "--force" in error
+    assert urdf.read_bytes() == before
+    assert apply(saved, "--urdf", urdf, "--force") == 0
+    assert difference(mounted(urdf), corrected(saved)) < 1e-8
+
+
+def test_another_file_leaves_the_urdf_as_it_is(tmp_path, saved):
+    urdf = robot(tmp_path / "robot.urdf")
+    before = urdf.read_bytes()
+    assert apply(saved, "--urdf", urdf, "-o", tmp_path / "new.urdf") == 0
+    assert urdf.read_bytes() == before and not (tmp_path / "robot.urdf.bak").exists()
+    assert difference(mounted(tmp_path / "new.urdf"), corrected(saved)) < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("change_text", "said"),
+    [
+        (("type='fixed'", "type='revolute'"), "joint dvl_joint between base_link and the DVL is revolute"),
+        (('<link   name="frame"/>', '<xacro:dvl parent="frame"/>'), "r.urdf:4: holds xacro macros (xacro:dvl)"),
+        (("xyz='0 0.2 0.3'", "xyz='0 ${y} 0.3'"), "holds a xacro expression"),
+        (("xyz='0 0.2 0.3'", "xyz='0 0.2'"), "is not three numbers"),
+        (('<parent link="frame"/>', '<parent link="dvl_link"/>'), "joint dvl_joint is above itself"),
+        (('<child link="dvl_link"/>', '<child link="dvl"/>'), "no joint above link 'dvl_link'; name the DVL's joint"),
+        (
+            ('<parent link="base_link"/>', '<parent link="hull"/>'),
+            "no joint above link 'hull'; joint dvl_joint does not",
+        ),
+        (("<robot ", "<!DOCTYPE robot><robot "), "document type declaration"),
+        (("</robot>", ""), "not valid XML"),
+        (("encoding='UTF-8'", "encoding='klingon'"), "not valid XML: unknown encoding: klingon"),
+        (("encoding='UTF-8'", "encoding='utf-7'"), "not valid XML: multi-byte encodings"),
+        (("<robot ", "<sdf "), "no URDF"),
+    ],
+)
+def test_what_cannot_be_edited_is_refused_in_one_line_and_left_alone(tmp_path, saved, capsys, change_text, said):
+    urdf = robot(tmp_path / "r.urdf")
+    text = urdf.read_bytes().decode().replace(*change_text)
+    if "sdf" in change_text[1]:
+        text = text.replace("</robot>", "</sdf>")
+    urdf.write_bytes(text.encode())
+    assert said in refused(capsys, saved, "--urdf", urdf, "--launch", tmp_path / "l.xml")
+    assert urdf.read_bytes() == text.encode()
+    assert not (tmp_path / "l.xml").exists()
+
+
+def test_a_joint_is_found_by_name_and_a_wrong_name_lists_those_there_are(tmp_path, saved, capsys):
+    urdf = robot(tmp_path / "r.urdf", ODD.replace('"dvl_link"', '"a50"'))
+    assert "its fixed joints: frame_joint, dvl_joint" in refused(capsys, saved, "--urdf", urdf, "--joint", "dvl")
+    assert apply(saved, "--urdf", urdf, "--joint", "dvl_joint") == 0
+    assert difference(mounted(urdf), corrected(saved)) < 1e-8
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xfe<\x00", b"\x00\x01", b"rpy", "<robot>\xe9</robot>".encode("latin-1")]
+)
+def test_garbage_is_no_urdf(tmp_path, saved, capsys, content):
+    (tmp_path / "r.urdf").write_bytes(content)
+    assert "r.urdf" in refused(capsys, saved, "--urdf", tmp_path / "r.urdf")
+
+
+# ---------------------------------------------------------------- TF, fusion
+
+
+def test_the_launch_file_publishes_the_corrected_mounting(tmp_path, saved):
+    assert apply(saved, "--launch", tmp_path / "tf.launch.xml") == 0
+    node = ElementTree.parse(tmp_path / "tf.launch.xml").getroot().find("node")
+    assert (node.get("pkg"), node.get("exec")) == ("tf2_ros", "static_transform_publisher")
+    arguments = shlex.split(node.get("args"))
+    given = dict(zip(arguments[::2], arguments[1::2], strict=True))
+    quaternion = [float(given[f"--{name}"]) for name in ("qx", "qy", "qz", "qw")]
+    assert difference(Rotation.from_quat(quaternion), corrected(saved)) < 1e-8
+    assert (given["--frame-id"], given["--child-frame-id"]) == ("base_link", "dvl_link")
+
+
+def test_a_frame_name_from_a_bag_cannot_make_a_launch_file_run_something(tmp_path, result, capsys):
+    document = result_document(result[1], "$(command touch)")
+    path = change(tmp_path / "r.yaml", result[1], mounting=document["mounting"])
+    assert "is no name of a frame" in refused(capsys, path, "--launch", tmp_path / "l.xml")
+    assert not (tmp_path / "l.xml").exists()
+
+
+def test_the_fusion_file_makes_the_node_publish_what_was_calibrated(tmp_path, saved, result):
+    target = tmp_path / "fusion.yaml"
+    assert apply(saved, "--fusion", target) == 0
+    content = yaml.safe_load(target.read_text())
+    localization = content["ekf_filter_node"]["ros__parameters"]
+    assert [i for i, used in enumerate(localization["twist0_config"]) if used] == [6, 7, 8]
+    assert len(localization["twist0_config"]) == 15 and localization["twist0"] == "/dvl_calibration/calibrated_twist"
+    parameters = load_parameters(target)  # our node's part, as the node reads it
+    assert parameters.result_file == ""
+    initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
+    estimate = Calibrator(parameters, initial=initial).estimate()
+    selected = result[1].estimate
+    np.testing.assert_allclose(estimate.state, selected.state, rtol=1e-9)
+    np.testing.assert_allclose(estimate.covariance, selected.covariance, rtol=1e-9)
+
+
+def test_the_advised_speed_of_sound_takes_the_scale_error_out(saved):
+    calibrated = load_calibrated_mounting(saved)
+    factor = float(re.search(r"sound by ([\d.]+)", scale_advice(calibrated))[1])
+    t = calibrated.parameters.rotation_dvl_from_body
+    ahead = np.array([2.0, 0.0, 0.0])
+    measured = distort(ahead, np.zeros(3), calibrated.scale, t)
+    assert abs(measured @ t[:, 0] / 2.0 - 1.0) > 1e-3
+    assert factor * measured @ t[:, 0] == pytest.approx(2.0, abs=2e-5)
+
+
+# ---------------------------------------------------------------- verdict, files, rollback
+
+
+def test_a_rejected_calibration_is_applied_only_by_force_and_says_so(tmp_path, result, capsys):
+    verification = {"verdict": "reject", "reasons": ["the misalignment is 6.0°"], "held_out": None}
+    path = change(tmp_path / "r.yaml", result[1], verification=verification)
+    error = refused(capsys, path, "--launch", tmp_path / "l.xml")
+    assert "its verdict is reject: the misalignment is 6.0°" in error and "--force" in error
+    assert apply(path) == 0  # only shows
+    assert apply(path, "--launch", tmp_path / "l.xml", "--force") == 0
+    assert "verdict is reject" in capsys.readouterr().err
+    assert (tmp_path / "l.xml").exists()
+
+
+def test_a_calibration_that_has_seen_nothing_is_not_applied(tmp_path, capsys):
+    samples = [
+        sample._replace(velocity=(0.0, 0.0, 0.0)) if hasattr(sample, "velocity") else sample for sample in run(5.0)
+    ]
+    nothing = replayed(write_bag(tmp_path / "bag", samples)).result
+    path = change(tmp_path / "r.yaml", nothing)
+    assert "collecting" in refused(capsys, path, "--launch", tmp_path / "l.xml")
+
+
+def test_what_the_data_has_not_shown_or_verified_is_said(tmp_path, saved, capsys):
+    assert apply(saved) == 0
+    assert "its verdict is marginal" in capsys.readouterr().err
+    document = yaml.safe_load(saved.read_text())
+    del document["verification"]  # as the node writes it
+    saved.write_text(yaml.safe_dump(document))
+    assert apply(saved) == 0
+    assert "not verified on held-out data" in capsys.readouterr().err
+    write_scenario(Scenario("straight", 30.0, imu_rate=20), tmp_path / "bag", Storage.MCAP, Compression.NONE)
+    assert apply(change(tmp_path / "straight.yaml", replayed(tmp_path / "bag").result)) == 0
+    assert "phi_x (roll) was not shown by the data" in capsys.readouterr().err
+
+
+def test_rollback_brings_every_file_back_and_a_second_one_undoes_that(tmp_path, saved, capsys):
+    urdf, launch = robot(tmp_path / "robot.urdf"), tmp_path / "l.xml"
+    launch.write_text("mine")
+    files = ["--urdf", urdf, "--launch", launch]
+    before = [path.read_bytes() for path in (urdf, launch)]
+    assert apply(saved, *files) == 0
+    after = [path.read_bytes() for path in (urdf, launch)]
+    assert apply("--rollback", *files) == 0
+    assert [path.read_bytes() for path in (urdf, launch)] == before != after
+    assert apply("--rollback", *files) == 0
+    assert [path.read_bytes() for path in (urdf, launch)] == after
+
+
+def test_rollback_touches_nothing_when_one_file_has_no_backup(tmp_path, saved, capsys):
+    urdf = robot(tmp_path / "robot.urdf")
+    assert apply(saved, "--urdf", urdf, "--fusion", tmp_path / "f.yaml") == 0
+    after = urdf.read_bytes()
+    capsys.readouterr()
+    assert "f.yaml.bak: cannot be read" in refused(
+        capsys, "--rollback", "--urdf", urdf, "--fusion", tmp_path / "f.yaml"
+    )
+    assert urdf.read_bytes() == after
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--urdf", "r.urdf"], "name a result file"),
+        (["missing.yaml"], "missing.yaml: no such result file"),
+        (["result.yaml", "--fusion", "result.yaml"], "is the result itself"),
+        (["result.yaml", "--fusion", "x", "--launch", "x"], "names of their own"),
+        (["result.yaml", "--urdf", "missing.urdf"], "missing.urdf: cannot be read as URDF"),
+        (["result.yaml", "-o", "x"], "name that, too"),
+        (["result.yaml", "--joint", "x"], "name that, too"),
+        (["result.yaml", "--launch", "missing/x"], "missing does not exist; create it"),
+        (["--rollback"], "name the files again"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(saved, monkeypatch, capsys, arguments, said):
+    monkeypatch.chdir(saved.parent)
+    assert said in refused(capsys, *arguments)
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"model": "M99"},
+        {"model": []},
+        {"mounting": None},
+        {"mounting": {"corrected_rpy": [0, 0, 0], "frame_id": "a", "child_frame_id": "b"}},
+        {"mounting": {"corrected_rpy": [0, "x"], "frame_id": "a", "child_frame_id": "b"}},
+        {"parameters": {"min_speed": -1}},
+        {"parameters": []},
+        {"verification": {"verdict": "splendid", "reasons": []}},
+        {"verification": []},
+        {"models": {"G1": 3}},
+    ],
+)
+def test_a_damaged_result_is_refused(tmp_path, result, capsys, damage):
+    assert "r.yaml" in refused(capsys, change(tmp_path / "r.yaml", result[1], **damage))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-6])
+def test_the_angle_between_rotations_is_exact_for_small_ones(angle):
+    axis = np.array([1.0, -2.0, 0.5]) / np.linalg.norm([1.0, -2.0, 0.5])
+    a = Rotation.from_euler("xyz", MOUNTING)
+    b = a * Rotation.from_rotvec(angle * axis)
+    assert angle_between(a.as_matrix(), b.as_matrix()) == pytest.approx(angle, rel=1e-6, abs=1e-15)

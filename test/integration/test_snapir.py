@@ -1,0 +1,86 @@
+"""Real sea trials (Snapir) with the published errors, imported to bags and replayed. Skipped without the data."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.calibration.frames import FLU_FROM_FRD
+from dvl_calib_ros.calibration.models import MODELS, Needs
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
+from dvl_calib_ros.files.trajectories import ImportOptions, import_recording, read_columns
+from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss
+
+
+@pytest.fixture(scope="module")
+def trajectories(snapir):
+    """Name -> time (N,) s, velocity (N, 3) m/s, forward-right-down."""
+    return {name: read_columns(snapir / f"{name}_dvl.csv", "m/s") for name in TRAJECTORIES}
+
+
+def write_csv(path: Path, time, velocity) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["Time [s]", "DVL X [m/s]", "DVL Y [m/s]", "DVL Z [m/s]"])
+        writer.writerows([repr(float(t)), *map(repr, row)] for t, row in zip(time, velocity.tolist(), strict=True))
+    return path
+
+
+def calibrate_on(folder: Path, time, velocity, errors, rng):
+    """Result of replaying a bag of the trajectory with errors, and the number of messages in it."""
+    dvl = write_csv(folder / "dvl.csv", time, measure_dvl(velocity, errors, np.eye(3), rng))
+    gnss = write_csv(folder / "gnss.csv", time, measure_gnss(velocity, GNSS_STD, rng))
+    counts = import_recording(dvl, gnss, None, folder / "bag", ImportOptions())
+    return replay([folder / "bag"], Parameters()).result, counts
+
+
+@pytest.mark.parametrize("name", TRAJECTORIES)
+def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, tmp_path, rng):
+    for number, errors in enumerate(COMBINATIONS[::5]):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        result, written = calibrate_on(folder, *trajectories[name], errors, rng)
+        dvl, reference = result.counts["dvl"], result.counts["reference"]
+        assert dvl["received"] == dvl["accepted"] == written["dvl/twist"] == len(trajectories[name][0])
+        assert reference["received"] == written["gnss/twist"]
+        assert result.counts["pairing"]["paired"] == dvl["usable"] + dvl["slow"]
+        pairing = result.counts["pairing"]  # no attitude in the bag
+        assert pairing["not_oriented"] + pairing["awaiting_attitude"] == dvl["usable"]
+        for model, estimate in result.estimates.items():
+            given = 0 if MODELS[model].needs is Needs.ATTITUDE else dvl["usable"]
+            assert estimate.used + estimate.gated == given
+
+
+def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectories, tmp_path, rng):
+    """Set E1 of the protocol, with default parameters: M7 at most 0.066 m/s, M3 and M4 at most 0.045 m/s."""
+    time, velocity = trajectories["T12"]
+    errors_of: dict[str, list[float]] = {name: [] for name in ["uncalibrated", *MODELS]}
+    for number, errors in enumerate(COMBINATIONS):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        result, _ = calibrate_on(folder, time[:200], velocity[:200], errors, rng)
+        residuals: dict[str, list[float]] = {name: [] for name in errors_of}
+        for name in set(TRAJECTORIES) - {"T12"}:
+            truth = trajectories[name][1] @ FLU_FROM_FRD
+            measured = measure_dvl(trajectories[name][1], errors, np.eye(3), rng) @ FLU_FROM_FRD
+            residuals["uncalibrated"].append(vector_rmse(measured - truth))
+            for model, estimate in result.estimates.items():
+                corrected = estimate.corrected_velocity(measured, np.eye(3))
+                residuals[model].append(vector_rmse(corrected - truth))
+        for model, values in residuals.items():
+            errors_of[model].append(float(np.mean(values)))
+    average = {model: float(np.mean(values)) for model, values in errors_of.items()}
+    print("Avg.VRMSE of E1, m/s:", {model: round(value, 4) for model, value in average.items()})
+    assert average["uncalibrated"] == pytest.approx(0.119, abs=0.001)
+    assert average["M7"] <= 0.066
+    assert average["M3"] <= 0.045
+    assert average["M4"] <= 0.045
+
+
+def vector_rmse(error) -> float:
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))

@@ -1,0 +1,130 @@
+"""The live node on other message types than the default: over DDS where they are installed, else without it."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, as_plain, write_driver_bag
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from io_fixtures import run
+from nav_msgs.msg import Odometry
+from ros import World, refused_at_start, until
+from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.messages.decode import MessageFeed
+from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
+from dvl_calib_ros.node import calibration_node
+from dvl_calib_ros.node.calibration_node import CalibrationNode
+from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
+from dvl_calib_ros.node.message_types import message_class
+from dvl_calib_ros.replay.replay import replay
+
+
+@pytest.fixture
+def world():
+    world = World()
+    yield world
+    world.close()
+
+
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (["-p", "dvl_type:=marine_acoustic_msgs/Dvl"], "sudo apt install ros-$ROS_DISTRO-marine-acoustic-msgs"),
+        (["-p", "gnss_type:=dvl_msgs/DVL"], "gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs/msg/Twist"),
+    ],
+)
+def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(arguments, said):
+    errors = refused_at_start(*arguments)
+    assert len(errors.splitlines()) == 1 and said in errors
+
+
+def test_the_node_and_the_replay_agree_on_other_types(world, tmp_path):
+    bag, saved = write_driver_bag(tmp_path / "bag", run(), ODOMETRY, TWIST_STAMPED), tmp_path / "live.yaml"
+    types = as_arguments(PATIENT | {"dvl_type": ODOMETRY, "gnss_type": TWIST_STAMPED})
+    with world.calibration_node(*types, f"result_file:={saved}"):
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        sent = play(world, bag)
+        for topic, stream in (("dvl/twist", "dvl"), ("gnss/twist", "reference"), ("imu/data", "imu")):
+            until(lambda s=stream, t=topic: diagnosed(diagnostics, f"{s} received") == str(sent[t]), f"all of {topic}")
+    assert_agree(load_yaml(saved, "result file"), replay([bag], Parameters(**PATIENT)).result)
+
+
+def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):
+    with world.calibration_node():  # in one process, DDS would refuse the second type
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        publisher = world.node.create_publisher(Odometry, "dvl/twist", 10)
+        until(
+            lambda: any("set dvl_type" in str(message.status[0].message) for message in diagnostics),
+            "the diagnostics to say what to set",
+        )
+        # its name may be discovered later than its topic
+        named = "test_client publishes nav_msgs/msg/Odometry, where"
+        until(lambda: named in diagnostics[-1].status[0].message, "the diagnostics to name it")
+        world.node.destroy_publisher(publisher)
+        until(lambda: "Odometry" not in diagnostics[-1].status[0].message, "diagnostics without it")
+
+
+@pytest.mark.parametrize("dvl_type", [MARINE, A50])
+def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed(dvl_type, world, monkeypatch):
+    """Stands in for a package that there is no wheel of: DDS is left out, all else is the node's."""
+    package, kind = dvl_type.split("/msg/")
+    stub = ModuleType(f"{package}.msg")
+    setattr(stub, kind, type(kind, (), {"__module__": f"{package}.msg._{kind.lower()}"}))
+    monkeypatch.setitem(sys.modules, package, ModuleType(package))
+    monkeypatch.setitem(sys.modules, f"{package}.msg", stub)
+    subscribed = {}
+
+    def subscribe(node, message_type, topic, callback, *_, **__):
+        subscribed[topic] = (message_type, callback)
+        return SimpleNamespace(topic_name=f"/{topic}", msg_type=message_type)
+
+    monkeypatch.setattr(CalibrationNode, "create_subscription", subscribe)
+    monkeypatch.setattr(calibration_node, "take", lambda _: None)
+    maker, samples = Maker(), [sample for sample in run() if isinstance(sample, DvlSample)]
+    with node_here(world, dvl_type=dvl_type) as node:
+        message_type, callback = subscribed["dvl/twist"]
+        assert message_type is getattr(stub, kind)
+        assert subscribed["gnss/twist"][0] is TwistWithCovarianceStamped
+        messages = [as_plain(maker.velocity(dvl_type, sample)) for sample in samples]
+        messages[3].altitude = -1.0
+        for message in messages:
+            callback(message, {"received_timestamp": 0, "source_timestamp": 0})
+        counts = node._calibrator.counts["dvl"]
+        assert (received(node), counts["no_bottom"], counts["accepted"]) == (len(samples), 1, len(samples) - 1)
+        assert node._feed.turns_dvl
+
+
+def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wrong_with_them_is_said():
+    calibrator, kind = Calibrator(Parameters(dvl_type=MARINE)), VELOCITY_TYPES[MARINE]
+    feed, silence, recent = MessageFeed(calibrator, lambda _: None), Silence(0.0), RecentCounts()
+    for second in range(8):
+        message = Maker().velocity(MARINE, DvlSample(second * 10**9, (1.5, 0.0, 0.0)))
+        message.beam_velocities_valid = False
+        feed.dvl(message, 0)
+        status = diagnose(calibrator, kind, [], silence, recent, float(second))
+    assert status.level == DiagnosticStatus.ERROR
+    assert "no usable DVL message for 7 s" in status.message
+    assert "8 DVL messages are not used: beam_velocities_valid is false" in status.message
+    assert {item.key: item.value for item in status.values}["dvl flagged_invalid"] == "8"
+
+
+def test_a_package_or_class_that_is_not_there_is_named_with_the_remedy():
+    assert message_class("dvl_type", TWIST) is TwistWithCovarianceStamped
+    with pytest.raises(
+        InputError, match=r"the message package dvl_msgs is not installed .* build the driver's dvl_msgs"
+    ):
+        message_class("dvl_type", A50)
+    with pytest.raises(InputError, match=r"dvl_type nav_msgs/msg/Dvl: .* install nav_msgs, and source"):
+        message_class("dvl_type", "nav_msgs/msg/Dvl")

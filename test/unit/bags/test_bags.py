@@ -1,0 +1,308 @@
+"""Recordings of every kind give the same data, and the same estimates."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from io_fixtures import (
+    JAZZY,
+    TOPICS,
+    estimates,
+    mcap_bytes,
+    raw,
+    raw_and_notes,
+    replayed,
+    rewrite,
+    run,
+    storage_file,
+    write_bag,
+)
+from mcap.writer import CompressionType, IndexType
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from dvl_calib_ros.bags.reader import BagReader, BagWriter, Compression, Storage
+from dvl_calib_ros.calibration.samples import DvlSample, VelocityFrame
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.messages.decode import stamp_ns
+from dvl_calib_ros.messages.drivers import TWIST_TYPE
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+KINDS = [
+    ("mcap", "none"), ("mcap", "chunk"), ("mcap", "message"), ("mcap", "file"),
+    ("sqlite3", "none"), ("sqlite3", "message"), ("sqlite3", "file"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory) -> Path:
+    return write_bag(tmp_path_factory.mktemp("plain") / "bag", run())
+
+
+@pytest.fixture(scope="module")
+def expected(plain) -> dict:
+    return estimates(plain)
+
+
+@pytest.mark.parametrize(("storage", "compression"), KINDS)
+def test_every_storage_and_compression_gives_the_same_estimates(tmp_path, expected, storage, compression):
+    assert estimates(write_bag(tmp_path / "bag", run(), storage, compression)) == expected
+
+
+@pytest.mark.parametrize(("storage", "compression"), KINDS)
+def test_a_storage_file_alone_gives_the_same_messages_as_its_folder(tmp_path, plain, storage, compression):
+    bag = write_bag(tmp_path / "bag", run(), storage, compression)
+    messages, notes = raw_and_notes(storage_file(bag))
+    assert messages == raw(plain) and not notes
+
+
+@pytest.mark.parametrize(("storage", "compression"), KINDS)
+def test_a_folder_without_metadata_gives_the_same_messages_and_says_so(tmp_path, plain, storage, compression):
+    bag = write_bag(tmp_path / "bag", run(), storage, compression)
+    (bag / "metadata.yaml").unlink()
+    messages, notes = raw_and_notes(bag)
+    assert messages == raw(plain)
+    assert len(notes) == 1 and "metadata.yaml" in notes[0]
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2", "rosbag2_bagfile_information: 3", "\x00", "a: {b: c}"])
+def test_a_damaged_metadata_file_costs_nothing_but_a_note(tmp_path, plain, text):
+    bag = write_bag(tmp_path / "bag", run())
+    (bag / "metadata.yaml").write_text(text)
+    messages, notes = raw_and_notes(bag)
+    assert messages == raw(plain)
+    assert "metadata.yaml" in notes[0]
+
+
+@pytest.mark.parametrize("split", [1, 500, 1234])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_two_halves_of_a_run_give_the_same_as_the_whole_in_either_order(tmp_path, expected, storage, split):
+    first = write_bag(tmp_path / "first", run()[:split], storage)
+    second = write_bag(tmp_path / "second", run()[split:], storage)
+    assert estimates(first, second) == expected
+    assert estimates(second, first) == expected
+
+
+def test_bags_of_one_sensor_each_are_merged_by_log_time(tmp_path, plain):
+    kinds = {type(sample) for sample in run()}
+    bags = [write_bag(tmp_path / kind.__name__, [s for s in run() if type(s) is kind]) for kind in kinds]
+    merged = raw(*bags)
+    assert [log_ns for _, log_ns, _ in merged] == sorted(log_ns for _, log_ns, _ in merged)
+    assert sorted(merged) == sorted(raw(plain))
+
+
+def test_the_parts_of_a_split_bag_are_read_in_order_and_only_those_that_metadata_lists(tmp_path):
+    bag = write_bag(tmp_path / "bag", run()[:100])
+    for number, samples in ((2, run()[100:200]), (10, run()[200:300])):
+        part = write_bag(tmp_path / f"part{number}", samples)
+        shutil.copy(storage_file(part), bag / f"bag_{number}.mcap")
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
+    metadata["rosbag2_bagfile_information"]["relative_file_paths"] += ["bag_2.mcap", "bag_3.mcap"]
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    messages, notes = raw_and_notes(bag)
+    assert len(messages) == 200
+    assert any("bag_3.mcap is missing" in note for note in notes)
+    assert any("bag_10.mcap: not read" in note for note in notes)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("index", [IndexType.ALL, IndexType.NONE])
+def test_mcap_files_of_other_writers_give_the_same_messages(tmp_path, plain, compression, chunked, index):
+    content = mcap_bytes(raw(plain), compression=compression, use_chunking=chunked, index_types=index)
+    (tmp_path / "other.mcap").write_bytes(content)
+    messages, notes = raw_and_notes(tmp_path / "other.mcap")
+    assert messages == raw(plain) and not notes
+
+
+def test_log_times_out_of_order_in_a_file_without_chunks_are_no_damage(tmp_path, plain):
+    messages = raw(plain)[:200]
+    messages[50], messages[51] = messages[51], messages[50]
+    (tmp_path / "swapped.mcap").write_bytes(mcap_bytes(messages, use_chunking=False))
+    found, notes = raw_and_notes(tmp_path / "swapped.mcap")
+    assert found == messages and not notes
+
+
+def test_a_file_is_known_by_its_content_whatever_its_name(tmp_path, plain):
+    for storage in ("mcap", "sqlite3"):
+        bag = write_bag(tmp_path / storage, run(), storage)
+        shutil.copy(storage_file(bag), tmp_path / f"{storage}#50%?.bin")
+        assert raw(tmp_path / f"{storage}#50%?.bin") == raw(plain)
+
+
+def test_a_recording_whose_last_messages_lie_in_the_journal_is_read_to_the_end(tmp_path, plain):
+    bag = write_bag(tmp_path / "bag", run(), "sqlite3")
+    file, crashed = storage_file(bag), tmp_path / "crashed.db3"
+    with sqlite3.connect(file) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA wal_autocheckpoint=0")
+        connection.execute("UPDATE messages SET timestamp = timestamp")
+        connection.commit()
+        connection.execute("DELETE FROM messages WHERE id > 700")
+        connection.commit()
+        shutil.copy(file, crashed)
+        shutil.copy(f"{file}-wal", f"{crashed}-wal")
+    connection.close()
+    assert raw(crashed) == raw(plain)[:700]
+
+
+def test_topics_are_found_with_and_without_a_leading_slash(tmp_path, expected):
+    assert estimates(write_bag(tmp_path / "bag", run(), prefix="/")) == expected
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_the_definition_embedded_in_the_bag_is_used(tmp_path, storage):
+    """The vendor's TwistWithCovarianceStamped has a field more, first, and Vector3 in another order."""
+    definition, _ = JAZZY.generate_msgdef(TWIST_TYPE, ros_version=2)
+    parts = definition.split("=" * 80)
+    parts[0] = "float64 temperature\n" + parts[0]
+    parts = [part.replace("float64 x\nfloat64 y\nfloat64 z", "float64 z\nfloat64 y\nfloat64 x") for part in parts]
+    vendor = get_typestore(Stores.EMPTY)
+    vendor.register(get_types_from_msg(("=" * 80).join(parts), TWIST_TYPE))
+    types = vendor.types
+    with Writer(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
+        connection = writer.add_connection("dvl/twist", TWIST_TYPE, typestore=vendor)
+        for i in range(50):
+            stamp = types["builtin_interfaces/msg/Time"](sec=100 + i, nanosec=0)
+            vector = types["geometry_msgs/msg/Vector3"]
+            twist = types["geometry_msgs/msg/Twist"](vector(x=1.5, y=0.1, z=0.05), vector(x=0.0, y=0.0, z=0.0))
+            inner = types["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36))
+            message = types[TWIST_TYPE](20.0, types["std_msgs/msg/Header"](stamp, "dvl_link"), inner)
+            writer.write(connection, (100 + i) * 10**9, vendor.serialize_cdr(message, TWIST_TYPE))
+    with BagReader([tmp_path / "bag"]) as bag:
+        linear = next(iter(bag.messages(["dvl/twist"])))[2].twist.twist.linear
+    assert (linear.x, linear.y, linear.z) == (1.5, 0.1, 0.05)
+    samples = [DvlSample((100 + i) * 10**9, (1.5, 0.1, 0.05)) for i in range(50)]
+    standard = write_bag(tmp_path / "standard", samples)
+    assert estimates(tmp_path / "bag") == estimates(standard)
+
+
+def test_samples_that_no_filter_can_use_are_counted_and_change_nothing(tmp_path):
+    dvl = [sample for sample in run() if isinstance(sample, DvlSample)]
+    bad = {dvl[10].stamp_ns: float("nan"), dvl[20].stamp_ns: float("inf"), dvl[30].stamp_ns: -float("inf")}
+    negative = dvl[40].stamp_ns
+
+    def change(topic, message):
+        stamp = stamp_ns(message.header.stamp)
+        if topic == "dvl/twist":
+            message.twist.twist.linear.y = bad.get(stamp, message.twist.twist.linear.y)
+            message.twist.covariance = message.twist.covariance * (-1.0 if stamp == negative else 1.0)
+        return message
+
+    result = replayed(rewrite(tmp_path / "bag", change, run())).result
+    left = [s for s in run() if not (isinstance(s, DvlSample) and s.stamp_ns in {*bad, negative})]
+    clean = replayed(write_bag(tmp_path / "clean", left)).result
+    assert result.counts["dvl"]["invalid"] == 4
+    for name, estimate in result.estimates.items():
+        assert estimate.used == clean.estimates[name].used
+        assert [*estimate.state] == [*clean.estimates[name].state]
+
+
+def test_zero_stamps_fall_back_to_the_log_time_and_are_reported(tmp_path, expected):
+    def change(_, message):
+        message.header.stamp.sec = message.header.stamp.nanosec = 0
+        return message
+
+    bag = rewrite(tmp_path / "bag", change, run())
+    assert estimates(bag) == expected  # the writer's log time is the stamp
+    notes = replayed(bag).notes
+    assert any(f"{len(run())} messages had no header stamp" in note for note in notes)
+    assert sum("without a header stamp" in note for note in notes) == 3  # once per stream
+
+
+def test_messages_in_a_wrong_frame_are_refused_counted_and_the_remedy_is_named(tmp_path):
+    def change(topic, message):
+        if topic == "gnss/twist":
+            message.header.frame_id = "antenna"
+        return message
+
+    replay = replayed(rewrite(tmp_path / "bag", change, run()))
+    counts = replay.result.counts["reference"]
+    assert counts["wrong_frame"] == counts["received"] > 0
+    assert sum("antenna" in note and "gnss_frame" in note for note in replay.notes) == 1
+
+
+def test_a_dvl_that_publishes_in_the_body_frame_is_refused_with_the_remedy(tmp_path):
+    bag = write_bag(tmp_path / "bag", run(), dvl_frame="base_link")
+    with pytest.raises(InputError, match=r"wrong_frame.*base_link.*dvl_frame"):
+        replayed(bag)
+
+
+def test_an_earth_frame_reference_without_attitude_is_said(tmp_path):
+    bag = write_bag(tmp_path / "bag", [s for s in run() if hasattr(s, "velocity")])
+    replay = replayed(bag)
+    assert replay.result.estimates["M3"].used == 0
+    assert any("no attitude" in note and "IMU topic" in note for note in replay.notes)
+
+
+@pytest.mark.parametrize("frame", [VelocityFrame.BODY, VelocityFrame.ENU])
+def test_prior_source_reference_takes_sway_and_heave_from_the_reference(tmp_path, frame):
+    bag = write_bag(tmp_path / "bag", run(frame=frame))
+    assert estimates(bag, prior_source="reference")["M5"] != estimates(bag)["M5"]
+    assert estimates(bag, prior_source="reference")["M3"] == estimates(bag)["M3"]
+
+
+def test_prior_source_reference_is_not_misled_by_invalid_samples(tmp_path):
+    def change(topic, message):
+        if topic == "gnss/twist":
+            message.twist.twist.linear.y = float("nan")
+        return message
+
+    first = [sample for sample in run(frame=VelocityFrame.BODY)][:60]
+    bad = rewrite(tmp_path / "bad", change, first)
+    good = write_bag(tmp_path / "good", run(frame=VelocityFrame.BODY)[60:])
+    assert all(abs(value) < 10 for value in estimates(bad, good, prior_source="reference")["M5"])
+
+
+def test_prior_source_reference_without_a_reference_names_the_remedy(tmp_path):
+    bag = write_bag(tmp_path / "bag", [s for s in run() if isinstance(s, DvlSample)])
+    with pytest.raises(InputError, match=r"prior_source reference.*gnss/twist.*--gnss-topic"):
+        replayed(bag, prior_source="reference")
+
+
+def test_prior_source_initial_window_is_warned_of_once(plain):
+    notes = replayed(plain, prior_source="initial_window").notes
+    assert sum("initial_window" in note for note in notes) == 1
+
+
+def test_a_bag_that_cannot_be_finished_is_not_left_behind(tmp_path):
+    def full() -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(InputError, match="No space left"), BagWriter(tmp_path / "bag") as bag:
+        bag.dvl("dvl/twist", DvlSample(1, (1.0, 0.0, 0.0)))
+        bag._writer.close = full
+    assert not (tmp_path / "bag").exists()
+
+
+def test_sqlite_bags_refuse_chunk_compression_and_existing_names(tmp_path):
+    with pytest.raises(InputError, match="chunk is MCAP's"):
+        BagWriter(tmp_path / "bag", Storage.SQLITE3, Compression.CHUNK)
+    with pytest.raises(InputError, match="exists already"):
+        BagWriter(tmp_path)
+
+
+def test_a_compressed_file_that_is_cut_gives_what_can_be_unpacked(tmp_path, plain):
+    content = mcap_bytes(raw(plain))
+    packed = b"".join(zstd.compress(content[at : at + 8192]) for at in range(0, len(content), 8192))
+    (tmp_path / "cut.mcap.zstd").write_bytes(packed[: len(packed) * 2 // 3])
+    messages, notes = raw_and_notes(tmp_path / "cut.mcap.zstd")
+    assert 200 < len(messages) < len(raw(plain))
+    assert messages == raw(plain)[: len(messages)]
+    assert all(str(tmp_path / "cut.mcap.zstd") in note for note in notes)
+
+
+def test_the_topics_of_a_bag_are_listed_with_their_types_and_counts(plain):
+    with BagReader([plain, plain]) as bag:
+        assert bag.topics == TOPICS
+        assert sum(bag.message_counts.values()) == 2 * len(run())

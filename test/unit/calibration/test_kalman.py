@@ -1,0 +1,135 @@
+"""The filter against weighted least squares, the batch against the filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from filter_problems import random_problem
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dvl_calib_ros.calibration import kalman
+from dvl_calib_ros.calibration.kalman import Measurements
+
+
+def least_squares(x, p, data, k):
+    """Prior-regularised weighted least squares, by stacking everything and calling lstsq."""
+    own = min(k, len(data.r) - 1)
+    rows, right = [np.linalg.cholesky(np.linalg.inv(p[k])).T], [np.linalg.cholesky(np.linalg.inv(p[k])).T @ x[k]]
+    for i in np.flatnonzero(data.usable[k]):
+        root = np.linalg.cholesky(np.linalg.inv(data.r[own, i]) * data.weight[own, i]).T
+        rows.append(root @ data.h[k, i])
+        right.append(root @ data.z[k, i])
+    a = np.vstack(rows)
+    return np.linalg.lstsq(a, np.concatenate(right), rcond=None)[0], np.linalg.inv(a.T @ a)
+
+
+@pytest.mark.parametrize("weights", [False, True])
+def test_the_filter_equals_weighted_least_squares(rng, weights):
+    x, p, data = random_problem(rng, weights=weights)
+    after = kalman.recursion(x, p, data)
+    for k in range(len(x)):
+        state, covariance = least_squares(x, p, data, k)
+        np.testing.assert_allclose(after.x[k], state, atol=1e-12)
+        np.testing.assert_allclose(after.p[k], covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("weights", [False, True])
+def test_least_squares_over_growing_windows_equals_the_filter_after_each(rng, weights):
+    x, p, data = random_problem(rng, weights=weights)
+    ends = [0, 1, 40, 150]
+    after = kalman.least_squares(x, p, data, ends)
+    for index, end in enumerate(ends):
+        expected = kalman.recursion(x, p, data.part(slice(0, end)))
+        np.testing.assert_allclose(after.x[index], expected.x, atol=1e-12)
+        np.testing.assert_allclose(after.p[index], expected.p, atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_samples=st.integers(1, 80),
+    n=st.integers(1, 6),
+    m=st.integers(1, 3),
+    outliers=st.sampled_from([0.0, 0.05, 0.5]),
+    gate=st.sampled_from([np.inf, 16.3, 3.0]),
+    weights=st.booleans(),
+)
+def test_the_batch_equals_the_filter_whatever_the_gate_decides(seed, n_samples, n, m, outliers, gate, weights):
+    x, p, data = random_problem(np.random.default_rng(seed), 2, n_samples, n, m, outliers, weights, gate)
+    one, all_at_once = kalman.recursion(x, p, data), kalman.batch(x, p, data)
+    np.testing.assert_array_equal(one.used, all_at_once.used)
+    np.testing.assert_allclose(one.x, all_at_once.x, atol=1e-10)
+    np.testing.assert_allclose(one.p, all_at_once.p, atol=1e-10)
+    np.testing.assert_allclose(one.nis, all_at_once.nis, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("outliers, gate", [(0.0, np.inf), (0.05, 16.3), (0.5, 1.0)])
+def test_the_history_is_the_filter_stopped_after_every_sample(rng, outliers, gate):
+    x, p, data = random_problem(rng, n_samples=40, outliers=outliers, gate=gate, weights=True)
+    history = kalman.history(x, p, data)
+    for stop in range(1, 41):
+        part = Measurements(
+            data.z[:, :stop],
+            data.h[:, :stop],
+            data.r[:, :stop],
+            data.weight[:, :stop],
+            data.usable[:, :stop],
+            data.gate,
+        )
+        after = kalman.recursion(x, p, part)
+        np.testing.assert_allclose(history.x[:, stop - 1], after.x, atol=1e-10)
+        np.testing.assert_allclose(history.p[:, stop - 1], after.p, atol=1e-10)
+    np.testing.assert_array_equal(history.used, kalman.recursion(x, p, data).used)
+
+
+def test_gating_that_does_not_settle_falls_back_to_the_filter(rng, monkeypatch):
+    x, p, data = random_problem(rng, outliers=0.5, gate=3.0)
+    expected = kalman.recursion(x, p, data)
+    monkeypatch.setattr(kalman, "MAX_GATE_PASSES", 1)
+    np.testing.assert_array_equal(kalman.batch(x, p, data).x, expected.x)
+    np.testing.assert_allclose(kalman.history(x, p, data).x[:, -1], expected.x, atol=1e-14)
+
+
+def test_the_covariance_stays_symmetric_positive_definite_over_precise_updates(rng):
+    """Nearly dependent measurements far more precise than the prior: where a plain (I - KH)P loses definiteness."""
+    h = np.tile([[1.0, 1.0 + 1e-7, 0.0]], (1, 5000, 1, 1)).reshape(1, 5000, 1, 3)
+    data = Measurements(
+        np.zeros((1, 5000, 1)),
+        h,
+        np.full((1, 1, 1, 1), 1e-12),
+        np.ones((1, 5000)),
+        np.ones((1, 5000), bool),
+        np.array([np.inf]),
+    )
+    x, p = np.zeros((1, 3)), np.eye(3)[None]
+    for _ in range(4):
+        after = kalman.recursion(x, p, data)
+        x, p = after.x, after.p
+        np.testing.assert_array_equal(p, p.transpose(0, 2, 1))
+        assert np.linalg.eigvalsh(p[0])[0] > 0.0
+
+
+def test_process_noise_adds_to_the_covariance_before_each_update(rng):
+    x, p, data = random_problem(rng, k=1, n_samples=5)
+    q = np.tile(1e-4 * np.eye(4), (5, 1, 1, 1))
+    expected_x, expected_p = x[0], p[0]
+    for i in range(5):  # textbook form, one step at a time
+        expected_p = expected_p + q[i, 0]
+        if data.usable[0, i]:
+            h = data.h[0, i]
+            gain = expected_p @ h.T @ np.linalg.inv(h @ expected_p @ h.T + data.r[0, i])
+            expected_x = expected_x + gain @ (data.z[0, i] - h @ expected_x)
+            expected_p = (np.eye(4) - gain @ h) @ expected_p
+    after = kalman.recursion(x, p, data, q)
+    np.testing.assert_allclose(after.x[0], expected_x, atol=1e-12)
+    np.testing.assert_allclose(after.p[0], expected_p, atol=1e-12)
+
+
+def test_a_sample_that_must_not_be_used_changes_nothing_at_all(rng):
+    x, p, data = random_problem(rng, n_samples=3)
+    unusable = Measurements(data.z, data.h, data.r, data.weight, np.zeros((3, 3), bool), data.gate)
+    after = kalman.recursion(x, p, unusable)
+    np.testing.assert_array_equal(after.x, x)
+    np.testing.assert_array_equal(after.p, p)
+    assert not after.used.any()

@@ -1,0 +1,149 @@
+"""Hold-out verification: against solving again without the data, and the verdicts it gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from filter_problems import random_problem
+from runs import MatchedRun, calibrate, make_samples
+
+from dvl_calib_ros.calibration import kalman
+from dvl_calib_ros.calibration.error_model import correct, correction_jacobian
+from dvl_calib_ros.calibration.folds import FOLDS, FoldInformation, Moments, folds_of
+from dvl_calib_ros.calibration.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.kalman import GaussianState, Measurements
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.observability import Convergence
+from dvl_calib_ros.calibration.observations import Observations
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.verification import HeldOutError, Word, held_out_error, verify
+
+GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05, calibration=0.002)
+
+
+@pytest.mark.parametrize("weights", [False, True])
+def test_leaving_a_fold_out_equals_filtering_without_it(rng, weights):
+    x, p, data = random_problem(rng, weights=weights)
+    folds = rng.integers(0, FOLDS, data.z.shape[1])
+    kept = FoldInformation(GaussianState(x, p))
+    for at in (slice(0, 70), slice(70, None)):
+        kept.add(folds[at], data.part(at), data.usable[:, at])
+    for fold in range(FOLDS):
+        others = Measurements(data.z, data.h, data.r, data.weight, data.usable & (folds != fold), data.gate)
+        expected = kalman.recursion(x, p, others)
+        for k in range(len(x)):
+            found = kept.without(fold, k)
+            np.testing.assert_allclose(found.x, expected.x[k], atol=1e-12)
+            np.testing.assert_allclose(found.p, expected.p[k], atol=1e-12)
+
+
+def test_folds_are_dealt_out_in_blocks_of_time_by_stamp_alone():
+    stamps = np.arange(0, 100, dtype=np.int64) * 1_000_000_000 + 1_700_000_000_000_000_000
+    folds = folds_of(stamps.tolist(), Parameters(verification_block=10.0))
+    assert set(folds.tolist()) == set(range(FOLDS))
+    assert (np.bincount(folds) == 20).all()
+    assert np.count_nonzero(np.diff(folds)) == 9
+    np.testing.assert_array_equal(folds_of(stamps[7:].tolist(), Parameters()), folds[7:])
+
+
+def test_the_held_out_error_is_the_error_of_each_sample_with_the_state_that_has_not_seen_it(rng):
+    t = rotation_from_rpy((0.1, -0.2, 0.8)).T
+    velocity, reference = rng.normal([1.5, 0, 0], 0.3, (60, 3)), rng.normal([1.4, 0, 0], 0.3, (60, 3))
+    noise = np.diag([0.01, 0.02, 0.03])
+    folds = np.arange(60) // 5 % FOLDS
+    moments = Moments()
+    moments.add(folds, Observations(velocity, reference, None, t, np.zeros(2), noise=noise[None]))
+    states = [GaussianState(rng.normal(0, 0.02, 4), np.diag(rng.uniform(1e-5, 1e-4, 4))) for _ in range(FOLDS)]
+    error = held_out_error(MODELS["M3"], states, moments, t)
+    terms = MODELS["M3"].error_terms_from_state
+    corrected, predicted = [], []
+    for v, g, fold in zip(velocity, reference, folds, strict=True):
+        errors = terms @ states[fold].x
+        corrected.append(np.sum((g - correct(v, errors[:3], errors[3:], t)) ** 2))
+        jacobian = correction_jacobian(v, t) @ terms
+        predicted.append(np.trace(noise + jacobian @ states[fold].p @ jacobian.T))
+    assert error.samples == 60
+    assert error.uncorrected == pytest.approx(np.sqrt(np.mean(np.sum((reference - velocity @ t) ** 2, axis=1))))
+    assert error.corrected == pytest.approx(np.sqrt(np.mean(corrected)))
+    assert error.predicted == pytest.approx(np.sqrt(np.mean(predicted)))
+
+
+def test_a_good_run_is_accepted_with_the_error_that_was_predicted():
+    run = MatchedRun("box", 300.0, phi=(0.005, -0.01, 0.02), scale=0.003, gnss_std=0.05, dvl_std=0.01)
+    parameters = Parameters(gnss_aided_std=np.hypot(0.05, 0.01))
+    calibrator = calibrate(make_samples(run), parameters, verified=True, block_size=512)
+    for name in ("M1", "G1"):
+        verification = calibrator.verification(name)
+        assert verification.verdict is Word.ACCEPT, verification.reasons
+        held_out = verification.held_out
+        assert held_out.corrected == pytest.approx(held_out.predicted, rel=0.05)
+        assert held_out.corrected < 0.99 * held_out.uncorrected
+        assert held_out.samples == calibrator.counts["pairing"]["paired"]
+
+
+def test_a_dvl_without_errors_is_not_rejected_for_what_correcting_nothing_adds():
+    for seed in range(10):
+        run = MatchedRun("box", 200.0, gnss_std=0.1, dvl_std=0.01, seed=seed)
+        calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.105), verified=True, block_size=512)
+        for name in ("G1", "F1"):  # of M3 it would be true: noise pulls its scale
+            assert calibrator.verification(name).verdict is not Word.REJECT
+
+
+def test_a_receiver_noisier_than_it_says_makes_the_calibration_marginal():
+    run = MatchedRun("box", 300.0, phi=(0.005, -0.01, 0.03), gnss_std=0.05)
+    calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.02), verified=True, block_size=512)
+    verification = calibrator.verification("M1")
+    assert verification.verdict is Word.MARGINAL
+    assert "noisier" in verification.reasons[0]
+
+
+def test_without_a_reference_a_calibration_is_marginal_at_best():
+    run = MatchedRun("straight", 120.0, phi=(0.0, 0.0, 0.02), gnss_every=0)
+    verification = calibrate(make_samples(run), verified=True).verification("M5")
+    assert verification.held_out is None
+    assert verification.verdict is Word.MARGINAL
+    assert "reference" in " ".join(verification.reasons)
+
+
+@pytest.mark.parametrize("block_size", [1, 512])
+def test_verification_does_not_depend_on_how_samples_are_gathered(block_size):
+    samples = make_samples(MatchedRun("box", 60.0, phi=(0.01, 0.0, 0.02), gnss_std=0.05))
+    one = calibrate(samples, verified=True, block_size=7).verification("G1").held_out
+    other = calibrate(samples, verified=True, block_size=block_size).verification("G1").held_out
+    assert other.samples == one.samples
+    assert other.corrected == pytest.approx(one.corrected, rel=1e-9)
+
+
+def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, **parameters):
+    state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), np.eye(4))
+    return verify(MODELS["M3"], state, convergence, held_out, Parameters(**parameters))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word", "reason"),
+    [
+        ({}, Word.ACCEPT, "0.050 with it"),
+        ({"degrees": 2.1}, Word.MARGINAL, "misalignment is 2.1"),
+        ({"degrees": 2.1, "accept_misalignment": 0.1}, Word.ACCEPT, "0.050 with it"),
+        ({"degrees": 5.1}, Word.REJECT, "mounting_rpy"),
+        ({"scale": 0.051}, Word.REJECT, "scale"),
+        ({"scale": -0.051}, Word.REJECT, "scale"),
+        ({"scale": 0.051, "max_scale_error": 0.1}, Word.ACCEPT, "0.050 with it"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002)}, Word.REJECT, "worse"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002)}, Word.MARGINAL, "noisier"),
+        (
+            {"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002), "max_error_ratio": 1.3},
+            Word.ACCEPT,
+            "0.060 with it",
+        ),
+        ({"held_out": HeldOutError(1000, 0.10, 0.0501, 0.05, 0.002)}, Word.ACCEPT, "0.050 with it"),
+        ({"held_out": HeldOutError(1000, 0.0500, 0.0501, 0.0501, 0.002)}, Word.ACCEPT, "0.050 with it"),
+        ({"held_out": None}, Word.MARGINAL, "reference"),
+        ({"convergence": Convergence.COLLECTING}, Word.MARGINAL, "none of the angles"),
+        ({"degrees": 3.0, "scale": 0.06}, Word.REJECT, "scale"),
+    ],
+)
+def test_the_verdict_and_its_first_reason(arguments, word, reason):
+    verification = judged(**arguments)
+    assert verification.verdict is word
+    assert reason in verification.reasons[0]

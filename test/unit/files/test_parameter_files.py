@@ -1,0 +1,188 @@
+"""Parameter files mean the same offline as to ROS 2, and what is wrong in one is named with file and parameter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.parameter_files import load_parameters, parameter_file_text, parameter_table
+
+
+def file_with(folder: Path, text: str) -> Path:
+    path = folder / "params.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/**: {ros__parameters: {min_speed: 0.5}}",
+        "/*: {ros__parameters: {min_speed: 0.5}}",
+        "dvl_calibration: {ros__parameters: {min_speed: 0.5}}",
+        "/dvl_calibration: {ros__parameters: {min_speed: 0.5}}",
+        "/auv/dvl_calibration: {ros__parameters: {min_speed: 0.5}}",
+        "/auv/*: {ros__parameters: {min_speed: 0.5}}",
+        "/**/dvl_calibration: {ros__parameters: {min_speed: 0.5}}",
+        "auv: {sensors: {dvl_calibration: {ros__parameters: {min_speed: 0.5}}}}",
+        "other: {ros__parameters: {min_speed: 9, unknown: 1}}\n/**: {ros__parameters: {min_speed: 0.5}}",
+        "/**: {ros__parameters: {min_speed: 2.0}}\ndvl_calibration: {ros__parameters: {min_speed: 0.5}}",
+        "/**: {ros__parameters: {use_sim_time: true, qos_overrides: {/clock: {depth: 1}}, min_speed: 0.5}}",
+        "/**: {ros__parameters: {min_speed: 5e-1}}",
+        "/**:\n  ros__parameters:\n    min_speed: 5.0e-1\n",
+    ],
+)
+def test_parameters_are_found_under_every_name_the_node_can_have(tmp_path, text):
+    assert load_parameters(file_with(tmp_path, text)) == Parameters(min_speed=0.5)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("min_speed", "1", 1.0),
+        ("lever_arm", "[1, 0, -2]", (1.0, 0.0, -2.0)),
+        ("initial_std_scale", "1e-3", 0.001),
+        ("initial_std_scale", "1E-3", 0.001),
+        ("initial_std_scale", ".5e-2", 0.005),
+        ("mounting_rpy", "[1e-3, -2e-1, +3e0]", (0.001, -0.2, 3.0)),
+        ("use_message_covariance", "false", False),
+        ("model", "M4", "M4"),
+        ("base_frame", "2026-05-01", "2026-05-01"),
+        ("result_file", "/data/a b.yaml", "/data/a b.yaml"),
+        ("result_file", "''", ""),
+    ],
+)
+def test_a_value_means_the_same_in_a_file_and_as_an_override(tmp_path, name, text, value):
+    in_file = load_parameters(file_with(tmp_path, f"/**: {{ros__parameters: {{{name}: {text}}}}}"))
+    overridden = load_parameters(None, [f"{name}:={text}"])
+    assert getattr(in_file, name) == getattr(overridden, name) == value
+    assert type(getattr(in_file, name)) is type(value)
+
+
+@given(name=st.sampled_from([name for name, spec in SCHEMA.items() if spec.kind == "double"]), part=st.floats(0, 1))
+def test_every_double_survives_being_written_as_text(name, part):
+    spec = SCHEMA[name]
+    value = min(max(spec.low + part * (spec.high - spec.low), spec.low), spec.high)
+    assert getattr(load_parameters(None, [f"{name}:={value!r}"]), name) == value
+
+
+WRONG = [
+    ("{mim_speed: 1.0}", "mim_speed: no such parameter, did you mean 'min_speed'"),
+    ("{a: {b: 1}}", "a.b: no such parameter"),
+    ("{1: 2}", "1: no such parameter"),
+    ("{min_speed: -1.0}", "min_speed: -1 is outside 0 .. 10 m/s"),
+    ("{min_speed: .nan}", "min_speed: nan is not finite"),
+    ("{min_speed: 1e999}", "min_speed: inf is not finite"),
+    ("{min_speed: '0.5'}", "min_speed: expected a number, got '0.5'"),
+    ("{min_speed: true}", "min_speed: expected a number"),
+    ("{min_speed: [1.0]}", "min_speed: expected a number"),
+    ("{min_speed: }", "min_speed: expected a number"),
+    ("{use_message_covariance: 1}", "use_message_covariance: expected true or false"),
+    ("{lever_arm: [1, 2]}", "lever_arm: expected an array of 3 numbers"),
+    ("{lever_arm: 1.0}", "lever_arm: expected an array of 3 numbers"),
+    ("{lever_arm: [1, 2, x]}", "lever_arm[2]: expected a number"),
+    ("{mounting_rpy: [0, 0, 7]}", "mounting_rpy[2]: 7 is outside"),
+    ("{model: M9}", "model: 'M9' is not one of auto, M1"),
+    ("{gnss_model: M7}", "gnss_model: 'M7' is not one of M1"),
+    ("{model: 3}", "model: expected text"),
+    ("[min_speed, 1]", "is not a list of name: value"),
+    ("", "is not a list of name: value"),
+    ("{min_speed: 1" + "0" * 400 + "}", "too large"),
+    ("{min_speed: 1" + "0" * 5000 + "}", "not valid YAML"),
+    ("{min_speed: [" + "[" * 3000 + "]}", "not valid YAML"),
+    ("&a {min_speed: *a}", "without aliases"),
+    ("{min_speed: !!python/object/apply:os.getcwd []}", "not valid YAML"),
+]
+
+
+@pytest.mark.parametrize(("parameters", "expected"), WRONG)
+def test_what_is_wrong_in_a_file_is_said_with_the_name_of_file_and_parameter(tmp_path, parameters, expected):
+    path = file_with(tmp_path, f"/**:\n  ros__parameters: {parameters}\n")
+    with pytest.raises(InputError) as caught:
+        load_parameters(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert expected in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "no ROS 2 parameter file"),
+        (b"min_speed: 0.5\n", "no ros__parameters in it"),
+        (b"- a\n- b\n", "no ROS 2 parameter file"),
+        (b"/**: [\n  x: {\n", "not valid YAML"),
+        (b"/**:\n\tros__parameters: 1\n", "not valid YAML"),
+        (b"/**: {ros__parameters: {base_frame: \xff\xfe}}", "no ROS 2 parameter file, not text"),
+        (bytes(range(256)), "no ROS 2 parameter file"),
+        (b"\x00\x01\x02", "not valid YAML"),
+        (b"dvl_calibratoin: {ros__parameters: {min_speed: 0.5}}", "only for dvl_calibratoin"),
+    ],
+)
+def test_a_file_that_is_no_parameter_file_is_refused_by_name(tmp_path, content, expected):
+    (tmp_path / "x.yaml").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        load_parameters(tmp_path / "x.yaml")
+    assert str(caught.value).startswith(f"{tmp_path / 'x.yaml'}: ") and expected in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
+    with pytest.raises(InputError, match="no such ROS 2 parameter file"):
+        load_parameters(tmp_path / "missing.yaml")
+    with pytest.raises(InputError, match="Is a directory"):
+        load_parameters(tmp_path)
+
+
+@given(st.binary(max_size=200))
+def test_no_file_content_raises_anything_but_input_error(tmp_path_factory, content):
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_bytes(b"/**: {ros__parameters: {model: " + content)
+    try:
+        load_parameters(path)
+    except InputError as error:
+        assert str(path) in str(error)
+
+
+def test_overrides_win_over_the_file_and_the_last_of_them_over_the_others(tmp_path):
+    path = file_with(tmp_path, "/**: {ros__parameters: {min_speed: 0.5, model: M4}}")
+    parameters = load_parameters(path, ["min_speed:=0.6", "min_speed:=0.7"])
+    assert (parameters.min_speed, parameters.model) == (0.7, "M4")
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("min_speed=1", "name:=value"),
+        ("min_speeed:=1", "did you mean 'min_speed'"),
+        ("min_speed:=fast", "min_speed: expected a number, got 'fast'"),
+        ("min_speed:=2026-13-45", "min_speed: expected a number, got '2026-13-45'"),
+        ("min_speed:=1" + "0" * 400, "too large"),
+        ("lever_arm:=[1, 2", "lever_arm: expected an array"),
+        ("min_speed:=", "min_speed: expected a number"),
+    ],
+)
+def test_a_wrong_override_is_said_with_its_name(override, expected):
+    with pytest.raises(InputError) as caught:
+        load_parameters(None, [override])
+    assert expected in str(caught.value)
+
+
+def test_parameters_of_ros_itself_can_be_given_as_overrides():
+    assert load_parameters(None, ["use_sim_time:=true"]) == Parameters()
+
+
+def test_the_generated_file_holds_every_parameter_at_its_default(tmp_path):
+    path = file_with(tmp_path, parameter_file_text())
+    assert load_parameters(path) == Parameters()
+    assert set(yaml.safe_load(path.read_text())["/**"]["ros__parameters"]) == set(SCHEMA)
+
+
+def test_the_table_has_one_row_of_five_cells_for_every_parameter():
+    rows = parameter_table().strip().splitlines()[2:]
+    assert [row.split("`")[1] for row in rows] == list(SCHEMA)
+    assert all(row.count("|") == 6 for row in rows)

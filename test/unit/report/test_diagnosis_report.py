@@ -1,0 +1,178 @@
+"""The report of a diagnosis: the answer first, held-out numbers, pictures that show what was measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import fail, succeed
+from report_fixtures import OWN_EFFECT, Page, assert_described, diagnosis, drawn
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.diagnosis.closure import Gap
+from dvl_calib_ros.diagnosis.diagnose import diagnose
+from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
+from dvl_calib_ros.report import diagnosis_report, write_diagnosis_report
+
+
+def page_of(folder, found: Diagnosis) -> Page:
+    path = folder / "diagnosis.html"
+    write_diagnosis_report(path, found)
+    return Page(path)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Page:
+    return page_of(tmp_path_factory.mktemp("diagnosis"), diagnosis())
+
+
+def positions(text: str, *parts: str) -> list[int]:
+    return [text.index(part) for part in parts]
+
+
+# ------------------------------------------------------------------ what it says
+
+
+def test_the_answer_comes_first_then_where_which_what_is_left_and_what_to_fly(page):
+    found = diagnosis()
+    order = positions(
+        page.text, "ambiguous", found.sentence, "x_m 0.300 (0.250 to 0.350) m", "32.1 mm/s", "Where the gap lies",
+        "Which effects", "Residual before and after", "What is left", found.next_manoeuvre, "The noise",
+    )  # fmt: skip
+    assert order == sorted(order)
+
+
+def test_held_out_gap_before_and_after_and_the_closure_stand_large(page):
+    start = page.text[: page.text.index("Where the gap lies")]
+    for shown in ("32.1 mm/s", "4.3 mm/s", "98 %", "91 % to 100 %", "34.6 mm/s"):
+        assert shown in start
+
+
+def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_preferred(page):
+    assert page.row("lever_arm or sideslip")[1:3] == ["85 %", "1e-20"]
+    assert "cannot tell lever_arm from sideslip" in page.text
+
+
+def test_sizes_that_this_data_cannot_show_are_marked_against_those_worth_knowing(tmp_path):
+    path = tmp_path / "diagnosis.html"
+    write_diagnosis_report(path, diagnosis())
+    html = path.read_text()
+    assert '<td class="text good">x_m 0.110 m</td>' in html  # 0.3 m would be worth knowing of
+    assert '<td class="text far">z_m 0.900 m</td>' in html
+
+
+def test_places_noise_and_untestable_effects_have_their_tables(page):
+    assert page.row("y (to port)")[1:] == ["turning", "0 to 150", "0 to 2.5", "70 %", "1e-15"]
+    assert page.row("outliers")[2] == "share 0.0200 (0.0100 to 0.0300)"
+    assert page.row("water_lock") == ["water_lock", "attitude"]
+
+
+def test_the_calibration_beside_the_effects_has_its_uncertainty(page):
+    assert "misalignment x +1.00 ± 0.10°, y −2.00 ± 0.20°, z +3.00 ± 0.30°; scale error x +1.00 ± 0.10 %" in page.text
+
+
+def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page):
+    assert "Nothing in it follows motion or time" in page.text
+    found = diagnosis()
+    rest = replace(found.series.rest, log_p=-50.0)
+    unknown = replace(found, verdict=Verdict.UNKNOWN, series=replace(found.series, rest=rest))
+    assert "still follows turn rate (p = 1.9e-22)" in page_of(tmp_path, unknown).text
+
+
+def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_path):
+    found = diagnosis()
+    series = replace(found.series, traces={})
+    nothing = replace(
+        found, verdict=Verdict.NO_GAP, sentence="No gap.", effects=(), where=(), series=series,
+        gap=Gap(0.001, 0.001, 0.03, float("nan"), (float("nan"), float("nan"))),
+    )  # fmt: skip
+    page = page_of(tmp_path, nothing)
+    assert len(page.images()) == 7  # the regimes, and three axes over time and by frequency
+    for absent in ("before", "Which effects", "Closed", "Where the gap lies", "nan"):
+        assert absent not in page.text
+
+
+def test_data_that_says_nothing_gives_a_page_without_numbers_and_pictures(tmp_path):
+    nan = float("nan")
+    found = diagnosis(
+        verdict=Verdict.INSUFFICIENT_EXCITATION, sentence="Too short.", gap=Gap(nan, nan, nan, nan, (nan, nan)),
+        effects=(), noise=(), where=(), untestable={}, minimum_detectable={}, series=None,
+    )  # fmt: skip
+    page = page_of(tmp_path, found)
+    assert page.images() == [] and page.rows == []
+    assert "insufficient excitation Too short." in page.text and "nan" not in page.text
+    assert found.next_manoeuvre in page.text
+
+
+def test_names_from_bags_and_plug_ins_are_text(page):
+    tags = [tag for tag, _ in page.tags]
+    assert not {"i", "u"} & set(tags)
+    for text in ("<b>$second$</b>", OWN_EFFECT, "<u>gaps</u>", "<i>two</i>"):
+        assert text in page.text
+
+
+# ------------------------------------------------------------------ pictures
+
+
+def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
+    figures = drawn(monkeypatch)
+    images = page_of(tmp_path, diagnosis()).images()
+    assert len(figures) >= 13
+    assert_described(images, figures)
+
+
+def test_the_gap_of_a_regime_is_what_lies_there_beyond_the_noise():
+    series = diagnosis().series
+    turning = series.regimes["turning"]
+    held = series.held_out
+    expected = np.sqrt((held.before**2 - held.floor)[turning].sum(axis=1).mean())
+    value, low, high = diagnosis_report._gap(held.before, held.floor, held.block, turning)
+    assert value == pytest.approx(expected) and low < expected < high
+    assert diagnosis_report._gap(held.after, held.floor, held.block, turning) == (0.0, 0.0, 0.0)
+
+
+def test_the_spectrum_of_white_noise_is_flat_at_its_density():
+    series = diagnosis().series
+    rng = np.random.default_rng(0)
+    n = 20_000
+    long = replace(series, time=0.2 * np.arange(n), segments=(slice(0, n),))
+    frequency, density = diagnosis_report._spectrum(long, rng.normal(0.0, 0.1, n))
+    expected = 0.1 * np.sqrt(2.0 * 0.2)  # the variance, spread evenly from 0 to 2.5 Hz
+    above = frequency > 0.01
+    assert frequency[-1] <= 2.5 and np.abs(density[above] / expected - 1.0).max() < 0.3
+
+
+# ------------------------------------------------------------------ from a bag
+
+
+def test_the_series_are_those_that_the_gap_was_measured_on(tmp_path):
+    bag = tmp_path / "lever"
+    main(["simulate", str(bag), "--duration", "200", "--gnss-std", "0.03", "--effect", "lever_arm:x_m=0.5"])
+    found = diagnose([bag], Parameters(), with_series=True)
+    held = found.series.held_out
+    n = len(found.series.time)
+    for residual, gap in ((held.before, found.gap.before), (held.after, found.gap.after)):
+        excess = ((residual**2).sum() - held.floor.sum()) / n
+        assert np.sqrt(max(0.0, excess)) == pytest.approx(gap)
+    assert set(found.series.traces) == {effect.name for effect in found.effects} == {"lever_arm"}
+    page = page_of(tmp_path, found)
+    assert page.row("lever_arm") and "lever_arm, to port" in page.text
+
+
+def test_the_command_writes_the_report_and_collects_series_only_for_it(tmp_path, capsys, monkeypatch):
+    asked = []
+
+    def answer(*_, with_series, **__):
+        asked.append(with_series)
+        return diagnosis()
+
+    monkeypatch.setattr("dvl_calib_ros.diagnosis.diagnose.diagnose", answer)
+    report = tmp_path / "report.html"
+    succeed(capsys, "diagnose", tmp_path, "--report", report)
+    succeed(capsys, "diagnose", tmp_path)
+    assert asked == [True, False]
+    assert diagnosis().sentence in Page(report).text
+    assert "does not exist" in fail(capsys, "diagnose", tmp_path, "--report", tmp_path / "none" / "report.html")
+    assert len(asked) == 2  # refused before the work

@@ -1,0 +1,329 @@
+"""Reports: what stands in them is what was found, whatever the data; nothing in a bag becomes markup."""
+
+from __future__ import annotations
+
+import base64
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import fail, in_fresh_process, succeed
+from io_fixtures import run, steady_run, write_bag
+from report_fixtures import FEW, Page, assert_described, drawn, evaluation, recorded, replay_page
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
+from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.report import write_evaluation_report
+from dvl_calib_ros.report.replay_report import write_replay_report
+from dvl_calib_ros.report.style import MODEL_STYLES
+from dvl_calib_ros.report.time_axis import TimeAxis
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A report of a replay, and what was replayed."""
+    path, replayed = replay_page(tmp_path_factory.mktemp("report"), models=MODELS)
+    return Page(path), replayed
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory) -> Page:
+    path = tmp_path_factory.mktemp("evaluation") / "evaluation.html"
+    write_evaluation_report(path, evaluation())
+    return Page(path)
+
+
+# ------------------------------------------------------------------ what it says
+
+
+def test_the_verdict_on_the_selected_model_comes_first_with_its_reasons(made):
+    page, replayed = made
+    verification = replayed.result.verifications[replayed.result.selected]
+    start = page.text.index(verification.verdict.value)
+    assert start < page.text.index(verification.reasons[0]) < page.text.index("Estimates")
+
+
+def test_the_held_out_errors_of_every_model_are_shown(made):
+    page, replayed = made
+    for name, verification in replayed.result.verifications.items():
+        error = verification.held_out
+        numbers = [f"{value:.4f}" for value in (error.uncorrected, error.corrected, error.predicted)]
+        assert page.row(name)[1:] == [*numbers, str(error.samples), verification.verdict.value]
+
+
+def test_without_verification_the_report_says_so(tmp_path, made):
+    replayed = made[1]
+    unverified = replace(replayed, result=replace(replayed.result, verifications={}))
+    write_replay_report(tmp_path / "report.html", unverified, [tmp_path], FEW)
+    text = Page(tmp_path / "report.html").text
+    assert "not verified" in text and "Held-out" not in text
+
+
+def test_the_table_holds_every_models_estimates_in_degrees_and_per_cent(made):
+    page, replayed = made
+    for name, estimate in replayed.result.estimates.items():
+        row = next(row for row in page.rows if row and row[0] == name and len(row) > 6)
+        yaw = f"{np.degrees(estimate.state[2]):+.2f} ± {np.degrees(estimate.std[2]):.2f}".replace("-", "−")
+        assert row[3].startswith(yaw)
+        assert row[-4:-2] == [str(estimate.used), str(estimate.gated)]
+
+
+def test_the_selected_models_errors_stand_large_on_top(made):
+    page, replayed = made
+    state, std = replayed.result.estimate.state, replayed.result.estimate.std
+    summary = page.text[: page.text.index("Corrected mounting")].replace("−", "-")
+    assert f"φz – misalignment about z {np.degrees(state[2]):+.2f}° ± {np.degrees(std[2]):.2f}°" in summary
+    assert f"{100 * state[3]:+.2f} % ± {100 * std[3]:.2f} %" in summary
+
+
+def test_the_static_transform_can_be_pasted(made):
+    assert "ros2 run tf2_ros static_transform_publisher --x 0 --y 0 --z 0 --qx" in made[0].text
+
+
+def test_the_type_of_the_dvls_data_is_shown(made):
+    assert "DVL data geometry_msgs/msg/TwistWithCovarianceStamped" in made[0].text
+
+
+def test_warnings_are_shown(tmp_path):
+    samples = [sample for sample in run() if isinstance(sample, DvlSample)]
+    path, replayed = replay_page(tmp_path, samples)
+    assert replayed.notes and all(note in Page(path).text for note in replayed.notes)
+
+
+def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
+    figures = drawn(monkeypatch)
+    page = Page(replay_page(tmp_path, models=MODELS)[0])
+    path = tmp_path / "evaluation.html"
+    write_evaluation_report(path, evaluation())
+    images = [*page.images(), *Page(path).images()]
+    assert len(figures) > 25
+    assert_described(images, figures)
+
+
+def test_models_can_be_told_apart_and_look_the_same_everywhere():
+    assert set(MODEL_STYLES) == set(MODELS)
+    assert len(set(MODEL_STYLES.values())) == len(MODELS)
+
+
+def test_the_same_data_gives_the_same_figures(tmp_path, made):
+    again = tmp_path / "again.html"
+    bag = tmp_path / "bag"
+    write_replay_report(again, made[1], [bag], FEW)
+    write_replay_report(tmp_path / "twice.html", made[1], [bag], FEW)
+    assert Page(again).images() == Page(tmp_path / "twice.html").images() != []
+
+
+# ------------------------------------------------------------------ self-contained and safe
+
+
+def test_the_page_loads_nothing_and_runs_nothing(made, evaluated):
+    for page in (made[0], evaluated):
+        names = {tag for tag, _ in page.tags}
+        assert not names & {"script", "iframe", "object", "form"}
+        sources = [value for _, attributes in page.tags for key, value in attributes.items() if key in ("src", "href")]
+        assert sources and all(source.startswith("data:") for source in sources)
+        policy = next(attributes["content"] for tag, attributes in page.tags if "http-equiv" in attributes)
+        assert "default-src 'none'" in policy and "script" not in policy
+
+
+def test_nothing_in_a_bag_becomes_markup(tmp_path):
+    folder = tmp_path / "<script>alert(1)<"
+    folder.mkdir()
+    path, replayed = replay_page(folder, dvl_frame='x"><img src=x onerror=alert(2)>')
+    assert replayed.dvl_frame.startswith('x">')
+    page = Page(path)
+    assert "script" not in {tag for tag, _ in page.tags}
+    assert all(image["src"].startswith("data:image/svg+xml;base64,") for image in page.images())
+    assert "<script>alert(1)<" in page.text and "onerror=alert(2)" in page.text
+
+
+def test_names_of_trajectories_are_text_in_tables_and_figures(evaluated):
+    assert "T$1$<b>" in evaluated.text and "T99 is <i>missing</i>" in evaluated.text
+    assert not {"b>", "i"} & {tag for tag, _ in evaluated.tags}
+    figures = [base64.b64decode(image["src"].split(",")[1]) for image in evaluated.images()]
+    assert not any(b"mathdefault" in figure for figure in figures)
+
+
+# ------------------------------------------------------------------ unusual data
+
+
+def test_a_bag_without_gnss_has_no_residuals(tmp_path):
+    samples = [sample for sample in run() if not isinstance(sample, ReferenceSample)]
+    page = Page(replay_page(tmp_path, samples)[0])
+    assert "No DVL sample has a reference velocity" in page.text
+    assert "Residual" not in page.text and "Models with GNSS" not in page.text and "Models without GNSS" in page.text
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_report_of_hardly_any_samples(tmp_path, count):
+    page = Page(replay_page(tmp_path, steady_run(count))[0])
+    assert f"{count} of the DVL" in page.text and len(page.images()) > 3
+
+
+def test_a_vehicle_that_stands_still(tmp_path):
+    still = [sample._replace(velocity=(0.0, 0.0, 0.0)) for sample in steady_run(50)]
+    page = Page(replay_page(tmp_path, still)[0])
+    assert "50 slow" in page.text
+
+
+def test_the_hours_between_two_bags_are_cut_out():
+    morning = np.arange(0, 100) * SECOND
+    stamps = np.concatenate([morning, morning + 80_000 * SECOND])
+    axis = TimeAxis(stamps)
+    assert axis(stamps)[-1] < 210.0 and len(axis.breaks) == 1 and "cut out" in axis.label
+    assert (np.diff(axis(stamps)) > 0.0).all()
+    whole = TimeAxis(morning)
+    assert not len(whole.breaks) and np.allclose(whole(morning), np.arange(100))
+
+
+@pytest.mark.parametrize(("seconds", "unit"), [(300, ", s"), (3_000, ", min"), (30_000, ", h")])
+def test_time_has_a_fitting_unit(seconds, unit):
+    axis = TimeAxis(np.linspace(0, seconds * SECOND, 1000).astype(np.int64))
+    assert axis.label.endswith(unit) and 1.0 < axis([seconds * SECOND])[0] <= 600.0
+
+
+# ------------------------------------------------------------------ recorder
+
+
+def test_recording_does_not_change_the_estimates(tmp_path):
+    bag = write_bag(tmp_path / "bag", run())
+    plain, with_history = replay([bag], Parameters()).result, recorded(bag).result
+    for name, estimate in plain.estimates.items():
+        other = with_history.estimates[name]
+        assert (estimate.used, estimate.gated) == (other.used, other.gated)
+        np.testing.assert_allclose(other.state, estimate.state, atol=1e-12)
+        np.testing.assert_allclose(other.covariance, estimate.covariance, atol=1e-12)
+
+
+def test_the_history_ends_with_the_result_and_holds_what_the_models_saw(tmp_path):
+    replayed = recorded(write_bag(tmp_path / "bag", run()))
+    history, result = replayed.history, replayed.result
+    for name, estimate in result.estimates.items():
+        np.testing.assert_allclose(history.models[name].state[-1], estimate.state, atol=1e-12)
+        np.testing.assert_allclose(history.models[name].std[-1], estimate.std, atol=1e-12)
+    assert len(history.dvl_ns) == result.counts["dvl"]["usable"]
+    assert len(history.paired_ns) == result.counts["pairing"]["paired"]
+    assert np.abs(history.paired_velocity - history.reference_velocity).max() < 0.6
+
+
+@pytest.mark.parametrize("expected", [0, 7, 1000, 10**6])
+@pytest.mark.parametrize("length", [5, 1000, 12_345])
+def test_a_series_of_any_length_is_thinned_evenly(length, expected):
+    series: Thinned[int] = Thinned(100, expected)
+    for i in range(length):
+        if series.wants_next():
+            series.keep(i)
+    assert 1 <= len(series.rows) <= 100
+    assert len(set(np.diff(series.rows))) <= 1
+    if length >= expected:
+        assert len(series.rows) >= min(length, 50)
+
+
+def test_a_long_recording_takes_no_more_memory_than_a_short_one(tmp_path):
+    history = recorded(write_bag(tmp_path / "bag", steady_run(2000))).history
+    assert KEPT_STATES // 2 <= len(history.stamps_ns) <= KEPT_STATES + 1
+    assert KEPT_VELOCITIES // 2 <= len(history.dvl_ns) <= KEPT_VELOCITIES
+
+
+def test_after_a_restart_the_history_starts_anew():
+    recorder = Recorder()
+    calibrator = Calibrator(Parameters(), block_size=8, on_block=recorder.observe)
+    first = steady_run(100)
+    later = [sample._replace(stamp_ns=sample.stamp_ns + 1_000 * SECOND) for sample in steady_run(300)]
+    for sample in [*later, *first]:
+        if isinstance(sample, ReferenceSample):
+            calibrator.feed_reference(sample)
+        elif calibrator.feed_dvl(sample):
+            recorder.note(calibrator)
+    history = recorder.history(calibrator)
+    assert calibrator.restarts == 1
+    for stamps in (history.stamps_ns, history.dvl_ns, history.paired_ns):
+        assert first[0].stamp_ns <= min(stamps) and max(stamps) <= first[-1].stamp_ns
+
+
+# ------------------------------------------------------------------ command
+
+
+def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag", run())
+    report = tmp_path / "report.html"
+    report.write_text("old")
+    succeed(capsys, "replay", bag, "--report", report, "--models", "M7")
+    assert (tmp_path / "report.html.bak").read_text() == "old"
+    page = Page(report)
+    shown = {row[0] for row in page.rows if row and row[0] in MODELS}
+    assert shown == {"M7", Parameters().gnss_model}  # what was asked for, and the selected one
+
+
+def test_a_report_that_cannot_be_written_is_refused_before_the_replay(tmp_path, capsys):
+    bag = write_bag(tmp_path / "bag", run())
+    assert "does not exist" in fail(capsys, "replay", bag, "--report", tmp_path / "none" / "report.html")
+    assert "is a folder" in fail(capsys, "replay", bag, "--report", tmp_path)
+    same = tmp_path / "same"
+    message = fail(capsys, "replay", bag, "--report", same, "--json", same)
+    assert "--report" in message and "--json" in message and not same.exists()
+
+
+def test_a_bad_bag_leaves_no_report(tmp_path, capsys):
+    report = tmp_path / "report.html"
+    fail(capsys, "replay", tmp_path / "none", "--report", report)
+    assert not report.exists()
+
+
+def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, capsys, monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("dvl_calib_ros.report")]:
+        monkeypatch.delitem(sys.modules, name)
+    import dvl_calib_ros
+
+    monkeypatch.delattr(dvl_calib_ros, "report")
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    bag = write_bag(tmp_path / "bag", run())
+    assert "pip install matplotlib jinja2" in fail(capsys, "replay", bag, "--report", tmp_path / "report.html")
+
+
+def test_a_replay_without_report_imports_no_plots(tmp_path):
+    bag = write_bag(tmp_path / "bag", run())
+    statement = f"from dvl_calib_ros.cli.main import main; main(['replay', {str(bag)!r}])"
+    assert in_fresh_process(statement, ["matplotlib", "jinja2", "dvl_calib_ros.report"]) == []
+
+
+# ------------------------------------------------------------------ evaluation
+
+
+def test_the_summary_of_an_evaluation_names_the_best_of_each_kind(evaluated):
+    best_free = next(name for name, model in MODELS.items() if not model.aided)
+    assert "Best with GNSS: M1 with 0.0300 m/s, 75 % less than uncalibrated" in evaluated.text
+    assert f"Best without GNSS: {best_free} with" in evaluated.text
+
+
+def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_path):
+    path = tmp_path / "evaluation.html"
+    write_evaluation_report(path, evaluation())
+    html = path.read_text()
+    assert '<td class="good">0.0300<small>0.0301 ×1.00</small></td>' in html
+    assert '<td class="bad">' in html  # M2, far from the 0.10 of the made-up publication
+    last = list(MODELS)[-1]
+    assert Page(path).row(last)[2:4] == ["–", "–"]  # no attitude there: neither the set nor the mean
+
+
+def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
+    path = tmp_path / "evaluation.html"
+    write_evaluation_report(path, evaluation(own_generator=True))
+    page = Page(path)
+    assert "simulated" in page.text and "×" not in page.text and "Rings: published" not in page.text
+
+
+def test_an_evaluation_without_studies_has_no_empty_sections(tmp_path):
+    path = tmp_path / "evaluation.html"
+    bare = evaluation(each=None, errors_in_variables=None, traces=(), held_out=(), coverage=())
+    write_evaluation_report(path, bare)
+    text = Page(path).text
+    for section in ("Can the uncertainty", "pulls the scale", "each run", "before and after", "Held-out"):
+        assert section not in text
