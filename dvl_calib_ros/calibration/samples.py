@@ -1,15 +1,27 @@
-"""What the calibration core is fed with: one immutable tuple per measurement.
+"""What the calibration core is fed with: samples of three streams, one by one (live) or as columns (recordings).
 
-Tuples of plain floats, not arrays: a sample is built and read once, at up to kHz rates, and a float costs a tenth of
-an array element there. Stamps are integer nanoseconds; a float second would lose the nanoseconds of 2026.
+A live sample is a tuple of plain floats, not arrays: it is built and read once, at up to kHz rates, and a float costs a
+tenth of an array element there. A recording's samples come as a `SampleBlock`, one row per message. Stamps are
+integer nanoseconds; a float second would lose the nanoseconds of 2026.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from .frames import Array, Quaternion, Vector
+
+Stamps = NDArray[np.int64]
+Codes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Index = NDArray[np.intp]
 
 
 class VelocityFrame(Enum):
@@ -18,6 +30,11 @@ class VelocityFrame(Enum):
     BODY = "body"
     ENU = "enu"
     NED = "ned"
+
+
+# A row's frame is its place in this tuple.
+FRAMES: tuple[VelocityFrame, ...] = tuple(VelocityFrame)
+FRAME_CODES = {frame: code for code, frame in enumerate(FRAMES)}
 
 
 class DvlSample(NamedTuple):
@@ -52,3 +69,297 @@ class ImuSample(NamedTuple):
     stamp_ns: int
     orientation: Quaternion | None
     angular_velocity: Vector | None
+
+
+Sample = DvlSample | ReferenceSample | ImuSample
+
+
+class Stream(Enum):
+    """The three streams, by the names that they are counted under."""
+
+    DVL = "dvl"
+    REFERENCE = "reference"
+    IMU = "imu"
+
+
+# Columns of values: velocity (m/s); of the IMU a quaternion (x, y, z, w) and the angular velocity (rad/s).
+_WIDTH = {Stream.DVL: 3, Stream.REFERENCE: 3, Stream.IMU: 7}
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Velocity covariances of N rows, of which few are distinct: most drivers send the same with every message.
+
+    distinct: (C, 3, 3) (m/s)², as the messages have them. index: (N,) which of them is a row's, -1 where its message
+    gives none.
+    """
+
+    distinct: Array
+    index: Index
+
+    @staticmethod
+    def none(n: int) -> Covariances:
+        """Of n rows without covariance."""
+        return Covariances(np.zeros((0, 3, 3)), np.full(n, -1, dtype=np.intp))
+
+    @staticmethod
+    def of(values: Array, n: int) -> Covariances:
+        """From one (3, 3) of all rows, or (N, 3, 3); what a row repeats of the one before is kept once."""
+        values = np.asarray(values, dtype=float)
+        if values.shape == (3, 3):
+            return Covariances(values[None], np.zeros(n, dtype=np.intp))
+        if values.shape != (n, 3, 3):
+            raise ValueError(f"covariance: expected (3, 3) or ({n}, 3, 3), got {values.shape}")
+        if not n:
+            return Covariances.none(0)
+        raw = np.ascontiguousarray(values).reshape(n, 9).view(np.int64)  # bits, so that nan repeats nan
+        changes = np.concatenate([[True], (raw[1:] != raw[:-1]).any(axis=1)])
+        return Covariances(values[changes], np.cumsum(changes) - 1)
+
+    def part(self, at: slice | Index | Mask) -> Covariances:
+        """The rows of a slice, of indices or of a mask."""
+        return Covariances(self.distinct, self.index[at])
+
+    def joined(self, other: Covariances) -> Covariances:
+        """These rows and then others."""
+        shifted = np.where(other.index < 0, -1, other.index + len(self.distinct))
+        return Covariances(
+            np.concatenate([self.distinct, other.distinct]), np.concatenate([self.index, shifted]).astype(np.intp)
+        )
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """Columns of one stream: N messages in their order of arrival.
+
+    stream: whose they are. stamps_ns: (N,) of the header. values: (N, 3) velocity, m/s, in the DVL's frame or in that
+    of `frames`; of the IMU (N, 7), a unit quaternion (x, y, z, w) of ``rotation_enu_from_body`` and the angular
+    velocity, rad/s, body frame, nan where a message does not give one. covariances: of velocities. frames: (N,) of the
+    reference, places in `FRAMES`. refused: (N,) 0 for a sample, else 1 + the place in `reasons` of why the message is
+    none (wrong frame, no bottom lock, undecodable ...); the row's other columns then mean nothing. arrival: (N,)
+    strictly increasing, by which the rows of all streams are put in the order in which they arrived.
+    """
+
+    stream: Stream
+    stamps_ns: Stamps
+    values: Array
+    covariances: Covariances
+    arrival: Stamps
+    frames: Codes
+    refused: Codes
+    reasons: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        shapes = {
+            "values": (self.values.shape, (n, _WIDTH[self.stream])),
+            "covariances": (self.covariances.index.shape, (n,)),
+            **{name: (getattr(self, name).shape, (n,)) for name in ("arrival", "frames", "refused")},
+        }
+        for name, (found, expected) in shapes.items():
+            if found != expected:
+                raise ValueError(f"{self.stream.value} block: {name} has shape {found}, expected {expected}")
+        if self.stamps_ns.dtype != np.int64:
+            raise ValueError(f"{self.stream.value} block: stamps_ns are {self.stamps_ns.dtype}, expected int64")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def orientation(self) -> Array:
+        """(N, 4) of the IMU."""
+        return self.values[:, :4]
+
+    @property
+    def angular_velocity(self) -> Array:
+        """(N, 3) rad/s of the IMU."""
+        return self.values[:, 4:]
+
+    def part(self, at: slice | Index | Mask) -> SampleBlock:
+        """The rows of a slice, of indices or of a mask."""
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[at],
+            values=self.values[at],
+            covariances=self.covariances.part(at),
+            arrival=self.arrival[at],
+            frames=self.frames[at],
+            refused=self.refused[at],
+        )
+
+    def joined(self, other: SampleBlock) -> SampleBlock:
+        """These rows and then others, of the same stream."""
+        reasons = (*self.reasons, *(reason for reason in other.reasons if reason not in self.reasons))
+        code = np.array([0, *(1 + reasons.index(reason) for reason in other.reasons)], dtype=np.uint8)
+        return SampleBlock(
+            self.stream,
+            np.concatenate([self.stamps_ns, other.stamps_ns]),
+            np.concatenate([self.values, other.values]),
+            self.covariances.joined(other.covariances),
+            np.concatenate([self.arrival, other.arrival]),
+            np.concatenate([self.frames, other.frames]),
+            np.concatenate([self.refused, code[other.refused]]),
+            reasons,
+        )
+
+    def shifted(self, offset_ns: int) -> SampleBlock:
+        """The same with other stamps."""
+        return replace(self, stamps_ns=self.stamps_ns + offset_ns)
+
+    def samples(self) -> Iterator[Sample | str]:
+        """Row by row as live: the sample, or why a message is none."""
+        covariances: list[Array | None] = [*self.covariances.distinct, None]  # -1 is the last one
+        rows = zip(
+            self.stamps_ns.tolist(), self.values.tolist(), self.covariances.index.tolist(), self.frames.tolist(),
+            self.refused.tolist(), strict=True,
+        )  # fmt: skip
+        for stamp_ns, values, covariance, frame, refused in rows:
+            if refused:
+                yield self.reasons[refused - 1]
+            elif self.stream is Stream.DVL:
+                yield DvlSample(stamp_ns, tuple(values), covariances[covariance])
+            elif self.stream is Stream.REFERENCE:
+                yield ReferenceSample(stamp_ns, tuple(values), covariances[covariance], FRAMES[frame])
+            else:
+                orientation, rate = tuple(values[:4]), tuple(values[4:])
+                yield ImuSample(
+                    stamp_ns,
+                    orientation if orientation[0] == orientation[0] else None,  # nan: not given
+                    rate if rate[0] == rate[0] else None,
+                )
+
+
+def sample_block(
+    stream: Stream,
+    stamps_ns: Stamps,
+    values: Array,
+    *,
+    covariance: Array | Covariances | None = None,
+    frames: VelocityFrame | Codes = VelocityFrame.BODY,
+    arrival: Stamps | None = None,
+    refused: Codes | None = None,
+    reasons: Sequence[str] = (),
+) -> SampleBlock:
+    """A `SampleBlock`, with what is the same for all rows given once.
+
+    covariance: (3, 3) or (N, 3, 3) (m/s)², None where not given. frames: one, or (N,) places in `FRAMES`. arrival: by
+    default in the order of the rows, and of use only if it is the one stream.
+    """
+    n = len(stamps_ns)
+    if not isinstance(covariance, Covariances):
+        covariance = Covariances.none(n) if covariance is None else Covariances.of(covariance, n)
+    return SampleBlock(
+        stream,
+        np.asarray(stamps_ns, dtype=np.int64),
+        np.asarray(values, dtype=float).reshape(n, _WIDTH[stream]),
+        covariance,
+        np.arange(n, dtype=np.int64) if arrival is None else np.asarray(arrival, dtype=np.int64),
+        np.full(n, FRAME_CODES[frames], dtype=np.uint8) if isinstance(frames, VelocityFrame) else frames,
+        np.zeros(n, dtype=np.uint8) if refused is None else refused,
+        tuple(reasons),
+    )
+
+
+def no_samples(stream: Stream) -> SampleBlock:
+    """A block without rows."""
+    return sample_block(stream, np.zeros(0, dtype=np.int64), np.zeros((0, _WIDTH[stream])))
+
+
+class Streams(NamedTuple):
+    """What arrived on all three streams in one stretch of a recording; `SampleBlock.arrival` says in which order."""
+
+    dvl: SampleBlock
+    reference: SampleBlock = no_samples(Stream.REFERENCE)
+    imu: SampleBlock = no_samples(Stream.IMU)
+
+    def arriving_by_stamp(self) -> Streams:
+        """The same as if every message arrived when it was stamped; at the same stamp IMU, reference, DVL."""
+        blocks = (self.imu, self.reference, self.dvl)
+        stamps = np.concatenate([block.stamps_ns for block in blocks])
+        arrival = np.empty(len(stamps), dtype=np.int64)
+        arrival[np.argsort(stamps, kind="stable")] = np.arange(len(stamps))
+        first, second = len(self.imu), len(self.imu) + len(self.reference)
+        imu, reference, dvl = (
+            replace(block, arrival=at)
+            for block, at in zip(blocks, (arrival[:first], arrival[first:second], arrival[second:]), strict=True)
+        )
+        return Streams(dvl, reference, imu)
+
+    def in_order(self) -> Iterator[tuple[Stream, Sample | str]]:
+        """All rows as live, in their order of arrival."""
+        rows = [block.samples() for block in self]
+        streams = np.repeat(np.arange(3), [len(block) for block in self])
+        order = np.argsort(np.concatenate([block.arrival for block in self]), kind="stable")
+        for stream in streams[order].tolist():
+            yield self[stream].stream, next(rows[stream])
+
+
+class Verdict:
+    """Why a DVL sample in order is not used by any model; `USED` if it is. Codes of `AlignedBlock.verdict`."""
+
+    USED, SLOW, FROZEN, TURNING, NO_TURN_RATE = range(5)
+    NAMES = ("used", "slow", "frozen", "turning", "no_turn_rate")
+
+
+class Pairing:
+    """Whether a DVL sample has a reference velocity, or why not. Codes of `AlignedBlock.pairing`."""
+
+    AWAITING, PAIRED, UNPAIRED, WITHOUT_ATTITUDE = range(4)
+    NAMES = ("awaiting_reference", "paired", "unpaired", "without_attitude")
+
+
+@dataclass(frozen=True)
+class AlignedBlock:
+    """N DVL samples in order of stamps, with what the other streams say at their times.
+
+    stamps_ns: (N,) compensated for dvl_time_offset. row: (N,) number of the DVL's message since the start, from 0.
+    velocity_dvl: (N, 3) m/s, DVL frame. covariances: of it. interval_ns: (N,) since the sample before, 0 for the
+    first. verdict: (N,) see `Verdict`. orientation: (N, 4) quaternion (x, y, z, w) of ``rotation_enu_from_body``, and
+    angular_velocity: (N, 3) rad/s, body frame, interpolated; nan where not known. pairing: (N,) see `Pairing`.
+    reference: (N, 3) m/s interpolated, in the frame of frames: (N,) places in `FRAMES`; nan where unpaired.
+    reference_covariance: (N, 3, 3) (m/s)² in that frame, nan where not given; None where no row has one. weight: (N,)
+    share of its own information that a sample's reference brings: below 1 where neighbours share it. around_s: (N, 2) s
+    since the reference sample before and until the one after, between which `reference` lies on a straight line; zeros
+    where it is one sample's own. prior_known: (N,) whether prior sway and heave were known by then.
+    """
+
+    stamps_ns: Stamps
+    row: Stamps
+    velocity_dvl: Array
+    covariances: Covariances
+    interval_ns: Stamps
+    verdict: Codes
+    orientation: Array
+    angular_velocity: Array
+    pairing: Codes
+    reference: Array
+    frames: Codes
+    weight: Array
+    around_s: Array
+    reference_covariance: Array | None = None
+    prior_known: Mask = field(default_factory=lambda: np.ones(0, dtype=bool))
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @cached_property
+    def usable(self) -> Mask:
+        """(N,) rows for models that need nothing else."""
+        return self.verdict == Verdict.USED
+
+    @cached_property
+    def oriented(self) -> Mask:
+        """(N,) rows for models that need attitude and angular velocity."""
+        return self.usable & ~np.isnan(self.orientation[:, 0]) & ~np.isnan(self.angular_velocity[:, 0])
+
+    @cached_property
+    def paired(self) -> Mask:
+        """(N,) rows for models that need a reference velocity."""
+        return self.usable & (self.pairing == Pairing.PAIRED)
+
+    def reasons(self) -> list[str]:
+        """(N,) in words, why a row does not go to every model: the gates' verdict, else the pairing's."""
+        return [
+            Verdict.NAMES[verdict] if verdict else Pairing.NAMES[pairing]
+            for verdict, pairing in zip(self.verdict.tolist(), self.pairing.tolist(), strict=True)
+        ]
