@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from .bank import ModelBank, nis_bounds
+from .clocks import Clocks
 from .folds import Moments, folds_of
 from .frames import ENU_FROM_NED, Array, Quaternion, Vector, rotation_from_quaternion, slerp
 from .kalman import GaussianState, Mask
@@ -123,7 +124,7 @@ class Calibrator:
         self._on_event = on_event
         self._on_block = on_block
         self._verified = verified
-        self._offset_ns = round(parameters.dvl_time_offset * 1e9)
+        self._clocks = Clocks.of(parameters)
         self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
         self._lever_arm: Vector | None = (
             tuple(parameters.lever_arm) if any(parameters.lever_arm) else None  # type: ignore[assignment]
@@ -141,7 +142,9 @@ class Calibrator:
         p = self.parameters
         self.restarts = 0
         jump_ns = self._max_jump_ns = round(p.max_time_jump * 1e9)
-        latency_ns = round(p.max_latency * 1e9)
+        self._first_stamp_ns: int | None = None
+        # one stream that is stamped late lags the others by as much once that is put right
+        latency_ns = round(p.max_latency * 1e9) + self._clocks.spread_ns
         gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
         retention_ns = RETENTION_NS + gnss_ns + imu_ns + latency_ns
         self._dvl_order: Sequencer[DvlSample] = Sequencer(jump_ns)
@@ -196,7 +199,10 @@ class Calibrator:
         if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
             tally["invalid"] += 1
             return None
-        sample = DvlSample(sample.stamp_ns - self._offset_ns, sample.velocity, covariance)
+        if self._first_stamp_ns is None:
+            self._first_stamp_ns = sample.stamp_ns
+        true_ns = self._clocks.dvl(sample.stamp_ns, self._first_stamp_ns)
+        sample = DvlSample(true_ns, sample.velocity, covariance)
         order, admitted = self._dvl_order.admit(sample)
         self._count_order(tally, order)
         if order is Order.CONFIRMED_RESTART:
@@ -229,10 +235,11 @@ class Calibrator:
         if not valid or not is_valid_velocity(sample.velocity, self.parameters.max_speed):
             tally["invalid"] += 1
             return
-        if self._decided_ns is not None and sample.stamp_ns < self._decided_ns:
+        stamp_ns = sample.stamp_ns - self._clocks.reference_ns
+        if self._decided_ns is not None and stamp_ns < self._decided_ns:
             tally["late"] += 1  # a DVL sample has gone on without it: max_latency is too short
-        if covariance is not sample.covariance:
-            sample = ReferenceSample(sample.stamp_ns, sample.velocity, covariance, sample.frame)
+        if covariance is not sample.covariance or stamp_ns != sample.stamp_ns:
+            sample = ReferenceSample(stamp_ns, sample.velocity, covariance, sample.frame)
         self._keep("reference", self._reference_order, self._reference, sample)
 
     def feed_imu(self, sample: ImuSample) -> None:
@@ -248,7 +255,8 @@ class Calibrator:
         if orientation is None and angular_velocity is None:
             tally["invalid"] += 1
             return
-        if orientation is not given or angular_velocity is not sample.angular_velocity:
+        stamp_ns -= self._clocks.imu_ns
+        if (stamp_ns, orientation, angular_velocity) != sample:
             sample = ImuSample(stamp_ns, orientation, angular_velocity)
         self._keep("imu", self._imu_order, self._imu, sample)
 

@@ -181,6 +181,41 @@ class Parameters:
         low=-10.0,
         high=10.0,
     )
+    reference_time_offset: float = _parameter(
+        0.0,
+        "Positive: reference (GNSS) stamps are late. Taken off before pairing.",
+        unit="s",
+        low=-10.0,
+        high=10.0,
+    )
+    imu_time_offset: float = _parameter(
+        0.0,
+        "Positive: IMU stamps (attitude and angular velocity) are late. Taken off before pairing.",
+        unit="s",
+        low=-10.0,
+        high=10.0,
+    )
+    dvl_clock_drift: float = _parameter(
+        0.0,
+        "By how much DVL stamps get later per second since the first (the DVL's clock runs fast). Taken off.",
+        unit="s/s",
+        low=-0.01,
+        high=0.01,
+    )
+    dvl_time_jump: float = _parameter(
+        0.0,
+        "By how much DVL stamps are later still from dvl_time_jump_at on. Taken off.",
+        unit="s",
+        low=-10.0,
+        high=10.0,
+    )
+    dvl_time_jump_at: float = _parameter(
+        0.0,
+        "DVL stamp (s since 1970) from which on dvl_time_jump holds.",
+        unit="s",
+        low=0.0,
+        high=2.0**31,
+    )
     initial_std_misalignment: float = _parameter(
         0.05,
         "Prior standard deviation of each misalignment angle.",

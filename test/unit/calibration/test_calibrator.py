@@ -59,6 +59,39 @@ def test_late_dvl_stamps_are_compensated_before_pairing():
     assert np.abs(late.state("M1").x - [*PHI, SCALE]).max() > 1e-5
 
 
+@pytest.mark.parametrize("late_s", [3.4, -3.4])
+def test_streams_late_by_seconds_are_paired_once_that_is_said_even_beyond_the_latency(late_s):
+    samples = make_samples(EXACT)
+    names = {DvlSample: "dvl_time_offset", ReferenceSample: "reference_time_offset", ImuSample: "imu_time_offset"}
+    expected = calibrate(samples, WIDE)
+    for kind, name in names.items():
+        late = [
+            sample._replace(stamp_ns=sample.stamp_ns + round(late_s * 1e9)) if isinstance(sample, kind) else sample
+            for sample in samples
+        ]
+        right = calibrate(late, WIDE.replace(**{name: late_s}))
+        assert right.counts["pairing"] == expected.counts["pairing"], name
+        np.testing.assert_allclose(right.state("M1").x, expected.state("M1").x, atol=1e-9)
+
+
+def test_a_dvl_clock_that_drifts_and_jumps_is_put_right():
+    samples = make_samples(EXACT)
+    first_ns = next(sample.stamp_ns for sample in samples if isinstance(sample, DvlSample))
+    jump_at_ns = first_ns + 30_000_000_000
+
+    def stamped(sample):
+        if not isinstance(sample, DvlSample):
+            return sample
+        stamp_ns = sample.stamp_ns + round(1e-3 * (sample.stamp_ns - first_ns))
+        return sample._replace(stamp_ns=stamp_ns + 700_000_000 * (stamp_ns >= jump_at_ns))
+
+    clock = {"dvl_clock_drift": 1e-3, "dvl_time_jump": 0.7, "dvl_time_jump_at": 1e-9 * jump_at_ns}
+    wrong = calibrate(list(map(stamped, samples)), WIDE)
+    right = calibrate(list(map(stamped, samples)), WIDE.replace(**clock))
+    np.testing.assert_allclose(right.state("M1").x, [*PHI, SCALE], atol=1e-6)
+    assert np.abs(wrong.state("M1").x - [*PHI, SCALE]).max() > 1e-5
+
+
 def test_message_covariances_are_turned_into_the_dvl_frame_and_added():
     run = variant(NOISY, gnss_phase=0, mounting_rpy=(0, 0, np.pi / 2))
     own, gnss = np.diag([1e-4, 2e-4, 3e-4]), np.diag([0.01, 0.04, 0.09])
