@@ -24,6 +24,7 @@ from .samples import VelocityFrame
 AUTO = "auto"
 FROM_FRAME_ID = "from_frame_id"
 FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
+IMU_ENU, IMU_NED = "enu", "ned"
 
 
 class ParameterError(ValueError):
@@ -173,6 +174,19 @@ class Parameters:
         unit="m",
         low=-100.0,
         high=100.0,
+    )
+    imu_rpy: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "Orientation in the body of the axes in which the IMU gives its data, as in a URDF origin (fixed axes X, Y, "
+        "Z). Forward-right-down in a level vehicle is pi 0 0.",
+        unit="rad",
+        low=-2 * math.pi,
+        high=2 * math.pi,
+    )
+    imu_frame: str = _parameter(
+        IMU_ENU,
+        "What the IMU's orientation is relative to: enu (yaw 0 is east, REP-103) or ned (yaw 0 is north, clockwise).",
+        choices=(IMU_ENU, IMU_NED),
     )
     dvl_time_offset: float = _parameter(
         0.0,

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import FLU_FROM_FRD, Array, Vector
+from ..calibration.imu_alignment import ImuAlignment
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from .drivers import VelocityType, velocity_type
@@ -94,6 +95,7 @@ class MessageFeed:
         self.dvl_type = velocity_type("dvl_type", calibrator.parameters.dvl_type)
         self._reference_type = velocity_type("gnss_type", calibrator.parameters.gnss_type)
         self._reference_reader = _Reader(self._reference_type)
+        self._imu_alignment = ImuAlignment(calibrator.parameters)
         self._on_problem = on_problem
         self.forget()
 
@@ -152,7 +154,10 @@ class MessageFeed:
         return sample
 
     def imu(self, message: Any, received_ns: int) -> ImuSample:
-        """Feed a sensor_msgs/Imu. A covariance that starts with -1 says that there is no such data."""
+        """Feed a sensor_msgs/Imu. A covariance that starts with -1 says that there is no such data.
+
+        The sample that comes back is the body's, in ENU, as parameters imu_rpy and imu_frame turn it.
+        """
         frame_id = message.header.frame_id
         if frame_id != self._imu_frame:
             self._note_imu_frame(frame_id)
@@ -162,6 +167,7 @@ class MessageFeed:
             None if message.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w),
             None if message.angular_velocity_covariance[0] == -1.0 else (w.x, w.y, w.z),
         )
+        sample = self._imu_alignment.sample(sample)
         self.calibrator.feed_imu(sample)
         return sample
 
@@ -238,11 +244,11 @@ class MessageFeed:
     def _note_imu_frame(self, frame_id: str) -> None:
         self._imu_frame = frame_id
         base = self.calibrator.parameters.base_frame
-        if frame_id.lstrip("/") != base.lstrip("/"):
+        if self._imu_alignment.is_identity and frame_id.lstrip("/") != base.lstrip("/"):
             self._problem(
                 "imu frame",
                 f"imu: data is in frame {frame_id!r}; it is taken as the orientation and angular velocity of {base}. "
-                "If the IMU is mounted turned, let its driver turn the data.",
+                "If the IMU is mounted turned, give its orientation in parameter imu_rpy.",
             )
 
     def _problem(self, kind: str, sentence: str) -> None:

@@ -1,0 +1,76 @@
+"""From what an IMU measures in a frame of its own to what the calibration goes by: the body's attitude and rates.
+
+With W the turn from the IMU's world to ENU and M the IMU's mounting ``rotation_body_from_imu``:
+``rotation_enu_from_body = W @ rotation_world_from_imu @ M.T`` and ``ω_body = M @ ω_imu``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .frames import ENU_FROM_NED, Array, Quaternion, Vector, quaternion_from_rotation, rotation_from_rpy
+from .parameters import IMU_NED, Parameters
+from .samples import ImuSample, SampleBlock
+
+
+class ImuAlignment:
+    """Turns samples of an IMU as parameters imu_rpy and imu_frame say.
+
+    `is_identity`: there is nothing to turn, and samples come out as the same objects.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self.is_identity = not any(parameters.imu_rpy) and parameters.imu_frame != IMU_NED
+        rotation_body_from_imu = rotation_from_rpy(parameters.imu_rpy)
+        self._rotation_body_from_imu: Array = rotation_body_from_imu
+        self._imu_from_body = quaternion_from_rotation(rotation_body_from_imu.T)
+        world = ENU_FROM_NED if parameters.imu_frame == IMU_NED else np.eye(3)
+        self._enu_from_world = quaternion_from_rotation(world)
+
+    def sample(self, sample: ImuSample) -> ImuSample:
+        """One sample, live. What the IMU does not give stays None; what is not finite stays so."""
+        if self.is_identity:
+            return sample
+        orientation, rate = sample.orientation, sample.angular_velocity
+        turned: Quaternion | None = None
+        if orientation is not None:
+            x, y, z, w = self._turned(np.array([orientation]))[0].tolist()
+            turned = (x, y, z, w)
+        turned_rate: Vector | None = None
+        if rate is not None:
+            wx, wy, wz = self._in_body(np.array([rate]))[0].tolist()
+            turned_rate = (wx, wy, wz)
+        return ImuSample(sample.stamp_ns, turned, turned_rate)
+
+    def block(self, block: SampleBlock) -> SampleBlock:
+        """Columns of the IMU's stream, row by row as `sample`."""
+        if self.is_identity or not len(block):
+            return block
+        return replace(
+            block, values=np.hstack([self._turned(block.orientation), self._in_body(block.angular_velocity)])
+        )
+
+    def _turned(self, orientation: Array) -> Array:
+        """Quaternions (N, 4) of the IMU in its world -> of the body in ENU."""
+        return quaternion_product(quaternion_product(self._enu_from_world, orientation), self._imu_from_body)
+
+    def _in_body(self, angular_velocity: Array) -> Array:
+        """(N, 3) rad/s; not by a matrix product, whose last bit depends on how many rows there are."""
+        return np.sum(angular_velocity[:, None, :] * self._rotation_body_from_imu, axis=-1)
+
+
+def quaternion_product(a: Array | Quaternion, b: Array | Quaternion) -> Array:
+    """Hamilton product of quaternions (..., 4) in the order x, y, z, w: the rotation b and then a."""
+    ax, ay, az, aw = np.moveaxis(np.asarray(a, dtype=float), -1, 0)
+    bx, by, bz, bw = np.moveaxis(np.asarray(b, dtype=float), -1, 0)
+    return np.stack(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ],
+        axis=-1,
+    )
