@@ -174,9 +174,13 @@ class BagReader:
         """First and last log time."""
         return min(s.span_ns[0] for s in self._sources), max(s.span_ns[1] for s in self._sources)
 
-    def messages(self, topics: Iterable[str]) -> Iterator[BagMessage]:
-        """Messages of these topics."""
+    def messages(
+        self, topics: Iterable[str], wanted: Callable[[str, int], bool] = lambda *_: True
+    ) -> Iterator[BagMessage]:
+        """Messages of these topics. wanted: by topic and log time, which are decoded at all; the others are left out."""
         for log_ns, source, topic, msgtype, data in self._merged(topics):
+            if not wanted(topic, log_ns):
+                continue
             try:
                 message, why = self._sources[source].decode(msgtype, data), ""
             except (SerdeError, DefinitionError) as error:

@@ -138,6 +138,11 @@ def read_urdf(path: Path) -> Urdf:
         raise InputError(f"{path}: cannot be read as URDF ({error.strerror})") from error
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: is UTF-16, which cannot be edited byte for byte; save it as UTF-8")
+    return parse_urdf(path, content)
+
+
+def parse_urdf(path: Path, content: bytes) -> Urdf:
+    """As `read_urdf`, of what is in memory; path: what errors call it."""
     return _Reader(path, content).read()
 
 
