@@ -1,9 +1,10 @@
-"""What a calibration's counts say that a user must not overlook: sentences, for the replay and for /diagnostics."""
+"""What a calibration's counts say that a user must not overlook: findings, for the replay and for /diagnostics."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+from .findings import Finding, finding
 from .results import Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
@@ -17,73 +18,51 @@ FLAPPING = 3
 
 _STREAMS = {"dvl": "DVL", "reference": "GNSS", "imu": "IMU"}
 _MESSAGE_FAULTS = {
-    "invalid": "are invalid (not finite, above max_speed, or with an impossible covariance): check the sensor, its "
-    "bottom lock or fix, and its driver",
-    "duplicate": "repeat the stamp of the one before: is there a second publisher, or a driver that sends twice?",
-    "out_of_order": "are older than the one before: is there a second publisher on the topic, or was a clock set back?",
-    "stray": "are more than max_time_jump from their neighbours in time: check the clock of the driver",
-    "late": "came after a DVL sample had gone on without them: raise max_latency",
-    "before_restart": "were from before the clock was set back or the bag looped",
+    "invalid": "SAMPLES_INVALID",
+    "duplicate": "STAMP_REPEATED",
+    "out_of_order": "STAMP_OUT_OF_ORDER",
+    "stray": "STAMP_STRAY",
+    "late": "SAMPLES_LATE",
+    "before_restart": "SAMPLES_BEFORE_RESTART",
 }
 
-INITIAL_WINDOW_WARNING = (
-    "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 and "
-    "M6 gain nothing over no calibration; prefer fixed"
-)
+
+def message_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Finding]:
+    """What is wrong with messages of each stream that were not used; from `Calibrator.counts`."""
+    return [
+        finding(code, count=counts[stream][fault], stream=name)
+        for stream, name in _STREAMS.items()
+        for fault, code in _MESSAGE_FAULTS.items()
+        if counts[stream].get(fault)
+    ]
 
 
-def message_advice(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """What is wrong with messages of each stream that were not used, and the remedy; from `Calibrator.counts`."""
-    sentences = []
-    for stream, name in _STREAMS.items():
-        for fault, what in _MESSAGE_FAULTS.items():
-            count = counts[stream].get(fault, 0)
-            if count:
-                sentences.append(f"{count} {name} samples {what}; they are not used")
-    return sentences
-
-
-def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """What is wrong with the data that came, and the remedy; from `Calibrator.counts`."""
+def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Finding]:
+    """What is wrong with the data that came; from `Calibrator.counts`."""
     dvl, pairing = counts["dvl"], counts["pairing"]
-    sentences = []
+    found = []
     if dvl["received"] >= ENOUGH_SAMPLES and not dvl["accepted"]:
         lost = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
-        sentences.append(f"none of {dvl['received']} DVL messages can be used: {lost}")
+        found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
     if _never_meet(counts):
-        sentences.append(
-            "no DVL sample has a reference velocity at its time, though both come: do their stamps agree? A DVL that "
-            "stamps with a clock of its own must be synchronised (NTP)"
-        )
+        found.append(finding("DVL_NO_REFERENCE"))
     if pairing["without_attitude"]:
-        sentences.append(
-            f"{pairing['without_attitude']} DVL samples have an earth-frame reference but no attitude: the models with "
-            "GNSS cannot use them; is the IMU topic right, and does it give an orientation?"
-        )
+        found.append(finding("REFERENCE_NO_ATTITUDE", count=pairing["without_attitude"]))
     if dvl["dropouts"]:
-        sentences.append(f"the DVL dropped out {dvl['dropouts']} times: check its power, cable and bottom lock")
+        found.append(finding("DVL_DROPOUTS", count=dvl["dropouts"]))
     if dvl["frozen"]:
-        sentences.append(
-            f"{dvl['frozen']} DVL samples repeat one velocity more than max_repeats times: its driver hangs"
-        )
+        found.append(finding("DVL_FROZEN", count=dvl["frozen"]))
     elif dvl["repeated"] >= ENOUGH_SAMPLES and dvl["repeated"] > SUSPICIOUS_REPEATED * dvl["usable"]:
-        sentences.append(
-            f"{dvl['repeated']} DVL samples repeat the velocity before exactly and are used: if its driver hangs, set "
-            "max_repeats"
-        )
+        found.append(finding("DVL_REPEATS", count=dvl["repeated"]))
     if pairing["gnss_losses"] >= FLAPPING:
-        sentences.append(
-            f"GNSS was lost {pairing['gnss_losses']} times: check its antenna; if models switch to and fro, raise "
-            "gnss_hysteresis"
-        )
+        found.append(finding("GNSS_LOSSES", count=pairing["gnss_losses"]))
     if dvl["no_turn_rate"]:
-        sentences.append(f"{dvl['no_turn_rate']} samples have no angular velocity for max_turn_rate and are not used")
+        found.append(finding("NO_TURN_RATE", count=dvl["no_turn_rate"]))
     if dvl.get("lever_arm_uncompensated"):
-        count = dvl["lever_arm_uncompensated"]
-        sentences.append(f"lever_arm is not compensated in {count} samples: no angular velocity")
+        found.append(finding("LEVER_ARM_NOT_COMPENSATED", count=dvl["lever_arm_uncompensated"]))
     if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
-        sentences.append("every sample is slower than min_speed: nothing is learnt")
-    return sentences
+        found.append(finding("ALL_SLOW"))
+    return found
 
 
 def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
@@ -95,22 +74,16 @@ def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
     return usable >= ENOUGH_SAMPLES and pairing["unpaired"] >= ENOUGH_SAMPLES
 
 
-def gate_advice(estimate: Estimate) -> list[str]:
+def gate_advice(estimate: Estimate) -> list[Finding]:
     """Whether a model's gate throws away so much that the configuration must be wrong."""
     given = estimate.used + estimate.gated
     if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
         return []
-    return [
-        f"{estimate.model}: {estimate.gated} of {given} samples are gated; check mounting_rpy and the frames before "
-        "believing it"
-    ]
+    return [finding("SAMPLES_GATED", model=estimate.model, gated=estimate.gated, given=given)]
 
 
-def consistency_advice(estimate: Estimate) -> list[str]:
+def consistency_advice(estimate: Estimate) -> list[Finding]:
     """Whether a model's innovations are larger than it believes; smaller ones only make σ too large."""
     if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
-    return [
-        f"{estimate.model}: innovations are larger than R and P allow (mean NIS {estimate.mean_nis:.1f}, at most "
-        f"{estimate.nis_bounds[1]:.1f}): σ is too small, raise gnss_aided_std or gnss_free_std"
-    ]
+    return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]

@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
     what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
+    what.add_argument("--findings", action="store_true", help="every warning with its meaning and remedy")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
     parser.add_argument(
@@ -39,6 +40,11 @@ def run(arguments: argparse.Namespace) -> None:
         from ..messages.drivers import driver_table
 
         print(driver_table(), end="")
+        return
+    if arguments.findings:
+        from ..calibration.findings import finding_table
+
+        print(finding_table(), end="")
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters

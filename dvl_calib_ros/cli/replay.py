@@ -47,7 +47,11 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         common.write_json(
             arguments.json,
-            replay_document(result, models) | {"dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned}},
+            replay_document(result, models)
+            | {
+                "dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned},
+                "findings": [found.as_dict() for found in replayed.findings],
+            },
         )
     if arguments.save is not None:
         save_text(arguments.save, result_text(result_document(result, replayed.dvl_frame, replayed.turned)))

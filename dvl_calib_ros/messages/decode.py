@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
+from ..calibration.findings import Finding, finding
 from ..calibration.frames import FLU_FROM_FRD, Array, Vector
 from ..calibration.imu_alignment import ImuAlignment
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE
@@ -86,7 +87,7 @@ class MessageFeed:
     """Feeds a calibrator with messages.
 
     on_problem is called with a sentence (what is wrong, what to do) when a problem is new; `problems` keeps the latest
-    sentence of each kind. Counting is the calibrator's. The messages are of the types that its parameters dvl_type and
+    finding of each kind. Counting is the calibrator's. The messages are of the types that its parameters dvl_type and
     gnss_type name; raises InputError for what is none.
     """
 
@@ -101,7 +102,7 @@ class MessageFeed:
 
     def forget(self) -> None:
         """Forget the problems and the frames seen."""
-        self.problems: dict[str, str] = {}
+        self.problems: dict[str, Finding] = {}
         self.zero_stamps = 0
         self.dvl_frame: str | None = self.calibrator.parameters.dvl_frame or None
         self._dvl_reader: _Reader | None = None
@@ -174,18 +175,14 @@ class MessageFeed:
     def undecodable(self, stream: str, reason: str) -> None:
         """Count a message that could not be decoded at all."""
         self.calibrator.refuse(stream, "invalid")
-        self._problem(f"{stream} undecodable", f"{stream}: a message could not be decoded ({reason}); it is skipped")
+        self._problem(f"{stream} undecodable", finding("MESSAGE_UNDECODABLE", stream=stream, reason=reason))
 
     def _stamp_ns(self, stream: str, header: Any, received_ns: int) -> int:
         stamp = stamp_ns(header.stamp)
         if stamp:
             return stamp
         self.zero_stamps += 1
-        self._problem(
-            f"{stream} stamp",
-            f"{stream}: messages without a header stamp; the time of reception is used, which costs accuracy in "
-            "turns. Let the driver fill header.stamp.",
-        )
+        self._problem(f"{stream} stamp", finding("STAMP_MISSING", stream=stream))
         return received_ns
 
     def _accept_dvl_frame(self, frame_id: str) -> bool:
@@ -194,11 +191,7 @@ class MessageFeed:
             self.dvl_frame = frame_id
             return True
         expected = self.dvl_frame or "the DVL's own frame (dvl_link)"
-        self._problem(
-            "dvl frame",
-            f"dvl: a message has frame_id {frame_id!r} where {expected!r} is expected; it is not used. Let the driver "
-            f"publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is its name.",
-        )
+        self._problem("dvl frame", finding("DVL_FRAME", frame_id=frame_id, expected=expected))
         return False
 
     @property
@@ -214,12 +207,7 @@ class MessageFeed:
         """The reader of the DVL's messages, made at the first that has passed, which tells the frame."""
         self._dvl_reader = _Reader(self.dvl_type, self.turns_dvl)
         if self.turns_dvl and self.calibrator.parameters.rotation_dvl_from_body[2, 2] < 0.0:
-            self._problem(
-                "dvl axes",
-                f"dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and "
-                "mounting_rpy turns the DVL upside down as well: right for a DVL that looks up. If mounting_rpy is "
-                "that of a frame whose z points down, set dvl_axes to flu, which takes the data as they are.",
-            )
+            self._problem("dvl axes", finding("DVL_TURNED_TWICE", frame_id=frame_id))
         return self._dvl_reader
 
     def _is_body_or_earth(self, frame_id: str) -> bool:
@@ -233,26 +221,18 @@ class MessageFeed:
         name = frame_id.lstrip("/")
         frame = VelocityFrame.BODY if name == p.base_frame.lstrip("/") else EARTH_FRAMES.get(name.lower())
         if frame is None:
-            self._problem(
-                "reference frame",
-                f"reference: frame_id {frame_id!r} says neither body ({p.base_frame}) nor earth "
-                f"({', '.join(EARTH_FRAMES)}); its messages are not used. Set parameter gnss_frame to body, enu or "
-                "ned.",
-            )
+            known = {"base": p.base_frame, "earth": ", ".join(EARTH_FRAMES)}
+            self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, **known))
         return frame
 
     def _note_imu_frame(self, frame_id: str) -> None:
         self._imu_frame = frame_id
         base = self.calibrator.parameters.base_frame
         if self._imu_alignment.is_identity and frame_id.lstrip("/") != base.lstrip("/"):
-            self._problem(
-                "imu frame",
-                f"imu: data is in frame {frame_id!r}; it is taken as the orientation and angular velocity of {base}. "
-                "If the IMU is mounted turned, give its orientation in parameter imu_rpy.",
-            )
+            self._problem("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
 
-    def _problem(self, kind: str, sentence: str) -> None:
+    def _problem(self, kind: str, found: Finding) -> None:
         is_new = kind not in self.problems
-        self.problems[kind] = sentence
+        self.problems[kind] = found
         if is_new:  # two frames in turn, or ever new garbage, must not be told of at every message
-            self._on_problem(sentence)
+            self._on_problem(str(found))

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..calibration.findings import Finding, finding
 from ..calibration.parameters import Parameters
 from ..errors import InputError
 
@@ -73,10 +74,10 @@ class VelocityType:
                 return rule
         return None
 
-    def advice(self, counts: Mapping[str, int]) -> list[str]:
+    def advice(self, counts: Mapping[str, int]) -> list[Finding]:
         """What is wrong with the messages that were not used for breaking rules; from `Calibrator.counts` of dvl."""
         return [
-            f"{counts[rule.counter]} DVL messages are not used: {rule.in_words}; {rule.remedy}"
+            finding("DVL_REFUSED", count=counts[rule.counter], reason=rule.in_words, remedy=rule.remedy)
             for rule in self.rules
             if counts.get(rule.counter)
         ]

@@ -21,9 +21,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from ..calibration.advice import INITIAL_WINDOW_WARNING
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
+from ..calibration.findings import Finding, finding
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
@@ -69,7 +69,7 @@ class CalibrationNode(Node):
         if parameters.initial_calibration:
             initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
         if parameters.prior_source == "initial_window":
-            self.get_logger().warning(INITIAL_WINDOW_WARNING)
+            self.get_logger().warning(str(finding("PRIOR_HOLDS_ERROR")))
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
         self._feed = MessageFeed(self._calibrator, self._warn)
         # what every DVL message asks for; none of it changes at run time
@@ -79,7 +79,7 @@ class CalibrationNode(Node):
         self._corrected_by = ""
         self._published = ("", 0)
         self._silence, self._recent = Silence(time.monotonic()), RecentCounts()
-        self._save_problem: str | None = None
+        self._save_problem: Finding | None = None
 
         self._estimate = self._output_message()
         self._corrected = self._output_message()
@@ -235,9 +235,9 @@ class CalibrationNode(Node):
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
 
-    def _topic_problems(self) -> list[str]:
+    def _topic_problems(self) -> list[Finding]:
         type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
-        problems = []
+        problems: list[Finding] = []
         for topic, subscription in self._inputs.items():
             problems += input_problems(self, subscription, type_parameters.get(topic))
         for publisher in (self._estimate_publisher, self._corrected_publisher):
@@ -273,7 +273,7 @@ class CalibrationNode(Node):
         try:
             save_text(path, self._result_text())
         except InputError as error:
-            self._save_problem = f"the result was not saved: {error}"
+            self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
             raise
         self._save_problem = None
 

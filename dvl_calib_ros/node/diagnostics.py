@@ -11,6 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from ..calibration.advice import consistency_advice, data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
+from ..calibration.findings import Finding, Severity, finding
 from ..calibration.models import MODELS
 from ..calibration.results import Estimate
 from ..messages.drivers import VelocityType
@@ -23,10 +24,7 @@ _PIECES = 6
 
 Counts = Mapping[str, Mapping[str, int]]
 _NOT_TAKEN = {"invalid", "duplicate", "out_of_order", "stray", "held", "before_restart"}
-_STREAMS = {
-    "dvl": ("DVL", "check the sensor, its driver and the topic dvl/twist"),
-    "imu": ("IMU", "the models that need attitude learn nothing; check its driver and the topic imu/data"),
-}
+_SILENT = {"dvl": ("DVL_SILENT", "dvl/twist"), "imu": ("IMU_SILENT", "imu/data")}
 
 
 class RecentCounts:
@@ -67,8 +65,8 @@ class Silence:
         self._started_s = now_s
         self._seen: dict[str, _Seen] = {}
 
-    def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, str]:
-        """Stream -> what is wrong, and the remedy. counts: the calibrator's, as of now."""
+    def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, Finding]:
+        """Stream -> what is wrong. counts: the calibrator's, as of now."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
             lost = _NOT_TAKEN | calibrator.refused_as[stream]
@@ -77,17 +75,17 @@ class Silence:
                 self._seen[stream] = _Seen(taken, now_s)
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
-        for stream, (name, remedy) in _STREAMS.items():
+        for stream, (code, topic) in _SILENT.items():
             if not counts[stream]["received"]:
                 if stream == "dvl" and now_s - self._started_s > SILENCE_S:
-                    faults[stream] = f"no {name} message yet: {remedy}"
+                    faults[stream] = finding("DVL_NO_MESSAGE", topic=topic)
             elif silent_s[stream] > SILENCE_S:
-                faults[stream] = f"no usable {name} message for {silent_s[stream]:.0f} s: {remedy}"
+                faults[stream] = finding(code, seconds=silent_s[stream], topic=topic)
         coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
         return faults | _other_times(newest_ns, coming, calibrator.parameters.max_time_jump)
 
 
-def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump_s: float) -> dict[str, str]:
+def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump_s: float) -> dict[str, Finding]:
     """Of the streams that come, those whose stamps are far from the DVL's."""
     dvl_ns = newest_ns["dvl"]
     if dvl_ns is None or "dvl" not in coming:
@@ -97,17 +95,14 @@ def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump
         ns = newest_ns[stream]
         if stream in coming and ns is not None and abs(ns - dvl_ns) > max_jump_s * 1e9:
             side = "ahead of" if ns > dvl_ns else "behind"
-            faults[stream] = (
-                f"{name} stamps are {abs(ns - dvl_ns) * 1e-9:.0f} s {side} the DVL's and cannot be paired: set both "
-                "clocks by the same source"
-            )
+            faults[stream] = finding("CLOCKS_DIFFER", stream=name, seconds=abs(ns - dvl_ns) * 1e-9, side=side)
     return faults
 
 
 def diagnose(
     calibrator: Calibrator,
     dvl_type: VelocityType,
-    problems: Sequence[str],
+    problems: Sequence[Finding],
     silence: Silence,
     recent: RecentCounts,
     now_s: float,
@@ -117,15 +112,13 @@ def diagnose(
     dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
-    silent = silence.faults(calibrator, counts, now_s)
     grown = recent.grown(counts, now_s)
-    faults = [silent.pop("dvl")] if "dvl" in silent else []
-    warnings = [*silent.values(), *problems, *_restart_advice(grown), *message_advice(grown), *data_advice(grown)]
-    warnings += dvl_type.advice(grown["dvl"])
-    warnings += gate_advice(estimate) + consistency_advice(estimate)
-    level = DiagnosticStatus.ERROR if faults else DiagnosticStatus.WARN if warnings else DiagnosticStatus.OK
-    status = DiagnosticStatus(level=level, hardware_id="dvl")
-    status.message = "; ".join(faults + warnings) or f"{estimate.model} {estimate.convergence.value}"
+    found = [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
+    found += message_advice(grown) + data_advice(grown) + dvl_type.advice(grown["dvl"])
+    found += gate_advice(estimate) + consistency_advice(estimate)
+    found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
+    status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
+    status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
         "why": selection.reason(calibrator.parameters),
@@ -136,19 +129,20 @@ def diagnose(
         **_count_values(estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
     }
-    for number, problem in enumerate(problems, start=1):
-        values[f"problem {number}"] = problem
+    for number, each in enumerate(found, start=1):
+        values[f"finding {number}"] = str(each)
     status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return status
 
 
-def _restart_advice(counts: Counts) -> list[str]:
-    if not counts["calibration"]["restarts"]:
-        return []
-    return [
-        "DVL stamps went back and the calibration started anew: a bag looped, or a clock was set; set clocks before "
-        "the node is started"
-    ]
+def _level(found: Sequence[Finding]) -> bytes:
+    if not found:
+        return DiagnosticStatus.OK
+    return DiagnosticStatus.ERROR if found[0].severity is Severity.ERROR else DiagnosticStatus.WARN
+
+
+def _restart_advice(counts: Counts) -> list[Finding]:
+    return [finding("CLOCK_WENT_BACK")] if counts["calibration"]["restarts"] else []
 
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:

@@ -8,13 +8,14 @@ from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 
+from ..calibration.findings import Finding, finding
 from ..messages.drivers import TYPES_OF
 
 # What ROS 2 calls a node whose topic is discovered before it is
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
-def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[str]:
+def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[Finding]:
     """What is wrong with the publishers of one of the node's inputs, and the remedy.
 
     type_parameter: the one that names the type of the topic, if it can be chosen.
@@ -22,19 +23,25 @@ def input_problems(node: Node, subscription: Any, type_parameter: str | None) ->
     topic, kind = subscription.topic_name, _type_name(subscription.msg_type)
     publishers = node.get_publishers_info_by_topic(topic)
     problems = [
-        f"{topic}: {_name(info)} publishes {info.topic_type}, where {kind} is expected, and is not heard; "
-        f"{_other_type_remedy(info.topic_type, type_parameter)}"
+        finding(
+            "TOPIC_OTHER_TYPE",
+            topic=topic,
+            name=_name(info),
+            type=info.topic_type,
+            expected=kind,
+            remedy=_other_type_remedy(info.topic_type, type_parameter),
+        )
         for info in publishers
         if info.topic_type != kind
     ]
     rightly_typed = [info for info in publishers if info.topic_type == kind]
     if len(rightly_typed) > 1:
         names = ", ".join(map(_name, rightly_typed))
-        problems.append(f"{topic}: {len(rightly_typed)} publishers ({names}), where one is expected; stop the others")
+        problems.append(finding("TOPIC_SEVERAL_PUBLISHERS", topic=topic, count=len(rightly_typed), names=names))
     for info in rightly_typed:
         reason = _incompatible(info.qos_profile, _in_full(subscription.qos_profile))
         if reason:
-            problems.append(f"{topic}: the QoS of {_name(info)} is incompatible, it is not heard ({reason})")
+            problems.append(finding("TOPIC_QOS", topic=topic, name=_name(info), reason=reason))
     return problems
 
 
@@ -44,28 +51,23 @@ def _other_type_remedy(name: str, type_parameter: str | None) -> str:
     return f"set {type_parameter} to it, or remap one of the two"
 
 
-def output_problems(node: Node, publisher: Any) -> list[str]:
+def output_problems(node: Node, publisher: Any) -> list[Finding]:
     """Which subscribers of one of the node's outputs do not hear it, and why."""
     problems = []
     for info in node.get_subscriptions_info_by_topic(publisher.topic_name):
         reason = _incompatible(_in_full(publisher.qos_profile), info.qos_profile)
         if reason:
-            problems.append(
-                f"{publisher.topic_name}: {_name(info)} asks for an incompatible QoS and does not hear it ({reason})"
-            )
+            problems.append(finding("OUTPUT_QOS", topic=publisher.topic_name, name=_name(info), reason=reason))
     return problems
 
 
-def twin_problems(node: Node, publisher: Any) -> list[str]:
+def twin_problems(node: Node, publisher: Any) -> list[Finding]:
     """Whether others publish what the node alone should: their estimates mix, and their files replace each other."""
     publishers = node.get_publishers_info_by_topic(publisher.topic_name)
     if len(publishers) < 2:
         return []
     names = ", ".join(map(_name, publishers))
-    return [
-        f"{publisher.topic_name}: {len(publishers)} publishers ({names}); stop the second calibration node or the bag "
-        "that plays a recorded one, or give one a namespace and its own result_file"
-    ]
+    return [finding("SECOND_NODE", topic=publisher.topic_name, count=len(publishers), names=names)]
 
 
 def _incompatible(offered: QoSProfile, requested: QoSProfile) -> str | None:

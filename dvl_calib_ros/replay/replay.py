@@ -13,8 +13,9 @@ import numpy as np
 
 from .. import __version__
 from ..bags.reader import BagReader
-from ..calibration.advice import INITIAL_WINDOW_WARNING, data_advice, gate_advice, message_advice
+from ..calibration.advice import data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
+from ..calibration.findings import Finding, finding
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
 from ..calibration.observations import Observations
 from ..calibration.parameters import Parameters
@@ -54,12 +55,14 @@ def _spelled(name: str, present: dict[str, str]) -> str:
 class Replayed:
     """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id.
 
-    history: the run over time, if it was asked for. reference_frame: of the reference's messages, None without any.
+    notes: all that the user should know in words, the findings among it. history: the run over time, if it was asked
+    for. reference_frame: of the reference's messages, None without any.
     dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
     """
 
     result: Result
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
     dvl_frame: str
     history: RunHistory | None = None
     reference_frame: VelocityFrame | None = None
@@ -90,33 +93,35 @@ def replay(
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
     topics = topics or Topics()
     prior = reference_prior(paths, parameters, topics) if parameters.prior_source == "reference" else None
-    notes: list[str] = []
+    found: list[Finding] = []
+    events: list[str] = []
     if parameters.prior_source == "initial_window":
-        notes.append(INITIAL_WINDOW_WARNING)
+        found.append(finding("PRIOR_HOLDS_ERROR"))
     recorder = Recorder() if with_history else None
     with BagReader(paths) as bag:
         chosen = topics.found_in(bag.topics)
-        _check_topics(bag, paths, chosen, notes)
+        _check_topics(bag, paths, chosen, found)
         calibrator = Calibrator(
             _of_types(bag, chosen, parameters),
             prior_sway_heave=prior,
             initial=initial,
             block_size=BLOCK_SIZE,
-            on_event=notes.append,
+            on_event=events.append,
             on_block=recorder.observe if recorder else on_block,
             verified=True,
         )
-        feed = MessageFeed(calibrator, notes.append)
+        feed = MessageFeed(calibrator, lambda _: None)
         if recorder:
             recorder.expect(bag.message_counts[chosen.dvl])
         _feed_all(bag, chosen, feed, recorder, on_progress)
-        notes = bag.notes + notes
+        found += feed.problems.values()
     result = calibrator.result()
-    notes += _warnings(result, topics, feed)
+    found += _warnings(result, topics, feed)
     history = recorder.history(calibrator) if recorder else None
     return Replayed(
         result,
-        tuple(notes),
+        (*bag.notes, *events, *map(str, found)),
+        tuple(found),
         feed.dvl_frame or "dvl_link",
         history,
         feed.reference_frame,
@@ -131,7 +136,7 @@ def _of_types(bag: BagReader, topics: Topics, parameters: Parameters) -> Paramet
     return parameters.replace(dvl_type=types[topics.dvl], gnss_type=types.get(topics.gnss, parameters.gnss_type))
 
 
-def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: list[str]) -> None:
+def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, found: list[Finding]) -> None:
     present = bag.topics
     where = ", ".join(map(str, paths))
     if not present:
@@ -142,14 +147,14 @@ def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, notes: 
         listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
         option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
         raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
-    _check_types(bag, where, topics, notes)
+    _check_types(bag, where, topics, found)
     if not bag.message_counts[topics.dvl]:
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in present:
-        notes.append(f"no topic {topics.gnss!r} in the bag: only the models without GNSS can run (set --gnss-topic?)")
+        found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
 
 
-def _check_types(bag: BagReader, where: str, topics: Topics, notes: list[str]) -> None:
+def _check_types(bag: BagReader, where: str, topics: Topics, found: list[Finding]) -> None:
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
         types = bag.types_of(name)
@@ -161,11 +166,7 @@ def _check_types(bag: BagReader, where: str, topics: Topics, notes: list[str]) -
                 f"{where}: topic {name} holds {' and '.join(sorted(types))}; replay bags of one type together"
             )
         if bag.lacks_definition(name):
-            notes.append(
-                f"the bag does not say how {types.pop()} is laid out (recorded before ROS 2 Iron?); it is read as "
-                "the definitions known here say. If it cannot be decoded, run ros2 bag convert to MCAP where the "
-                "package is installed"
-            )
+            found.append(finding("BAG_NO_DEFINITION", type=types.pop()))
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": VELOCITY_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
@@ -241,23 +242,23 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
     return sway, heave
 
 
-def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[str]:
+def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[Finding]:
     """What the counts say that a user should not overlook."""
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    notes = message_advice(result.counts) + feed.dvl_type.advice(dvl) + data_advice(result.counts)
+    found = message_advice(result.counts) + feed.dvl_type.advice(dvl) + data_advice(result.counts)
     if feed.zero_stamps:
-        notes.append(f"{feed.zero_stamps} messages had no header stamp; their log time is used")
+        found.append(finding("STAMPS_MISSING_IN_BAG", count=feed.zero_stamps))
     for estimate in result.estimates.values():
-        notes += gate_advice(estimate)
-    return notes
+        found += gate_advice(estimate)
+    return found
 
 
 def _remedy(feed: MessageFeed) -> str:
     """What is known of the DVL's messages that were refused."""
-    known = [sentence for kind, sentence in feed.problems.items() if kind.startswith("dvl")]
-    known += feed.dvl_type.advice(feed.calibrator.counts["dvl"])
+    known = [str(found) for kind, found in feed.problems.items() if kind.startswith("dvl")]
+    known += map(str, feed.dvl_type.advice(feed.calibrator.counts["dvl"]))
     return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 

@@ -98,7 +98,7 @@ def _read(recording: Recording) -> _Samples:
         if len(found) < 2:
             raise InputError(
                 f"{recording.path}: {what} holds {len(found)} usable samples; a motion takes reference velocity and "
-                f"attitude. {' '.join(feed.problems.values())}".strip()
+                f"attitude. {' '.join(map(str, feed.problems.values()))}".strip()
             )
     velocity_ns, attitude_ns = sorted(velocities), sorted(attitudes)
     first_ns = min(velocity_ns[0], attitude_ns[0])

@@ -154,7 +154,9 @@ def document(bag, tmp_path_factory) -> dict:
 
 
 def test_replay_json_has_the_documented_structure(document, bag):
-    assert set(document) == {"models", "verification", "selected", "counts", "parameters", "version", "dvl"}
+    assert set(document) == {
+        "models", "verification", "selected", "counts", "parameters", "version", "dvl", "findings"
+    }  # fmt: skip
     assert document["dvl"] == {"type": TWIST_TYPE, "turned_from_frd": False}
     assert set(document["verification"]) == set(MODELS)
     assert list(document["models"]) == list(MODELS)

@@ -288,7 +288,7 @@ def test_water_track_is_said_with_the_remedy():
     for _ in range(3):
         feed.take(sent)
     assert feed.counts["water_track"] == 3
-    (sentence,) = VELOCITY_TYPES[MARINE].advice(feed.counts)
+    (sentence,) = map(str, VELOCITY_TYPES[MARINE].advice(feed.counts))
     assert sentence.startswith("3 DVL messages are not used: velocity_mode is water track") and "water" in sentence
 
 
