@@ -209,7 +209,7 @@ FAULTS = {
     ),
     "denormal variances": Fault(None, [denormal()], not_given()),
     "every message comes again": Fault(
-        "is there a second publisher", [with_extra(1, again)], CLEAN, counted={("dvl", "duplicate"): 200}
+        "[STAMP_REPEATED]", [with_extra(1, again)], CLEAN, counted={("dvl", "duplicate"): 200}
     ),
     "the DVL repeats itself for 10 s": Fault(
         "set max_repeats", [frozen(20, 30)], counted={("dvl", "repeated"): 50, ("dvl", "frozen"): 0}
@@ -223,12 +223,12 @@ FAULTS = {
     ),
     # that of the DVL first, whose first two samples show it
     "all clocks are set back by an hour": Fault(
-        "a clock was set",
+        "[CLOCK_WENT_BACK]",
         [later(between(0, 5), HOUR_S), ONLY_DVL[25:27], [s for s in AFTER_5_S if s not in ONLY_DVL[:27]]],
         AFTER_5_S, counted={("calibration", "restarts"): 1, ("dvl", "accepted"): 175},
     ),
     "all clocks are set back by 3 s": Fault(
-        "was a clock set back?", [later(between(0, 20), 3), between(20, 40)],
+        "[STAMP_OUT_OF_ORDER]", [later(between(0, 20), 3), between(20, 40)],
         counted={("dvl", "out_of_order"): 14, ("dvl", "duplicate"): 1},
     ),
     "the clock of GNSS is an hour ahead": Fault(
@@ -238,7 +238,7 @@ FAULTS = {
     ),
     "the IMU stops": Fault(
         # what comes much later tells that no IMU can be waited for any more
-        "is the IMU topic right", [without(ImuSample, 15, 40), later(without(ImuSample, 0, 40, between(39, 40)), 100)]
+        "[REFERENCE_NO_ATTITUDE]", [without(ImuSample, 15, 40), later(without(ImuSample, 0, 40, between(39, 40)), 100)]
     ),
     "another instrument on the same topics": Fault("'base_link'", [with_extra(10, other_instrument)], CLEAN),
 }  # fmt: skip
