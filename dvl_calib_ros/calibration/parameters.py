@@ -444,6 +444,14 @@ class Parameters:
         "same folder (the working directory, if none was named at the start).",
         read_only=False,
     )
+    result_backups: float = _parameter(
+        3.0,
+        "How many results before are kept beside result_file: .bak is the one before, .bak.2 and on are those before "
+        "it that converged best, of equals the newest.",
+        low=1.0,
+        high=100.0,
+        read_only=False,
+    )
     initial_calibration: str = _parameter(
         "", "Result file whose states and covariances are the prior. Empty: none.",
     )  # fmt: skip

@@ -46,8 +46,8 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
+    from ..files.atomic import backup_of, save_bytes
     from ..files.mounting import load_calibrated_mounting
-    from ..files.result_file import backup_of, save_bytes
 
     calibrated = load_calibrated_mounting(arguments.result)
     common.check_outputs(arguments, "urdf" if arguments.output is None else "output", "launch", "fusion")
@@ -118,7 +118,7 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
 
 def _roll_back(arguments: argparse.Namespace) -> None:
     from ..errors import InputError
-    from ..files.result_file import backup_of, save_bytes
+    from ..files.atomic import backup_of, save_bytes
 
     targets = _targets(arguments)
     if not targets:

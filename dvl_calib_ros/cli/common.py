@@ -77,7 +77,7 @@ def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
 def check_outputs(arguments: argparse.Namespace, *options: str) -> None:
     """Raise InputError if the file that an option names could not be written, before work is done for it."""
     from ..errors import InputError
-    from ..files.result_file import check_writable
+    from ..files.atomic import check_writable
 
     named: dict[Path, str] = {}
     for option in options:
@@ -128,7 +128,7 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def write_json(path: Path, document: Any) -> None:
     """Write JSON, whole or not at all; numbers that are not finite become null."""
-    from ..files.result_file import save_text
+    from ..files.atomic import save_text
 
     save_text(path, json.dumps(_finite(document), indent=1, allow_nan=False) + "\n")
 

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.compensation import compensated, parameter_file
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.results import diagnosis_document
-    from ..files.result_file import save_text
+    from ..files.atomic import save_text
     from ..replay.replay import Topics
 
     parameters = common.load(arguments)

@@ -105,7 +105,7 @@ def _are_bags(paths: list[Path]) -> bool:
 
 def _save(arguments: argparse.Namespace, evaluation: Evaluation) -> None:
     from ..evaluation.documents import evaluation_csv, evaluation_document
-    from ..files.result_file import save_text
+    from ..files.atomic import save_text
 
     if arguments.json is not None:
         common.write_json(arguments.json, evaluation_document(evaluation))

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Replay, print, save."""
     from ..calibration.models import MODELS
-    from ..files.result_file import result_document, result_text, save_text
+    from ..files.result_file import result_document, save_result
     from ..replay.replay import Topics, replay, replay_document
 
     models = common.chosen("--models", arguments.models, tuple(MODELS))
@@ -54,7 +54,8 @@ def run(arguments: argparse.Namespace) -> None:
             },
         )
     if arguments.save is not None:
-        save_text(arguments.save, result_text(result_document(result, replayed.dvl_frame, replayed.turned)))
+        document = result_document(result, replayed.dvl_frame, replayed.turned)
+        save_result(arguments.save, document, round(parameters.result_backups))
     if write_report is not None:
         write_report(arguments.report, replayed, arguments.bags, models)
     _print(replayed, models)

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Run what is left of the trial, score it, print the tables and write them to the folder."""
     from ..errors import InputError
-    from ..files.result_file import save_text
+    from ..files.atomic import save_text
     from ..trial.cases import KINDS, plan
     from ..trial.motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS, recordings_folder
     from ..trial.run import Trial

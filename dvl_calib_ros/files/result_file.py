@@ -1,16 +1,14 @@
-"""The result of a calibration as a YAML file: never torn when written, never believed blindly when read."""
+"""The result of a calibration as a YAML file: never lost to a worse one, never believed blindly when read."""
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import shlex
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from dataclasses import dataclass
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,17 @@ from .. import __version__
 from ..calibration.frames import FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.observability import Convergence
 from ..calibration.parameters import FLU, FRD
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
 from ..errors import InputError, printable
+from .atomic import own_stream, save_bytes
 from .yaml_files import load_yaml
 
 FORMAT = "dvl_calib_ros result 1"
+# Result files have some ten thousand bytes; what is much larger is none, and is not read to find out.
+LARGEST_FILE = 1 << 22
 
 
 def estimate_document(estimate: Estimate) -> dict[str, Any]:
@@ -121,86 +123,75 @@ def check_in_folder(path: Path, folder: Path) -> None:
         raise InputError(f"{path}: at run time only a .yaml file in {folder} can be named; name others at the start")
 
 
-def check_writable(path: Path) -> None:
-    """Raise InputError if a result file could not be written there, before anything is collected for it."""
-    folder = _target(path).parent
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; name a file in it, such as {path / 'calibration.yaml'}")
-    if not folder.is_dir():
-        raise InputError(f"{path}: the folder {folder} does not exist; create it or name another")
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{path}: the folder {folder} is not writable ({error.strerror}); name another") from error
+def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> None:
+    """Write a result as `save_bytes` does, unless it holds nothing and the file there holds something.
 
+    Parameters
+    ----------
+    path: Of the result file.
+    document: As of `result_document`.
+    n_backups: How many of the results before are kept: the one before, and the best and newest of those before it.
+        One that was continued, as by a save every minute, gives way to its continuation.
 
-def save_text(path: Path, text: str) -> None:
-    """Write a text as `save_bytes` does."""
-    save_bytes(path, text.encode())
+    Raises
+    ------
+    NothingUsedError: If no sample was used, and the file there is not known to be as empty.
+    InputError: If it cannot be written.
 
-
-def save_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that it is always the old or the new one, whole; the old one is kept as ``.bak``.
-
-    Raises InputError; then the old file is untouched.
     """
-    target = _target(path)
-    temporary = backup = ""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=".dvl_calib.", suffix=".tmp")
-        with os.fdopen(handle, "wb") as file:
-            os.fchmod(file.fileno(), 0o644)
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        if target.exists():
-            backup = _second_name(target, f"{temporary}.bak")
-        os.replace(temporary, target)
-        temporary = ""
-        if backup:
-            os.replace(backup, backup_of(target))
-            backup = ""
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        remedy = "free some space, or name a file on another disk" if full else "name another place"
-        raise InputError(f"{path}: could not be written ({error.strerror}); {remedy}") from error
-    finally:
-        for left in filter(None, (temporary, backup)):
-            with suppress(OSError):
-                os.unlink(left)
-    with suppress(OSError):  # the file is there; not every file system can sync a folder
-        _sync_folder(target.parent)
+    if not document["used"] and own_stream(path) is None and path.exists():
+        before = _Worth.of_file(path)
+        if before is None or before.used:
+            holds = "is no result file" if before is None else f"holds a result of {before.used} samples"
+            raise NothingUsedError(f"no sample was used, so there is nothing to save: {path}, which {holds}, is kept")
+    save_bytes(path, result_text(document).encode(), partial(_worth_keeping, _Worth.of(document), n_backups))
 
 
-def backup_of(path: Path) -> Path:
-    """Where the file is that `save_bytes` last replaced; beside what a link points to."""
-    target = Path(os.path.realpath(path))
-    return target.with_name(f"{target.name}.bak")
+class NothingUsedError(InputError):
+    """A result without a sample would replace something."""
 
 
-def _target(path: Path) -> Path:
-    """Where a file is written: a link stays a link. One that another user has laid there raises InputError."""
-    if path.is_symlink() and path.lstat().st_uid not in (0, os.geteuid()):
-        raise InputError(f"{path}: is a link that another user has made; name another file")
-    return Path(os.path.realpath(path))
+@dataclass(frozen=True)
+class _Worth:
+    """What of a result tells how much would be lost with it. convergence: 0 collecting .. 2 fine."""
+
+    used: int
+    convergence: int
+    first_ns: int | None
+
+    @staticmethod
+    def of(document: Mapping[str, Any]) -> _Worth:
+        rank = [each.value for each in Convergence].index(document["convergence"])
+        return _Worth(int(document["used"]), rank, document["time_span"]["first_ns"])
+
+    @staticmethod
+    def of_file(path: Path) -> _Worth | None:
+        """None for what is no result file, or a damaged one."""
+        try:
+            content: Any = load_yaml(path, "result file") if path.stat().st_size <= LARGEST_FILE else None
+            return _Worth.of(content) if content["format"] == FORMAT else None
+        except (InputError, OSError, KeyError, TypeError, ValueError, OverflowError):
+            return None
+
+    def continued_by(self, other: _Worth) -> bool:
+        """Whether the other is of the same run, later on."""
+        return self.first_ns == other.first_ns and self.used <= other.used
 
 
-def _second_name(path: Path, name: str) -> str:
-    """Make the file known under this name, too."""
-    try:
-        os.link(path, name)
-    except OSError:  # a file system without hard links
-        shutil.copy2(path, name)
-    return name
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def _worth_keeping(new: _Worth, n_backups: int, before: Sequence[Path]) -> list[Path]:
+    """Of the files before, newest first, those to keep: the first, and then by convergence, the newest of equals."""
+    worth = {path: _Worth.of_file(path) for path in before}
+    kept: list[Path] = []
+    for path in before:
+        own = worth[path]
+        if own is not None and (not own.used or (path != before[0] and own.continued_by(new))):
+            continue
+        kept.append(path)
+        new = own or new
+    first, rest = kept[:1], kept[1:]
+    rest.sort(key=lambda path: -1 if (own := worth[path]) is None else own.convergence, reverse=True)  # stable
+    best = rest[: n_backups - len(first)]
+    return [*first, *(path for path in before if path in best)]
 
 
 def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:

@@ -28,14 +28,15 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..errors import InputError
+from ..files.atomic import check_writable
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (
+    NothingUsedError,
     check_in_folder,
-    check_writable,
     load_initial_calibration,
     result_document,
     result_text,
-    save_text,
+    save_result,
 )
 from ..messages.decode import MessageFeed
 from ..messages.drivers import velocity_type
@@ -262,6 +263,8 @@ class CalibrationNode(Node):
             return response
         try:
             self._save(Path(path))
+        except NothingUsedError as error:
+            response.message = str(error)
         except InputError as error:
             response.message = str(error)
             self.get_logger().error(response.message)
@@ -270,16 +273,18 @@ class CalibrationNode(Node):
         return response
 
     def _save(self, path: Path) -> None:
+        self._save_problem = None
         try:
-            save_text(path, self._result_text())
+            save_result(path, self._result_document(), round(self._calibrator.parameters.result_backups))
+        except NothingUsedError:
+            raise
         except InputError as error:
             self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
             raise
-        self._save_problem = None
 
-    def _result_text(self) -> str:
+    def _result_document(self) -> dict[str, Any]:
         feed = self._feed
-        return result_text(result_document(self._calibrator.result(), feed.dvl_frame or "dvl_link", feed.turns_dvl))
+        return result_document(self._calibrator.result(), feed.dvl_frame or "dvl_link", feed.turns_dvl)
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -313,8 +318,11 @@ class CalibrationNode(Node):
         try:
             self._save(Path(path))
             print(f"calibration_node: saved to {path}", file=sys.stderr)
+        except NothingUsedError as error:
+            print(f"calibration_node: {error}", file=sys.stderr)
         except InputError as error:
-            print(f"calibration_node: {error}. The result follows.\n{self._result_text()}", file=sys.stderr)
+            result = result_text(self._result_document())
+            print(f"calibration_node: {error}. The result follows.\n{result}", file=sys.stderr)
 
 
 def _set_stamp(stamp: Any, nanoseconds: int) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import jinja2
 
 from .. import __version__
-from ..files.result_file import save_text
+from ..files.atomic import save_text
 from .style import MODEL_STYLES
 
 # Class of a cell that holds a verdict

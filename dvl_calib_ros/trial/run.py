@@ -18,7 +18,7 @@ from typing import Any
 
 from ..calibration.parameters import Parameters
 from ..errors import InputError
-from ..files.result_file import save_text
+from ..files.atomic import save_text
 from ..parallel import outcomes_on_cores
 from .cases import Case
 from .generator import record

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..files.result_file import save_text
+from ..files.atomic import save_text
 
 
 class Category(str, Enum):

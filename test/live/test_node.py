@@ -32,6 +32,7 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.demo.player import BagPlayer
+from dvl_calib_ros.files.result_file import result_document, save_result
 from dvl_calib_ros.files.yaml_files import load_yaml
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.replay.replay import replay
@@ -116,6 +117,21 @@ def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_
     assert process.returncode == 0, process.output
     assert "Traceback" not in process.output
     assert load_yaml(saved, "result file")["model"] == "F1"
+
+
+def test_a_node_that_gets_no_data_leaves_the_result_before_and_its_backup_as_they_are(world, tmp_path, bag):
+    saved = tmp_path / "live.yaml"
+    good = replay([bag], Parameters()).result
+    for _ in range(2):
+        save_result(saved, result_document(good), 3)
+    before = {path.name: path.read_bytes() for path in tmp_path.glob("live*")}
+    assert len(before) == 2
+    for _ in range(2):
+        with world.calibration_node(f"result_file:={saved}") as process:
+            diagnostics = world.received(DiagnosticArray, "/diagnostics")
+            until(lambda diagnostics=diagnostics: diagnostics, "the node to run")
+        assert process.returncode == 0 and "no sample was used" in process.output
+        assert {path.name: path.read_bytes() for path in tmp_path.glob("live*")} == before
 
 
 def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_lost(world, tmp_path):
@@ -295,6 +311,11 @@ def test_services_reset_and_save_answer_in_words(world, tmp_path, monkeypatch):
         )
         assert world.call(Trigger, f"{NODE}/reset").success
         assert received(node) == 0
+        answer = world.call(Trigger, f"{NODE}/save")
+        assert not answer.success and "no sample was used, so there is nothing to save" in answer.message
+        assert load_yaml(target, "result file")["used"] == 10
+        dvl.send(*(twist(1000 + 0.2 * i) for i in range(10)))
+        until(lambda: received(node) == 10, "all samples")
         target.unlink()
         (tmp_path / "result.yaml.bak").unlink()
         tmp_path.rmdir()

@@ -1,13 +1,10 @@
-"""The result file: exact, never torn, never believed blindly."""
+"""The result file: exact, never lost to a worse one, never believed blindly."""
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import shlex
-import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,12 +21,13 @@ from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.atomic import save_text
 from dvl_calib_ros.files.result_file import (
-    check_writable,
+    NothingUsedError,
     load_initial_calibration,
     result_document,
     result_text,
-    save_text,
+    save_result,
 )
 
 MOUNTING = (0.1, -0.2, 0.7)
@@ -95,107 +93,93 @@ def test_the_file_says_what_a_user_asks_of_it(saved, result):
     assert content["std"]["phi_z"] == f"{sigma:.4f} deg"
 
 
-def _disk_is_full(*_):
-    raise OSError(errno.ENOSPC, "No space left on device")
+# ---------------------------------------------------------------------- a good result is never lost
 
 
-def test_the_file_before_is_kept_as_bak_even_when_the_next_save_fails(tmp_path, monkeypatch):
-    path = tmp_path / "result.yaml"
-    for text in ("one", "two", "three"):
-        save_text(path, text)
-    monkeypatch.setattr(os, "fsync", _disk_is_full)
-    with pytest.raises(InputError):
-        save_text(path, "four")
-    assert path.read_text() == "three"
-    assert (tmp_path / "result.yaml.bak").read_text() == "two"
-    assert sorted(os.listdir(tmp_path)) == ["result.yaml", "result.yaml.bak"]
+def document(used: int, convergence: str = "coarse", first_ns: int | None = 0) -> dict:
+    """As much of a result's document as its worth is told from."""
+    head = {"format": "dvl_calib_ros result 1", "used": used, "convergence": convergence}
+    return {**head, "time_span": {"first_ns": first_ns}}
 
 
-def test_a_link_stays_a_link(tmp_path):
-    (tmp_path / "data").mkdir()
-    (tmp_path / "link.yaml").symlink_to(tmp_path / "data" / "result.yaml")
-    save_text(tmp_path / "link.yaml", "text")
-    assert (tmp_path / "link.yaml").is_symlink()
-    assert (tmp_path / "data" / "result.yaml").read_text() == "text"
+def uses(folder: Path) -> list[int]:
+    """Samples used in the file and its backups, from the newest."""
+    names = sorted(os.listdir(folder), key=lambda name: (len(name), name))
+    return [yaml.safe_load((folder / name).read_text())["used"] for name in names]
 
 
-@pytest.mark.parametrize("function", ["fsync", "replace", "fdopen", "fchmod", "link"])
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EACCES])
-def test_a_failure_while_saving_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, function, code):
-    path = tmp_path / "result.yaml"
-    path.write_text("old")
-
-    def fail(*_args, **_options):
-        raise OSError(code, os.strerror(code))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, function, fail)
-        if function == "link":
-            patch.setattr("shutil.copy2", fail)
-        with pytest.raises(InputError, match=os.strerror(code)) as caught:
-            save_text(path, "new")
-    assert ("free some space" in str(caught.value)) == (code == errno.ENOSPC)
-    assert path.read_text() == "old"
-    assert os.listdir(tmp_path) == ["result.yaml"]
+def test_a_result_of_no_sample_replaces_nothing_that_holds_something(tmp_path, saved, result):
+    before = saved.read_bytes()
+    empty = {**result_document(result), "used": 0}
+    for _ in range(3):
+        with pytest.raises(NothingUsedError, match=rf"no sample was used.*of {result.estimate.used} samples, is kept"):
+            save_result(saved, empty, 3)
+    notes = tmp_path / "notes.yaml"
+    notes.write_text("not a result")
+    with pytest.raises(NothingUsedError, match="is no result file, is kept"):
+        save_result(notes, empty, 3)
+    assert saved.read_bytes() == before and notes.read_text() == "not a result"
+    assert sorted(os.listdir(tmp_path)) == ["notes.yaml", "result.yaml"]
 
 
-def test_a_file_system_that_cannot_sync_folders_or_link_files_is_no_failure(tmp_path, monkeypatch):
-    sync = os.fsync
-
-    def only_files(handle):
-        if os.path.isdir(f"/proc/self/fd/{handle}"):
-            raise OSError(errno.EINVAL, "Invalid argument")
-        sync(handle)
-
-    def no_links(*_):
-        raise OSError(errno.EPERM, "Operation not permitted")
-
-    monkeypatch.setattr(os, "fsync", only_files)
-    monkeypatch.setattr(os, "link", no_links)
-    save_text(tmp_path / "result.yaml", "one")
-    save_text(tmp_path / "result.yaml", "two")
-    assert (tmp_path / "result.yaml").read_text() == "two"
-    assert (tmp_path / "result.yaml.bak").read_text() == "one"
+def test_an_empty_result_is_written_where_nothing_is_and_makes_room_without_a_trace(tmp_path):
+    path = tmp_path / "r.yaml"
+    for used, left in ((0, [0]), (0, [0]), (7, [7]), (8, [8, 7])):
+        save_result(path, document(used, "collecting", None if used == 0 else used), 3)
+        assert uses(tmp_path) == left
 
 
-def test_an_interrupted_save_leaves_no_temporary_file(tmp_path, monkeypatch):
-    def interrupted(_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        save_text(tmp_path / "result.yaml", "text")
-    assert os.listdir(tmp_path) == []
+def test_a_run_that_is_saved_every_minute_does_not_push_out_the_good_one_before_it(tmp_path):
+    path = tmp_path / "r.yaml"
+    save_result(path, document(9000, "fine", first_ns=1), 3)
+    for used in range(1, 50):
+        save_result(path, document(used, "collecting", first_ns=2), 3)
+    assert uses(tmp_path) == [49, 48, 9000]
 
 
-def test_a_disk_that_is_really_full_is_said(tmp_path):
-    """A file size limit makes write() itself fail, as a full disk does."""
-    script = (
-        "import resource, signal, sys; from pathlib import Path\n"
-        "from dvl_calib_ros.files.result_file import save_text\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "save_text(Path(sys.argv[1]), 'x' * 100_000)"
-    )
-    path = tmp_path / "result.yaml"
-    path.write_text("old")
-    done = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True)
-    assert "InputError" in done.stderr and "File too large" in done.stderr
-    assert path.read_text() == "old" and os.listdir(tmp_path) == ["result.yaml"]
+def test_of_many_runs_the_best_converged_are_kept_and_of_these_the_newest(tmp_path):
+    path = tmp_path / "r.yaml"
+    runs = [(1, "fine"), (2, "fine"), (3, "coarse"), (4, "fine"), (5, "collecting"), (6, "coarse"), (7, "collecting")]
+    for used, convergence in runs:
+        save_result(path, document(used, convergence, first_ns=used), 3)
+    assert uses(tmp_path) == [7, 6, 4, 2]
 
 
-def test_where_no_file_can_be_is_said_before_anything_is_collected(tmp_path):
-    (tmp_path / "file").touch()
-    for path, expected in (
-        (tmp_path, "is a folder; name a file in it"),
-        (tmp_path / "missing" / "r.yaml", "does not exist; create it"),
-        (tmp_path / "file" / "r.yaml", "does not exist; create it"),
-    ):
-        with pytest.raises(InputError, match=expected):
-            check_writable(path)
-        with pytest.raises(InputError, match="could not be written"):
-            save_text(path, "text")
-    check_writable(tmp_path / "new.yaml")
-    assert os.listdir(tmp_path) == ["file"]
+def test_with_one_backup_it_is_the_file_before_and_with_fewer_than_there_are_the_others_go(tmp_path):
+    path = tmp_path / "r.yaml"
+    for used in range(1, 6):
+        save_result(path, document(used, "fine", first_ns=used), 4)
+    assert uses(tmp_path) == [5, 4, 3, 2, 1]
+    save_result(path, document(6, "fine", first_ns=6), 1)
+    assert uses(tmp_path) == [6, 5]
+
+
+RUNS = st.lists(st.tuples(st.integers(0, 50), st.sampled_from(["collecting", "coarse", "fine"])), max_size=12)
+
+
+@given(runs=RUNS, n_backups=st.integers(2, 4))
+def test_whatever_runs_follow_each_other_the_last_fine_one_is_kept(tmp_path_factory, runs, n_backups):
+    folder = tmp_path_factory.mktemp("runs")
+    last_fine = None
+    for number, (used, convergence) in enumerate(runs):
+        with suppress(NothingUsedError):
+            save_result(folder / "r.yaml", document(used, convergence, first_ns=number), n_backups)
+            last_fine = used if used and convergence == "fine" else last_fine
+        assert last_fine is None or last_fine in uses(folder)
+        assert len(uses(folder)) <= n_backups + 1
+
+
+def test_a_backup_that_is_no_result_file_any_more_is_the_first_to_go(tmp_path):
+    path = tmp_path / "r.yaml"
+    for used in range(1, 4):
+        save_result(path, document(used, "collecting", first_ns=used), 3)
+    (tmp_path / "r.yaml.bak").write_text("damaged: [")
+    for used in range(4, 6):
+        save_result(path, document(used, "collecting", first_ns=used), 3)
+    assert uses(tmp_path) == [5, 4, 3, 1]
+
+
+# ---------------------------------------------------------------------- what is read
 
 
 def change(path: Path, edit) -> Path:
