@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
 
 if TYPE_CHECKING:
-    from ..trial.scorer import Table
+    from collections.abc import Sequence
+
+    from ..trial.plan import Case
+    from ..trial.tables import Table
 
 DEFAULT_CASES = 100
 KIND_CHOICES = ("all", "tuning", "held-out")
+FAMILY_CHOICES = ("simulated", "half_real", "horizontal", "several")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,50 +25,90 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("blind trial (--trial)")
     amount = group.add_mutually_exclusive_group()
     amount.add_argument("--cases", type=int, metavar="N", help=f"a fair part of the trial; default: {DEFAULT_CASES}")
+    amount.add_argument(
+        "--case", action="append", metavar="KEY", help="one case, by its key or id (as in sealed/); may be given again"
+    )
     amount.add_argument("--full", action="store_true", help="all cases (hours)")
     group.add_argument("--kinds", choices=KIND_CHOICES, default="all", help="of trajectory; default: %(default)s")
+    group.add_argument(
+        "--family", choices=FAMILY_CHOICES, action="append",
+        help="simulated manoeuvres, real motion, the same with a horizontal reference, or several recordings of one "
+        "vehicle; may be given again; default: all, in turns",
+    )  # fmt: skip
     group.add_argument(
         "--out", type=Path, default=Path("dvl_calib_trial"), metavar="FOLDER",
         help="folder of the trial, which goes on where it was stopped; default: %(default)s",
     )  # fmt: skip
     group.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     group.add_argument("--seed", type=int, default=0, metavar="S", help="of the trial; default: %(default)s")
+    group.add_argument("--minutes", type=float, default=math.inf, metavar="M", help="begin no case after this time")
+    group.add_argument("--page", type=Path, metavar="FILE", help="write the page of the documentation (Markdown)")
     group.add_argument("--keep-bags", action="store_true", help="leave the bags in the folder")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Run what is left of the trial, score it, print the tables and write them to the folder."""
+    from .. import __version__
     from ..errors import InputError
     from ..files.atomic import save_text
-    from ..trial.cases import KINDS, plan
-    from ..trial.motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS, recordings_folder
+    from ..trial.motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
+    from ..trial.plan import KINDS, Family, plan
+    from ..trial.recorded import NO_RECORDINGS, has_ins, recordings_folder
     from ..trial.run import Trial
-    from ..trial.scorer import join, score
+    from ..trial.scored import join
+    from ..trial.tables import score
     from ..trial.truth import unseal
 
     _check(arguments)
     kinds = {"all": KINDS, "tuning": TUNING_KINDS, "held-out": HELD_OUT_KINDS}[arguments.kinds]
     errors = common.console(stderr=True)
-    if RECORDED in kinds and recordings_folder() is None:
+    if RECORDED in kinds and not has_ins(recordings_folder()):
         kinds = tuple(kind for kind in kinds if kind != RECORDED)
-        errors.print("[yellow]note:[/] no recorded trajectories; name the folder of Snapir's in DVL_CALIB_SNAPIR")
-    cases = plan(kinds)
-    if not arguments.full:
+        errors.print(f"[yellow]note:[/] {NO_RECORDINGS}")
+    cases = plan(kinds, [Family(name) for name in arguments.family or FAMILY_CHOICES])
+    if arguments.case:
+        cases = _chosen(cases, arguments.case)
+    elif not arguments.full:
         cases = cases[: arguments.cases or DEFAULT_CASES]
     trial = Trial(arguments.out, arguments.seed, arguments.jobs, arguments.keep_bags)
     try:
         with common.progress("trial") as on_progress:
-            answers = trial.run(cases, on_progress)
+            answers = trial.run(cases, on_progress, 60.0 * arguments.minutes)
     except OSError as error:
         raise InputError(f"{arguments.out}: {error.strerror or error}; name another folder by --out") from error
     result = score(join(unseal(trial.sealed), answers))
     common.write_json(arguments.out / "score.json", result.document())
     save_text(arguments.out / "score.md", result.markdown())
+    if arguments.page is not None:
+        save_text(arguments.page, result.page(_command(arguments), __version__))
     out = common.console()
     for table in result.tables:
         out.print(_rich(table))
     if result.n_failed:
         errors.print(f"[red]{result.n_failed} cases failed[/]; {trial.answers} says how")
+
+
+def _chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
+    """Cases by key or id, in the order of the names. Raises InputError."""
+    from ..errors import InputError
+
+    by_name = {name: case for case in cases for name in (case.key, case.id)}
+    if unknown := [name for name in names if name not in by_name]:
+        raise InputError(f"--case {unknown[0]}: no such case; give a key or an id as in the folder's sealed/*.json")
+    return [by_name[name] for name in names]
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    """The command line that runs the same cases again."""
+    words = ["dvl-calib diagnose --trial", f"--seed {arguments.seed}"]
+    if arguments.case:
+        words += [f"--case {name}" for name in arguments.case]
+    else:
+        words.append("--full" if arguments.full else f"--cases {arguments.cases or DEFAULT_CASES}")
+    words += [f"--family {name}" for name in arguments.family or ()]
+    if arguments.kinds != "all":
+        words.append(f"--kinds {arguments.kinds}")
+    return " ".join(words)
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -73,6 +118,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError(f"--cases: {arguments.cases} is no number of cases; give 1 or more, or --full")
     if arguments.jobs < 0:
         raise InputError(f"--jobs: {arguments.jobs} is negative; give a number of processes, or 0 for one per core")
+    if not arguments.minutes >= 0.0:
+        raise InputError(f"--minutes: {arguments.minutes} is no time; give 0 or more")
     if arguments.seed < 0:
         raise InputError(f"--seed: {arguments.seed} is negative; give 0 or more")
 

@@ -8,29 +8,40 @@ from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from ..bags.reader import BagWriter
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from .cases import Case, Drawn, draw
+from .cases import Drawn, draw
 from .motion import Floats, Motion
+from .plan import Case
 from .strength import Scene
-from .truth import Truth
-from .vehicle import Faults, dvl_velocity, recorded_attitude, reference_velocity
+from .vehicle import (
+    Faults,
+    attitude_state,
+    dvl_stamps,
+    dvl_velocity,
+    in_recording,
+    recorded_attitude,
+    reference_velocity,
+)
 
 START_NS = 1_770_000_000_000_000_000
-BETWEEN_RECORDINGS_NS = 3_600_000_000_000
-IMU_RATE_HZ = 20.0
+BETWEEN_RECORDINGS_NS = 86_400_000_000_000
 IMU_ATTITUDE_STD = 2e-4
 IMU_RATE_STD = 5e-4
 
 
+# How a driver without a vertical velocity shows that: its variance in (m/s)², None for that of the other axes
+VERTICALS = {"huge": 1e6, "large": 2.5e3, "minus_one": -1.0, "zero": None, "zero_without_covariance": None}
+
+
 @dataclass(frozen=True)
 class Recorded:
-    """Where the bags of a case are, one per recording, and what its user knows: the nominal mounting; and its truth."""
+    """Where the bags of a case are, one per recording; and the case."""
 
     bags: tuple[Path, ...]
-    mounting_rpy: tuple[float, float, float]
-    truth: Truth
+    drawn: Drawn
 
 
 def record(case: Case, seed: int, folder: Path) -> Recorded:
@@ -38,11 +49,11 @@ def record(case: Case, seed: int, folder: Path) -> Recorded:
     drawn = draw(case, seed)
     folder.mkdir(parents=True)
     bags = []
-    for number, motion in enumerate(drawn.scene.motions):
+    for number in range(len(drawn.scene.motions)):
         bags.append(folder / f"recording{number}")
         start_ns = START_NS + number * BETWEEN_RECORDINGS_NS
-        _write(bags[-1], _samples(drawn, motion, Noise.of(case.hardness, drawn.scene, drawn.noise), start_ns))
-    return Recorded(tuple(bags), drawn.scene.vehicle.mounting_rpy, drawn.truth)
+        _write(bags[-1], _samples(drawn, number, Noise.of(case.hardness, drawn.scene, drawn.noise), start_ns))
+    return Recorded(tuple(bags), drawn)
 
 
 # ------------------------------------------------------------------ noise
@@ -117,13 +128,13 @@ _HARD: Mapping[str, Callable[[np.random.Generator], Noise]] = {
 Sample = DvlSample | ReferenceSample | ImuSample
 
 
-def _samples(drawn: Drawn, motion: Motion, noise: Noise, start_ns: int) -> list[list[Sample]]:
-    """The samples of each sensor, in order of stamps."""
-    scene, faults = drawn.scene, drawn.faults
+def _samples(drawn: Drawn, number: int, noise: Noise, start_ns: int) -> list[list[Sample]]:
+    """The samples of each sensor in a recording, in order of stamps."""
+    scene, motion, faults = drawn.scene, drawn.scene.motions[number], in_recording(drawn.faults, number)
     return [
         _dvl(scene, motion, faults, noise, start_ns),
         _gnss(scene, motion, faults, noise, start_ns),
-        _imu(motion, faults, noise, start_ns),
+        _imu(scene, motion, faults, noise, start_ns),
     ]
 
 
@@ -133,7 +144,7 @@ def _stamps_ns(times: Floats, noise: Noise, start_ns: int) -> list[int]:
 
 
 def _dvl(scene: Scene, motion: Motion, faults: Faults, noise: Noise, start_ns: int) -> list[Sample]:
-    times = noise.sampled(scene.dvl_stamps(motion), scene.dvl_rate)
+    times = noise.sampled(scene.dvl_times(motion), scene.dvl_rate)
     axes_from_beams = scene.vehicle.axes_from_beams
     velocity = dvl_velocity(motion, scene.vehicle, faults, times)
     velocity += scene.beam_std * noise.white((len(times), 4)) @ axes_from_beams.T
@@ -141,9 +152,12 @@ def _dvl(scene: Scene, motion: Motion, faults: Faults, noise: Noise, start_ns: i
     velocity[wild] += noise.rng.uniform(-2.0, 2.0, (int(wild.sum()), 3))
     reported = noise.reported_dvl * scene.beam_std
     covariance = reported**2 * axes_from_beams @ axes_from_beams.T if reported else None
+    stamps = dvl_stamps(times, faults)
+    newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamps[:-1]]))
+    kept = stamps > newest  # a driver drops what its clock, stepping back, stamps before what it has sent
     return [
         DvlSample(stamp, (x, y, z), covariance)
-        for stamp, (x, y, z) in zip(_stamps_ns(times, noise, start_ns), velocity.tolist(), strict=True)
+        for stamp, (x, y, z) in zip(_stamps_ns(stamps[kept], noise, start_ns), velocity[kept].tolist(), strict=True)
     ]
 
 
@@ -153,6 +167,9 @@ def _gnss(scene: Scene, motion: Motion, faults: Faults, noise: Noise, start_ns: 
     velocity += scene.gnss_std * noise.of_reference(len(times), scene.gnss_rate)
     reported = noise.reported_gnss * scene.gnss_std
     covariance = reported**2 * np.eye(3) if reported else None
+    if scene.vertical:
+        velocity[:, 2] = 0.0
+        covariance = _without_vertical(scene.vertical, covariance)
     frame = VelocityFrame.BODY if scene.in_body else VelocityFrame.ENU
     return [
         ReferenceSample(stamp, (x, y, z), covariance, frame)
@@ -160,15 +177,27 @@ def _gnss(scene: Scene, motion: Motion, faults: Faults, noise: Noise, start_ns: 
     ]
 
 
-def _imu(motion: Motion, faults: Faults, noise: Noise, start_ns: int) -> list[Sample]:
-    times = np.arange(0.0, motion.seconds, 1.0 / IMU_RATE_HZ)
-    attitude = recorded_attitude(motion, faults, times)
-    tilt = type(attitude).from_rotvec(IMU_ATTITUDE_STD * noise.rng.normal(size=(len(times), 3)))
-    quaternions = (attitude * tilt).as_quat().tolist()
-    rates = motion.at(times).rates + IMU_RATE_STD * noise.rng.normal(size=(len(times), 3))
+def _without_vertical(shown: str, covariance: Floats | None) -> Floats | None:
+    variance = VERTICALS[shown]
+    if covariance is None or shown == "zero_without_covariance":
+        return None
+    return covariance if variance is None else np.diag([*np.diag(covariance)[:2], variance])
+
+
+def _imu(scene: Scene, motion: Motion, faults: Faults, noise: Noise, start_ns: int) -> list[Sample]:
+    times = scene.imu_stamps(motion)
+    state = attitude_state(motion, faults, times)
+    tilt = Rotation.from_rotvec(IMU_ATTITUDE_STD * noise.rng.normal(size=(len(times), 3)))
+    attitude = recorded_attitude(state, faults) * tilt
+    rates = state.rates + IMU_RATE_STD * noise.rng.normal(size=(len(times), 3))
+    if scene.rates_differenced:
+        turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() * scene.imu_rate
+        rates = np.vstack([turns, turns[-1:]])
     return [
         ImuSample(start_ns + round(time * 1e9), (x, y, z, w), (p, q, r))
-        for time, (x, y, z, w), (p, q, r) in zip(times.tolist(), quaternions, rates.tolist(), strict=True)
+        for time, (x, y, z, w), (p, q, r) in zip(
+            times.tolist(), attitude.as_quat().tolist(), rates.tolist(), strict=True
+        )
     ]
 
 

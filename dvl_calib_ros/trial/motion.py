@@ -1,21 +1,15 @@
-"""How the vehicles of the trial move: manoeuvres of a body with inertia in waves and current, and recorded sea trials.
+"""How the vehicles of the trial move: manoeuvres of a body with inertia in waves and current.
 
 Euler angles are yaw, pitch, roll (Z-Y-X) of the forward-left-up body in east-north-up, so a positive pitch is bow down.
 """
 
 from __future__ import annotations
 
-import csv
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -95,7 +89,8 @@ def _interpolate(at: Floats, time: Floats, columns: Floats) -> Floats:
     return np.column_stack([np.interp(at, time, column) for column in columns.T])
 
 
-def _motion(seconds: float, time: Floats, velocity_enu: Floats, euler: Floats) -> Motion:
+def sampled_motion(seconds: float, time: Floats, velocity_enu: Floats, euler: Floats) -> Motion:
+    """A motion from its velocity (M, 3) m/s and Euler angles (M, 3) rad at the full rate."""
     turned = attitude(euler)
     steps = (turned[:-2].inv() * turned[2:]).as_rotvec() / (time[2:] - time[:-2])[:, None]
     rates = np.vstack([steps[:1], steps, steps[-1:]])
@@ -202,6 +197,7 @@ ROUNDS: Mapping[str, Round] = {
     "straight": _straight,
     "one_speed_box": _one_speed_box,
 }
+# Real motion
 RECORDED = "snapir"
 # What the diagnosis may be tuned on, and what is kept from that
 TUNING_KINDS = ("box", "lawnmower", "figure8", "zigzag")
@@ -221,7 +217,7 @@ def manoeuvre(kind: str, seconds: float, rng: np.random.Generator, calm: bool = 
     through_water = np.column_stack([speed, -skid * turn_rate * speed, rise * speed])
     current = np.array([*rng.normal(0.0, 0.1, 2), 0.0])
     velocity = attitude(euler).apply(through_water) + current + swell.velocity(time)
-    return _motion(seconds, time, velocity, euler)
+    return sampled_motion(seconds, time, velocity, euler)
 
 
 def _obeyed(orders: list[Order], time: Floats, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
@@ -275,43 +271,3 @@ class _Swell:
 
     def pitch(self, time: Floats) -> Floats:
         return self._sum(time, 4)
-
-
-# ------------------------------------------------------------------ recorded
-
-# T11 hardly turns
-RECORDINGS = tuple(f"T{number:02d}" for number in range(1, 11))
-# Recorded at 1 Hz: what changes faster than this is noise of the recording as much as motion
-SMOOTHING_S = 1.5
-
-
-def recordings_folder() -> Path | None:
-    """Folder of the Snapir sea trials: $DVL_CALIB_SNAPIR, else ../shared/data/snapir beside the project, if there."""
-    named = os.environ.get("DVL_CALIB_SNAPIR")
-    folder = Path(named) if named else Path(__file__).resolve().parents[3] / "shared" / "data" / "snapir"
-    return folder if (folder / f"{RECORDINGS[0]}_attitude.csv").is_file() else None
-
-
-@cache
-def recorded(folder: Path, name: str) -> Motion:
-    """The motion of a recorded run: forward-right-down velocity and its attitude in north-east-down, smoothed."""
-    seconds, velocity_frd = _columns(folder / f"{name}_dvl.csv")
-    _, rpy_ned = _columns(folder / f"{name}_attitude.csv")
-    length = float(seconds[-1] - seconds[0]) - 2 * MARGIN_S
-    start = float(seconds[0]) + MARGIN_S
-    roll, pitch, yaw = np.unwrap(rpy_ned, axis=0).T
-    euler = np.column_stack([np.pi / 2 - yaw, -pitch, roll])
-    sigma = SMOOTHING_S / float(np.median(np.diff(seconds)))
-    smooth = CubicSpline(
-        seconds - start,
-        gaussian_filter1d(np.column_stack([velocity_frd * [1.0, -1.0, -1.0], euler]), sigma, axis=0, mode="nearest"),
-    )
-    time = np.arange(-MARGIN_S, length + MARGIN_S, 1.0 / RATE_HZ)
-    both = smooth(time)
-    return _motion(length, time, attitude(both[:, 3:]).apply(both[:, :3]), both[:, 3:])
-
-
-def _columns(path: Path) -> tuple[Floats, Floats]:
-    with path.open(newline="") as file:
-        rows = np.array([[float(cell) for cell in row] for row in list(csv.reader(file))[1:]])
-    return rows[:, 0], rows[:, 1:]

@@ -6,11 +6,13 @@ of), ``answers.jsonl`` (one answer a line) and, while a case is worked on, its b
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,16 +22,18 @@ from ..calibration.parameters import Parameters
 from ..errors import InputError
 from ..files.atomic import save_text
 from ..parallel import outcomes_on_cores
-from .cases import Case
 from .generator import record
+from .plan import Case
+from .strength import Yardstick
 from .truth import seal
+from .vehicle import FAULTS, Faults
 
 Document = dict[str, Any]
 Answerer = Callable[[Sequence[Path], Parameters], Document]
 """Bags of one vehicle, and what is known of its mounting -> the diagnosis as in its JSON."""
 
 # The draws or the physics of the generator have changed: answers to older cases are answers to others
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 3
 
 
 def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
@@ -59,23 +63,33 @@ class Trial:
         """File of the answers."""
         return self.folder / "answers.jsonl"
 
-    def run(self, cases: Sequence[Case], on_progress: Callable[[float], None] = lambda _: None) -> dict[str, Document]:
-        """Answers to the cases by their id, asked for where they are not in the folder yet. Raises InputError."""
+    def run(
+        self,
+        cases: Sequence[Case],
+        on_progress: Callable[[float], None] = lambda _: None,
+        seconds: float = math.inf,
+    ) -> dict[str, Document]:
+        """Answers to the cases by their id, asked for where they are not in the folder yet. Raises InputError.
+
+        seconds: no further case is begun after this time.
+        """
         self._prepare()
         done = read_answers(self.answers)
+        until = time.monotonic() + seconds
         left = [case for case in cases if case.id not in done]
         with self.answers.open("a", encoding="utf-8") as file:
-            for number, answer in enumerate(self._answered(left), start=len(cases) - len(left) + 1):
+            for number, answer in enumerate(self._answered(left, until), start=len(cases) - len(left) + 1):
                 done[answer["id"]] = answer
                 file.write(json.dumps(answer, sort_keys=True) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
                 on_progress(number / len(cases))
-        return {case.id: done[case.id] for case in cases}
+        return {case.id: done[case.id] for case in cases if case.id in done}
 
-    def _answered(self, cases: Sequence[Case]) -> Any:
+    def _answered(self, cases: Sequence[Case], until: float) -> Iterator[Document]:
         work = partial(_answer, trial=self)
-        return map(work, cases) if self.jobs == 1 else outcomes_on_cores(work, cases, self.jobs)
+        begun = itertools.takewhile(lambda _: time.monotonic() < until, cases)
+        return map(work, begun) if self.jobs == 1 else outcomes_on_cores(work, begun, self.jobs)
 
     def _prepare(self) -> None:
         """Make the folder, or check that what is in it is of this trial."""
@@ -98,13 +112,24 @@ def _answer(case: Case, trial: Trial) -> Document:
     bags = trial.folder / "bags" / case.id
     shutil.rmtree(bags, ignore_errors=True)  # half written when the trial was stopped
     recorded = record(case, trial.seed, bags)
-    seal(recorded.truth, trial.sealed)
+    drawn = recorded.drawn
+    seal(drawn.truth, trial.sealed)
     began = time.process_time()
-    document = _asked(trial.answerer, recorded.bags, Parameters(mounting_rpy=recorded.mounting_rpy))
+    document = _asked(trial.answerer, recorded.bags, Parameters(mounting_rpy=drawn.scene.vehicle.mounting_rpy))
     seconds = time.process_time() - began
     if not trial.keep_bags:
         shutil.rmtree(bags)
-    return {"id": case.id, "document": document, "cpu_s": round(seconds, 2)}
+    left_mps = Yardstick(drawn.scene).error_mps(drawn.faults, said(document))
+    return {"id": case.id, "document": document, "cpu_s": round(seconds, 2), "left_mps": left_mps}
+
+
+def said(document: Document) -> Faults:
+    """The faults that an answer names, as far as the generator knows such, at the sizes that it gives."""
+    faults: dict[str, dict[str, float]] = {}
+    for effect in document.get("effects", []):
+        if effect["name"] in FAULTS:
+            faults[effect["name"]] = {name: each["value"] for name, each in effect["parameters"].items()}
+    return faults
 
 
 def _asked(answerer: Answerer, bags: Sequence[Path], parameters: Parameters) -> Document:

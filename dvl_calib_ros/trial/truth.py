@@ -20,6 +20,7 @@ class Category(str, Enum):
     HARD_NULL = "hard_null"
     SINGLE = "single"
     PAIR = "pair"
+    TRIPLE = "triple"
     UNKNOWN = "unknown"
     UNIDENTIFIABLE = "unidentifiable"
 
@@ -28,14 +29,19 @@ class Category(str, Enum):
 class Truth:
     """The sealed truth of a case.
 
-    id: as in the name of the bag, says nothing. faults: name -> parameters. q: of each fault alone. distances: name of
-    another fault of the library -> norm of what it leaves of the truth's trace at best. correlation: of a pair, at
-    most. outside_share: of an unknown fault, what the library together does not explain. hardness: of a hard null.
+    id: as in the name of the bag, says nothing. key: says everything, and draws it again. family: as in `plan`. faults:
+    name -> parameters, "seconds@1" being that of recording 1. q: of each fault, others beside it. distances: name of
+    another fault of the library -> norm of what it leaves at best of the trace of that fault which it is nearest to.
+    correlation: of a pair, at most. outside_share: of an unknown fault, what the library together does not explain.
+    hardness: of a hard null. twin: id of the same case with all axes. before_mps: error (rms) that the faults make
+    beyond the calibration. noise_mps: error that the noise makes.
     """
 
     id: str
     category: Category
     kind: str
+    key: str = ""
+    family: str = "simulated"
     faults: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     q: Mapping[str, float] = field(default_factory=dict)
     q_wanted: float = 0.0
@@ -43,6 +49,9 @@ class Truth:
     correlation: float | None = None
     outside_share: float | None = None
     hardness: str | None = None
+    twin: str | None = None
+    before_mps: float = 0.0
+    noise_mps: float = 0.0
     scene: Mapping[str, Any] = field(default_factory=dict)
 
 

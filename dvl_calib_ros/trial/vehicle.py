@@ -16,20 +16,24 @@ from .motion import HELD_OUT_KINDS, RATE_HZ, TUNING_KINDS, Floats, Motion, State
 
 Values = Mapping[str, float]
 Faults = Mapping[str, Values]
-"""Name of a fault -> its parameters."""
+"""Name of a fault -> its parameters, for one recording or several (`in_recording`)."""
 HOUR_S = 3600.0
+# A vehicle that turns faster than this is in a turn
+TURNING_RAD_S = 0.04
 
 
 @dataclass(frozen=True)
 class Fault:
     """typical: a size of each parameter worth knowing of. largest: beyond it, no vehicle would go unnoticed.
 
-    positive: parameters that are not negative. Parameters that are times (from_s, to_s) are drawn by the case.
+    positive: parameters that are not negative. Parameters that are times of the run (from_s, to_s, at_s) are drawn by
+    the case. between: shows between recordings only.
     """
 
     typical: Values
     largest: float
     positive: bool = False
+    between: bool = False
 
 
 def _axes(suffix: str, typical: float) -> Values:
@@ -52,9 +56,34 @@ FAULTS: Mapping[str, Fault] = {
     "heading_error": Fault({"sin_rad": 0.02, "cos_rad": 0.02}, 10.0),
     "sideslip": Fault({"coefficient_s": 0.1}, 10.0),
     "tilt_coupling": Fault({"x_per_pitch": 0.5, "z_per_pitch": 0.5, "y_per_roll": 0.5, "z_per_roll": 0.5}, 12.0),
+    "attitude_time_offset": Fault({"seconds": 0.1}, 8.0),
+    "time_offset_jump": Fault({"seconds": 0.2}, 8.0),
+    "clock_drift": Fault({"rate": 5e-4}, 20.0),
+    "mounting_moved": Fault({"roll_rad": 0.02, "pitch_rad": 0.02, "yaw_rad": 0.02}, 5.0, between=True),
 }
-# Faults of the reference velocity or of the attitude that turns it into the body
-REFERENCE_FAULTS = frozenset({"reference_time_offset", "reference_lag", "heading_error"})
+# What a reference in the body's frame cannot show
+NEED_ATTITUDE = frozenset({"heading_error", "attitude_time_offset"})
+
+
+def of_one_recording(in_body: bool) -> list[str]:
+    """Names of the faults that a single recording can show."""
+    return [name for name, fault in FAULTS.items() if not fault.between and not (in_body and name in NEED_ATTITUDE)]
+
+
+def in_recording(faults: Faults, number: int) -> Faults:
+    """The faults that are there in a recording of several, the first being 0.
+
+    "seconds@1" is a parameter of recording 1 alone; a fault with from_recording is not there before.
+    """
+    return {
+        name: {
+            each.split("@")[0]: value
+            for each, value in values.items()
+            if "@" not in each or each.endswith(f"@{number}")
+        }
+        for name, values in faults.items()
+        if values.get("from_recording", 0) <= number
+    }
 
 
 # ------------------------------------------------------------------ what no library knows
@@ -101,6 +130,24 @@ def _turn_stall(state: State, elapsed: Floats, shape: Values) -> Floats:
     return _on(0, np.abs(state.rates[:, 2]) * state.speed)
 
 
+def _bias_step(state: State, elapsed: Floats, shape: Values) -> Floats:
+    return _on(int(shape["axis"]), elapsed > shape["share"] * elapsed[-1])
+
+
+def _turn_hysteresis(state: State, elapsed: Floats, shape: Values) -> Floats:
+    """The side of the last turn, until a turn to the other side."""
+    turning = np.where(np.abs(state.rates[:, 2]) > TURNING_RAD_S, np.sign(state.rates[:, 2]), 0.0)
+    last = np.maximum.accumulate(np.where(turning != 0.0, np.arange(len(turning)), 0))
+    return _on(1, turning[last])
+
+
+def _speed_resonance(state: State, elapsed: Floats, shape: Values) -> Floats:
+    """At one speed, in the middle of those that the vehicle goes at."""
+    slow, fast = np.quantile(state.speed, [0.05, 0.95])
+    at = slow + shape["share"] * (fast - slow)
+    return _on(0, np.exp(-0.5 * ((state.speed - at) / max(0.08 * (fast - slow), 0.02)) ** 2))
+
+
 def _third_harmonic(state: State, elapsed: Floats, shape: Values) -> Floats:
     return _on(1, np.sin(3.0 * state.euler[:, 0] + shape["phase"]))
 
@@ -112,6 +159,9 @@ ODDITIES: Mapping[str, Oddity] = {
     "thruster_wash": Oddity(_thruster_wash, 0.2),
     "turn_stall": Oddity(_turn_stall, 0.1, kinds=("figure8", "zigzag", "free")),
     "third_harmonic": Oddity(_third_harmonic, 0.02, {"phase": (0.0, 6.283)}),
+    "bias_step": Oddity(_bias_step, 0.02, {"axis": (0.0, 3.0), "share": (0.25, 0.75)}),
+    "turn_hysteresis": Oddity(_turn_hysteresis, 0.02),
+    "speed_resonance": Oddity(_speed_resonance, 0.05, {"share": (0.3, 0.7)}),
 }
 
 
@@ -153,14 +203,23 @@ class Vehicle:
         return np.asarray(np.linalg.pinv(self.beams()), dtype=np.float64)
 
 
-def dvl_velocity(motion: Motion, vehicle: Vehicle, faults: Faults, stamps: Floats) -> Floats:
-    """What the DVL reports at its stamps (N,) s, free of noise: (N, 3) m/s in its own frame."""
-    state = motion.at(stamps - faults.get("dvl_time_offset", {}).get("seconds", 0.0))
+def dvl_stamps(times: Floats, faults: Faults) -> Floats:
+    """How the DVL stamps what it measured at times (N,) s, of which the first is that of its first sample."""
+    since = times - times[0]
+    late = np.full(len(times), faults.get("dvl_time_offset", {}).get("seconds", 0.0))
+    if jump := faults.get("time_offset_jump"):
+        late += jump["seconds"] * (since >= jump["at_s"])
+    return np.asarray(times + late + faults.get("clock_drift", {}).get("rate", 0.0) * since)
+
+
+def dvl_velocity(motion: Motion, vehicle: Vehicle, faults: Faults, times: Floats) -> Floats:
+    """What the DVL measures at times (N,) s, free of noise: (N, 3) m/s in its own frame."""
+    state = motion.at(times)
     nominal = vehicle.dvl_from_body
     moved = _velocity_at_dvl(state, faults)
     turned = _mounting(state, vehicle, faults).apply(nominal.apply(moved))
     radial = turned @ _beams_as_they_are(vehicle, faults).T
-    factor = np.full(len(stamps), 1.0 + vehicle.sound_speed_error)
+    factor = np.full(len(times), 1.0 + vehicle.sound_speed_error)
     factor += faults.get("quadratic_scale", {}).get("coefficient_s_per_m", 0.0) * state.speed
     factor += faults.get("scale_drift", {}).get("rate_per_hour", 0.0) / HOUR_S * state.time
     added = nominal.apply(_tilt_leak(state, faults)) + _constant(faults, "velocity_bias", "mps")
@@ -190,7 +249,9 @@ def _velocity_at_dvl(state: State, faults: Faults) -> Floats:
 
 
 def _mounting(state: State, vehicle: Vehicle, faults: Faults) -> Rotation:
+    moved = faults.get("mounting_moved", {})
     turn = np.tile(vehicle.misalignment, (len(state.time), 1))
+    turn += [moved.get(f"{angle}_rad", 0.0) for angle in ("roll", "pitch", "yaw")]
     turn += np.outer(state.time / HOUR_S, _constant(faults, "misalignment_drift", "rad_per_hour"))
     turn += np.outer(state.speed, _constant(faults, "mount_flexure", "rad_per_mps"))
     return Rotation.from_rotvec(turn)
@@ -226,9 +287,13 @@ def reference_velocity(motion: Motion, faults: Faults, stamps: Floats, in_body: 
     return np.column_stack([np.interp(times, motion.time + 0.5 / RATE_HZ, column) for column in filtered.T])
 
 
-def recorded_attitude(motion: Motion, faults: Faults, stamps: Floats) -> Rotation:
-    """Attitude as the inertial unit has it at its stamps (N,) s, with the compass's error."""
-    state = motion.at(stamps)
+def attitude_state(motion: Motion, faults: Faults, stamps: Floats) -> State:
+    """The motion that the inertial unit stamps with stamps (N,) s."""
+    return motion.at(stamps - faults.get("attitude_time_offset", {}).get("seconds", 0.0))
+
+
+def recorded_attitude(state: State, faults: Faults) -> Rotation:
+    """Attitude as the inertial unit has it, with the compass's error."""
     euler = state.euler.copy()
     if swing := faults.get("heading_error"):
         euler[:, 0] += swing["sin_rad"] * np.sin(euler[:, 0]) + swing["cos_rad"] * np.cos(euler[:, 0])

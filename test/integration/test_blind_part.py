@@ -9,16 +9,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.trial.cases import KINDS, Case, plan
 from dvl_calib_ros.trial.motion import RECORDED
+from dvl_calib_ros.trial.plan import KINDS, Case, plan
 from dvl_calib_ros.trial.run import Trial
-from dvl_calib_ros.trial.scorer import both_named, join, no_guess
+from dvl_calib_ros.trial.scored import join
 from dvl_calib_ros.trial.truth import Category, unseal
-from dvl_calib_ros.trial.vehicle import FAULTS
+from dvl_calib_ros.trial.vehicle import of_one_recording
 
 pytestmark = pytest.mark.trial
 
-SINGLES = sorted(FAULTS)[::4]
+SINGLES = sorted(of_one_recording(in_body=False))[::4]
 KINDS_HERE = tuple(kind for kind in KINDS if kind != RECORDED)  # the same part with and without the recordings
 
 
@@ -66,15 +66,15 @@ def test_strong_effects_are_found_and_named(scored):
 def test_strong_effects_are_closed_and_their_sizes_within_their_intervals(scored):
     single = scored[Category.SINGLE]
     assert np.median([case.closure for case in single if case.closure is not None]) >= 0.9
-    inside = [low <= true <= high for case in single for low, true, high in case.intervals]
+    inside = [interval.holds for case in single for interval in case.intervals]
     assert len(inside) >= 4
     assert np.mean(inside) >= 0.8
 
 
 def test_pairs_and_unknown_effects_are_seen(scored):
-    assert any(both_named(case) for case in scored[Category.PAIR])
+    assert any(case.are_all_named for case in scored[Category.PAIR])
     assert any(case.verdict == "unknown" for case in scored[Category.UNKNOWN])
 
 
 def test_nothing_is_guessed_where_the_data_cannot_tell(scored):
-    assert all(no_guess(case) for case in scored[Category.UNIDENTIFIABLE])
+    assert all(case.no_guess for case in scored[Category.UNIDENTIFIABLE])

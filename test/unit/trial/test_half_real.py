@@ -1,0 +1,182 @@
+"""Half-real cases of the trial: real motion, faults as large as at sea, clocks, no vertical, several recordings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.trial import generator, recorded
+from dvl_calib_ros.trial.cases import draw
+from dvl_calib_ros.trial.generator import VERTICALS, Noise
+from dvl_calib_ros.trial.half_real import HORIZONTAL, MIN_DISTANCE, MIN_Q
+from dvl_calib_ros.trial.plan import Case, Family, plan
+from dvl_calib_ros.trial.recorded import recordings_folder
+from dvl_calib_ros.trial.strength import Yardstick
+from dvl_calib_ros.trial.truth import Category
+from dvl_calib_ros.trial.vehicle import dvl_stamps, in_recording
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("snapir_ins")]
+
+KIND = "snapir"
+
+
+def case(category=Category.PAIR, name="", family=Family.HALF_REAL, number=0, q=0.0) -> Case:
+    return Case(category, KIND, name, q, number=number, family=family)
+
+
+def samples_of(drawn, number=0):
+    """(stamps s, values) of DVL, reference and inertial unit, without noise."""
+    clean = replace(drawn, scene=replace(drawn.scene, beam_std=0.0, gnss_std=0.0))
+    dvl, gnss, imu = generator._samples(clean, number, Noise(np.random.default_rng(0)), 0)
+    seconds = [np.array([s.stamp_ns for s in each]) * 1e-9 for each in (dvl, gnss, imu)]
+    return (
+        (seconds[0], np.array([s.velocity for s in dvl])),
+        (seconds[1], np.array([s.velocity for s in gnss])),
+        (seconds[2], Rotation.from_quat([s.orientation for s in imu]), np.array([s.angular_velocity for s in imu])),
+    )
+
+
+def find(wanted, category=Category.PAIR, family=Family.HALF_REAL, name="", seeds=range(40)):
+    """The first of some draws of a case that is as wanted."""
+    for seed in seeds:
+        drawn = draw(case(category, name, family), seed)
+        if wanted(drawn):
+            return drawn
+    raise AssertionError("no draw is as wanted")
+
+
+@pytest.fixture
+def no_imu_noise(monkeypatch):
+    monkeypatch.setattr(generator, "IMU_ATTITUDE_STD", 0.0)
+    monkeypatch.setattr(generator, "IMU_RATE_STD", 0.0)
+
+
+def test_a_user_who_knows_the_truth_can_undo_it_from_the_bag_alone(no_imu_noise):
+    """Lever arm at the time of measurement, then the delay: by other means than the generator's, to 3 mm/s."""
+    drawn = find(lambda d: set(d.faults) == {"lever_arm", "dvl_time_offset"} and d.scene.dvl_rate == 5.0)
+    (late, measured), (gnss_time, enu), (imu_time, attitude, rates) = samples_of(drawn)
+    vehicle, arm = drawn.scene.vehicle, np.array(list(drawn.faults["lever_arm"].values()))
+    at = late - drawn.faults["dvl_time_offset"]["seconds"]
+    inside = (at > max(gnss_time[0], imu_time[0]) + 5.0) & (at < min(gnss_time[-1], imu_time[-1]) - 5.0)
+    at = at[inside]
+    turned = Rotation.from_euler("xyz", CubicSpline(imu_time, np.unwrap(attitude.as_euler("xyz"), axis=0))(at))
+    body = turned.apply(CubicSpline(gnss_time, enu)(at), inverse=True) + np.cross(CubicSpline(imu_time, rates)(at), arm)
+    nominal = Rotation.from_euler("xyz", vehicle.mounting_rpy).inv().apply(body)
+    ideal = Rotation.from_rotvec(vehicle.misalignment).apply(nominal)
+    scale = np.sum(ideal * measured[inside], axis=0) / np.sum(ideal**2, axis=0)
+    assert np.abs(scale - 1.0).max() < 0.03
+    assert np.sqrt(np.mean((ideal * scale - measured[inside]) ** 2)) < 0.003
+    assert drawn.truth.before_mps > 0.02  # what it was before
+
+
+def test_a_clock_stamps_with_offset_jump_and_drift():
+    times = np.arange(10.0, 20.0)
+    faults = {
+        "dvl_time_offset": {"seconds": 1.5},
+        "time_offset_jump": {"seconds": 0.5, "at_s": 4.0},
+        "clock_drift": {"rate": 0.01},
+    }
+    since = times - 10.0
+    assert np.allclose(dvl_stamps(times, faults), times + 1.5 + 0.5 * (since >= 4.0) + 0.01 * since)
+
+
+def test_a_clock_that_steps_back_leaves_stamps_in_order():
+    drawn = find(
+        lambda d: d.faults["time_offset_jump"]["seconds"] < -1.1, category=Category.SINGLE, name="time_offset_jump"
+    )
+    (stamps, _), _, _ = samples_of(drawn)
+    assert (np.diff(stamps) > 0.0).all()
+    assert len(stamps) < len(drawn.scene.dvl_times(drawn.scene.motions[0]))
+
+
+def test_late_attitude_is_the_attitude_of_before(no_imu_noise):
+    drawn = find(lambda d: d.scene.imu_rate >= 5.0, category=Category.SINGLE, name="attitude_time_offset")
+    late = drawn.faults["attitude_time_offset"]["seconds"]
+    _, _, (time, attitude, _) = samples_of(drawn)
+    true = drawn.scene.motions[0].at(time - late).attitude
+    assert np.abs((true.inv() * attitude).magnitude()).max() < 1e-9
+
+
+def test_every_fault_at_sea_is_strong_beside_the_others_and_apart_from_every_rival():
+    for number in range(4):
+        drawn = draw(case(Category.TRIPLE, number=number), 11)
+        truth = drawn.truth
+        assert len(truth.faults) == 3 and min(truth.q.values()) >= MIN_Q
+        assert min(truth.distances.values()) >= MIN_DISTANCE
+        assert not truth.distances.keys() & truth.faults.keys()
+        # the truth said is all that there is to say; less of it leaves more
+        yardstick = Yardstick(drawn.scene)
+        assert yardstick.error_mps(drawn.faults, drawn.faults) < 1e-9
+        for name in drawn.faults:
+            assert yardstick.error_mps(drawn.faults, {k: v for k, v in drawn.faults.items() if k != name}) > 1e-4
+
+
+def test_faults_are_as_large_as_at_sea():
+    pairs = [draw(case(number=2 * n), 5).truth.faults for n in range(8)]
+    assert max(abs(each["lever_arm"]["x_m"]) for each in pairs) > 1.5
+    delays = [abs(values["seconds"]) for each in pairs for name, values in each.items() if name != "lever_arm"]
+    assert max(delays) > 1.5 and max(delays) <= 3.0
+
+
+@pytest.mark.parametrize("number", range(len(HORIZONTAL)))
+def test_a_horizontal_reference_shows_it_as_drivers_do_and_is_else_its_twin(number, tmp_path):
+    horizontal = case(Category.SINGLE, "dvl_time_offset", Family.HORIZONTAL, number)
+    drawn, twin = draw(horizontal, 3), draw(horizontal.twin, 3)
+    assert drawn.faults == twin.faults and drawn.truth.twin == twin.truth.id != drawn.truth.id
+    dvl, gnss, _ = generator._samples(drawn, 0, Noise(np.random.default_rng(1)), 0)
+    dvl_twin, gnss_twin, _ = generator._samples(twin, 0, Noise(np.random.default_rng(1)), 0)
+    assert [s.velocity for s in dvl] == [s.velocity for s in dvl_twin]
+    assert [s.velocity[:2] for s in gnss] == [s.velocity[:2] for s in gnss_twin]
+    assert all(s.velocity[2] == 0.0 for s in gnss)
+    shown = HORIZONTAL[number]
+    if shown == "zero_without_covariance":
+        assert gnss[0].covariance is None
+    else:
+        variance = VERTICALS[shown]
+        assert gnss[0].covariance[2, 2] == (drawn.scene.gnss_std**2 if variance is None else variance)
+
+
+def test_recordings_of_a_vehicle_have_a_delay_a_day_and_a_mounting_that_moved_once():
+    drawn = draw(case(Category.TRIPLE, "mounting_moved", Family.SEVERAL), 1)
+    n, moved = len(drawn.scene.motions), drawn.faults["mounting_moved"]
+    days = [in_recording(drawn.faults, number) for number in range(n)]
+    assert len({each["dvl_time_offset"]["seconds"] for each in days}) == n >= 2
+    assert len({tuple(each["lever_arm"].values()) for each in days}) == 1
+    assert [("mounting_moved" in each) for each in days] == [k >= moved["from_recording"] for k in range(n)]
+    assert 1 <= moved["from_recording"] < n
+
+
+def test_recordings_of_a_day_each_are_as_many_bags_on_as_many_days(tmp_path):
+    recorded_case = generator.record(case(Category.NULL, family=Family.SEVERAL), 2, tmp_path / "case")
+    starts = []
+    for bag in recorded_case.bags:
+        with BagReader([bag]) as reader:
+            starts.append(next(iter(reader.raw_messages(("dvl/twist",))))[1])
+    assert len(starts) == len(recorded_case.drawn.scene.motions) >= 2
+    assert np.allclose(np.diff(starts) * 1e-9, 86400.0, atol=5.0)
+
+
+def test_rates_differenced_as_imported_are_those_of_half_a_sample_later(no_imu_noise):
+    drawn = find(lambda d: d.scene.rates_differenced, category=Category.NULL)
+    _, _, (time, attitude, rates) = samples_of(drawn)
+    turned = Rotation.concatenate([attitude[k] * Rotation.from_rotvec(rates[k]) for k in range(len(time) - 1)])
+    assert np.abs((turned.inv() * attitude[1:]).magnitude()).max() < 1e-9
+
+
+def test_without_the_recordings_their_cases_are_left_out_and_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("DVL_CALIB_SHARED", str(tmp_path))
+    assert recordings_folder() is None
+    assert {each.family for each in plan(kinds=("box",))} == {Family.SIMULATED}
+    done = subprocess.run(
+        [sys.executable, "-m", "dvl_calib_ros.cli.main", "diagnose", "--trial", "--family", "half_real",
+         "--out", str(tmp_path / "trial")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0 and recorded.NO_RECORDINGS.split(";")[0] in done.stderr
