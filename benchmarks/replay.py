@@ -8,7 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from dvl_calib_ros.bags.reader import Compression, Storage
+from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 

@@ -130,7 +130,7 @@ def sqlite_cases() -> Iterator[Damaged]:
 
 def _ours(path: Path) -> Iterator[Recorded]:
     with suppress(InputError), BagReader([path]) as bag:
-        yield from bag.raw_messages(bag.topics)
+        yield from ((channel.topic, log_ns, data) for log_ns, channel, data in bag.raw_messages(bag.topics))
 
 
 def _rosbags(path: Path) -> Iterator[Recorded]:

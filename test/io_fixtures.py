@@ -14,10 +14,12 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.typesys import Stores, get_typestore
 
-from dvl_calib_ros.bags.reader import BagReader, BagWriter, Compression, Storage
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.messages.encode import SampleWriter
 from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -45,13 +47,14 @@ def write_bag(
 ) -> Path:
     frame_ids = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
     with BagWriter(path, Storage(storage), Compression(compression)) as bag:
+        writer = SampleWriter(bag)
         for sample in samples:
             if isinstance(sample, DvlSample):
-                bag.dvl(f"{prefix}dvl/twist", sample, dvl_frame)
+                writer.dvl(f"{prefix}dvl/twist", sample, dvl_frame)
             elif isinstance(sample, ReferenceSample):
-                bag.reference(f"{prefix}gnss/twist", sample, frame_ids[sample.frame])
+                writer.reference(f"{prefix}gnss/twist", sample, frame_ids[sample.frame])
             else:
-                bag.imu(f"{prefix}imu/data", sample)
+                writer.imu(f"{prefix}imu/data", sample)
     return path
 
 
@@ -69,7 +72,7 @@ def rewrite(path: Path, change: Callable[[str, Any], Any], samples: Iterable[Sam
     with BagWriter(path) as bag:
         for topic, log_ns, message in messages:
             if message is not None:
-                bag._write(topic, TOPICS[topic], log_ns, message)
+                bag.message(topic, TOPICS[topic], log_ns, message)
     return path
 
 
@@ -100,13 +103,12 @@ def _standard(topic: str) -> tuple[str, str]:
 
 
 def raw(*paths: Path) -> list[tuple[str, int, bytes]]:
-    with BagReader(paths) as bag:
-        return list(bag.raw_messages(bag.topics))
+    return raw_and_notes(*paths)[0]
 
 
 def raw_and_notes(*paths: Path) -> tuple[list[tuple[str, int, bytes]], list[str]]:
     with BagReader(paths) as bag:
-        return list(bag.raw_messages(bag.topics)), bag.notes
+        return [(channel.topic, log_ns, data) for log_ns, channel, data in bag.raw_messages(bag.topics)], bag.notes
 
 
 def replayed(*paths: Path, **parameters: Any) -> Replayed:

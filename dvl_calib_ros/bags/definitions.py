@@ -13,8 +13,6 @@ from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ..messages.drivers import VELOCITY_TYPES
-
 # Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
 LONGEST_DEFINITION = 1 << 18
 LARGEST_ARRAYS = 1 << 16
@@ -41,13 +39,11 @@ def is_empty(definition: Definition | None) -> bool:
     return definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
 
 
-def known_typestores(msgtype: str) -> list[Typestore]:
-    """Types for a message without a definition: Jazzy's, and each version of a driver's message that is known here."""
-    known = VELOCITY_TYPES[msgtype].definitions if msgtype in VELOCITY_TYPES else ()
-    stores = [get_typestore(Stores.ROS2_JAZZY) for _ in known or ("",)]
-    for store, text in zip(stores, known, strict=False):
-        store.register(get_types_from_msg(text, msgtype))
-    return stores
+def known_typestore(msgtype: str, text: str) -> Typestore:
+    """Jazzy's types and one that a definition is known of, in MSG format."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(text, msgtype))
+    return store
 
 
 def typestore(definition: Definition | None, msgtype: str) -> Typestore:
@@ -55,13 +51,27 @@ def typestore(definition: Definition | None, msgtype: str) -> Typestore:
     if definition is None or is_empty(definition):
         return get_typestore(Stores.ROS2_JAZZY)
     try:
-        store = get_typestore(Stores.EMPTY)
-        store.register(_harmless(_parsed(definition, msgtype)))
+        return _typestore(definition, msgtype)
     except DefinitionError:
         raise
-    except Exception as error:  # the parser raises all sorts of things
+    except Exception as error:
+        # The parser raises all sorts of things on what is damaged; one that parses nothing at all is not damage.
+        _typestore(_SOUND[definition.format], "a/msg/B")
         raise DefinitionError(f"the definition of {msgtype} is damaged ({type(error).__name__})") from error
+
+
+def _typestore(definition: Definition, msgtype: str) -> Typestore:
+    store = get_typestore(Stores.EMPTY)
+    store.register(_harmless(_parsed(definition, msgtype)))
     return store
+
+
+_SOUND = {
+    MessageDefinitionFormat.MSG: Definition(MessageDefinitionFormat.MSG, "int32 a\nfloat64[9] b\n"),
+    MessageDefinitionFormat.IDL: Definition(
+        MessageDefinitionFormat.IDL, "module a { module msg { struct B { long x; }; }; };"
+    ),
+}
 
 
 def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def add_topic_options(parser: argparse.ArgumentParser) -> None:
 
 def add_storage_options(parser: argparse.ArgumentParser) -> None:
     """--storage and --compression of a bag to write."""
-    from ..bags.reader import Compression, Storage
+    from ..bags.writer import Compression, Storage
 
     storages, compressions = [each.value for each in Storage], [each.value for each in Compression]
     parser.add_argument("--storage", choices=storages, default="mcap", help="default: %(default)s")

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Import one recording, or a folder of them."""
-    from ..bags.reader import Compression, Storage
+    from ..bags.writer import Compression, Storage
     from ..errors import InputError
     from ..files.trajectories import ImportOptions, import_folder, import_recording
 

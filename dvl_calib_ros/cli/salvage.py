@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, say what was lost."""
-    from ..bags.reader import BagReader, BagWriter, Compression, Storage
+    from ..bags.reader import BagReader
+    from ..bags.writer import BagWriter, Compression, Storage
     from ..errors import InputError, printable
 
     counts: Counter[str] = Counter()
@@ -31,12 +32,11 @@ def run(arguments: argparse.Namespace) -> None:
         topics, total = reader.topics, max(sum(reader.message_counts.values()), 1)
         if not topics:
             raise InputError(f"{', '.join(map(str, arguments.bags))}: there is no message in it; record it again")
-        definitions = {topic: reader.definition(topic) for topic in topics}
         writer = BagWriter(arguments.output, Storage(arguments.storage), Compression(arguments.compression))
         with common.progress("salvaging") as on_progress, writer:
-            for number, (topic, log_ns, data) in enumerate(reader.raw_messages(topics)):
-                writer.raw(topic, topics[topic], definitions[topic], log_ns, data)
-                counts[topic] += 1
+            for number, (log_ns, channel, data) in enumerate(reader.raw_messages(topics)):
+                writer.raw(channel, log_ns, data)
+                counts[channel.topic] += 1
                 if number % PROGRESS_EVERY == 0:
                     on_progress(number / total)
         common.print_warnings(reader.notes)

@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Simulate and write."""
     import math
 
-    from ..bags.reader import Compression, Storage
+    from ..bags.writer import Compression, Storage
     from ..calibration.samples import VelocityFrame
     from ..simulation.injection import injection
     from ..simulation.recorded import Recording

@@ -55,15 +55,15 @@ class BagPlayer:
         with BagReader(self._paths) as bag:
             first_ns: int | None = None
             started = time.monotonic()
-            for topic, log_ns, data in bag.raw_messages(self._publishers):
+            for log_ns, channel, data in bag.raw_messages(self._publishers):
                 first_ns = log_ns if first_ns is None else first_ns
                 at = (log_ns - first_ns) * 1e-9
                 on_time(at)
                 wait = started + at / speed - time.monotonic()
                 if wait > 0.0:
                     time.sleep(wait)
-                self._publishers[topic].publish(bytes(data))
-                sent[topic] += 1
+                self._publishers[channel.topic].publish(data)
+                sent[channel.topic] += 1
         self.wait_until_received()
         return sent
 

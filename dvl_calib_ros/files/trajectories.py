@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bags.reader import BagWriter, Compression, Storage
+from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
+from ..messages.encode import SampleWriter
 
 N_COLUMNS = 4
 SUFFIXES = ("csv", "npy")
@@ -187,7 +188,7 @@ def import_recording(
     references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std) if gnss else []
     attitudes = read_attitude(attitude, start_ns) if attitude else []
     with BagWriter(output, options.storage, options.compression) as bag:
-        bag.recording(attitudes, references, dvl_samples)
+        SampleWriter(bag).recording(attitudes, references, dvl_samples)
     return {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
 
 

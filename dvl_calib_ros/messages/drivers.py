@@ -268,6 +268,10 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
         ),
     )
 }
+# for bags that do not say how messages are laid out
+KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
+    name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
+}
 REFERENCE_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
 # what the parameters of these names may name
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": VELOCITY_TYPES, "gnss_type": REFERENCE_TYPES}

@@ -26,7 +26,7 @@ from ..calibration.verification import verification_document
 from ..errors import InputError
 from ..files.result_file import estimate_document, load_initial_calibration
 from ..messages.decode import MessageFeed
-from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
+from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
 from .recorder import Recorder, RunHistory
 
 BLOCK_SIZE = 512
@@ -98,7 +98,7 @@ def replay(
     if parameters.prior_source == "initial_window":
         found.append(finding("PRIOR_HOLDS_ERROR"))
     recorder = Recorder() if with_history else None
-    with BagReader(paths) as bag:
+    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, found)
         calibrator = Calibrator(
@@ -209,7 +209,7 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
     rotation = None
     velocities: list[Any] = []
     first_ns: int | None = None
-    with BagReader(paths) as bag:
+    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
         typed = _of_types(bag, chosen, parameters)

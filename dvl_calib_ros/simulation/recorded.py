@@ -18,7 +18,7 @@ from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..errors import InputError
 from ..messages.decode import MessageFeed
-from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES
+from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES
 from ..replay.replay import Topics
 from .trajectories import Motion
 
@@ -77,7 +77,7 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
 def _read(recording: Recording) -> _Samples:
     velocities: dict[int, tuple[Vector, VelocityFrame]] = {}
     attitudes: dict[int, Quaternion] = {}
-    with BagReader([recording.path]) as bag:
+    with BagReader([recording.path], KNOWN_DEFINITIONS) as bag:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
         _check_topics(recording, topics, bag.topics)
         parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=bag.topics[topics.gnss])

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..bags.reader import BagWriter, Compression, Storage
+from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..effects.base import ActsOn, EffectInput
+from ..messages.encode import SampleWriter
 from .injection import Injection, disturbed, injection_document, traces
 from .recorded import Recording, recorded_motion
 from .sensors import (
@@ -133,7 +134,7 @@ def write_bag(
         writer.attachment(TRUTH_NAME, "application/json", text.encode())
     run = simulate(scenario)
     with writer as bag:
-        bag.recording(run.imu, run.gnss, run.dvl)
+        SampleWriter(bag).recording(run.imu, run.gnss, run.dvl)
 
 
 def truth_document(scenario: Scenario) -> dict[str, Any]:

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from ..bags.reader import BagWriter
+from ..bags.writer import BagWriter
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ..messages.encode import SampleWriter
 from .cases import Drawn, draw
 from .motion import Floats, Motion
 from .plan import Case
@@ -203,4 +204,4 @@ def _imu(scene: Scene, motion: Motion, faults: Faults, noise: Noise, start_ns: i
 
 def _write(path: Path, sensors: list[list[Sample]]) -> None:
     with BagWriter(path) as bag:
-        bag.recording(*sensors)
+        SampleWriter(bag).recording(*sensors)

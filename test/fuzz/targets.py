@@ -56,7 +56,7 @@ def _read_bag(path: Path) -> None:
     try:
         with BagReader([path]) as bag:
             topics = bag.topics
-            assert all(topic in topics for topic, _, _ in bag.raw_messages(topics))
+            assert all(channel.topic in topics for _, channel, _ in bag.raw_messages(topics))
     except InputError as error:
         assert str(error)
 

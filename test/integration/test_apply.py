@@ -14,7 +14,7 @@ import yaml
 from io_fixtures import replayed, run, write_bag
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.bags.reader import Compression, Storage
+from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.cli.main import main

@@ -27,7 +27,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros import NODE, World, refused_at_start, until
 from std_srvs.srv import Trigger
 
-from dvl_calib_ros.bags.reader import Compression, Storage
+from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from ..raw_file import holes_in, open_recording
 from .damage import LARGEST_RECORD, DamagedError, Salvaged
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -30,15 +31,15 @@ class _Row(NamedTuple):
 
 def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
     """All whole messages in the order they were written; then DamagedError, unless none is missing."""
-    with path.open("rb") as file:
+    with open_recording(path) as file:
         yield from salvage_sqlite_stream(file, path.stat().st_size)
 
 
 def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     """As `salvage_sqlite`, of an open file of so many bytes."""
     pages = _Pages(file, size)
-    topics: dict[int, tuple[str, str]] = {}
-    definitions: dict[str, tuple[str, str]] = {}
+    topics: dict[int, _Topic] = {}
+    definitions: dict[tuple[str, str], tuple[str, str]] = {}
     leaves: dict[int, int] = {}  # number of the first message -> page
     for page in range(1, pages.count + 1):
         for row in pages.rows(page):
@@ -46,20 +47,39 @@ def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
                 leaves.setdefault(row.number, page)
                 break
             _take_note(row, topics, definitions)
-    count, last = 0, 0
+    count, astray, last = 0, 0, 0
     for page in (leaves[number] for number in sorted(leaves)):
         for row in pages.rows(page):
-            if _is_message(row.columns) and row.columns[1] in topics:
-                _, topic_id, log_ns, data = row.columns
-                name, kind = topics[topic_id]
-                count, last = count + 1, max(last, row.number)
-                yield Salvaged(name, kind, *definitions.get(kind, ("", "")), log_ns, data)
+            if not _is_message(row.columns):
+                continue
+            _, topic_id, log_ns, data = row.columns
+            count, last = count + 1, max(last, row.number)
+            if topic_id not in topics:
+                astray += 1
+                continue
+            name, kind, digest = topics[topic_id]
+            definition = definitions.get((kind, digest)) or definitions.get((kind, ""), ("", ""))
+            yield Salvaged(name, kind, *definition, log_ns, data)
     if leaves and not topics:
         raise DamagedError("the page with the names of the topics is damaged")
-    if pages.missing:
-        raise DamagedError(f"the file is {pages.missing} bytes short")
+    damage = [f"the file is {pages.missing} bytes short"] if pages.missing else []
+    if pages.unread:
+        size = len(pages.unread) * pages.size
+        damage.append(f"{len(pages.unread)} pages cannot be read from the disk, {size} bytes skipped")
     if last > count:  # rosbag2 numbers messages from 1
-        raise DamagedError(f"{last - count} messages lie on damaged pages")
+        damage.append(f"{last - count} messages lie on damaged pages")
+    if astray:
+        damage.append(f"{astray} messages are of topics that it does not name")
+    if damage:
+        raise DamagedError(", ".join(damage))
+
+
+class _Topic(NamedTuple):
+    """digest: hash of the type's description, '' before ROS 2 Iron."""
+
+    name: str
+    msgtype: str
+    digest: str
 
 
 def _is_message(columns: list[Any]) -> bool:
@@ -74,31 +94,37 @@ def _is_message(columns: list[Any]) -> bool:
     )
 
 
-def _take_note(row: _Row, topics: dict[int, tuple[str, str]], definitions: dict[str, tuple[str, str]]) -> None:
-    """Take note of a topic (id, name, type, cdr, QoS, ...) or a definition (id, type, format, text, ...)."""
+def _take_note(row: _Row, topics: dict[int, _Topic], definitions: dict[tuple[str, str], tuple[str, str]]) -> None:
+    """Take note of a topic (id, name, type, cdr, QoS, hash) or a definition (id, type, format, text, hash)."""
     number, columns = row
     if len(columns) < 4 or columns[0] is not None or not all(isinstance(text, str) for text in columns[1:]):
         return
     if columns[2] in _FORMATS:
-        definitions[columns[1]] = (columns[2], columns[3])
+        definition = (columns[2], columns[3])
+        definitions.setdefault((columns[1], columns[4] if len(columns) > 4 else ""), definition)
+        definitions.setdefault((columns[1], ""), definition)  # for topics that do not say which of several
     elif "/" in columns[2]:
-        topics[number] = (columns[1], columns[2])
+        topics[number] = _Topic(columns[1], columns[2], columns[5] if len(columns) > 5 else "")
 
 
 class _Pages:
-    """The pages of a database file, numbered from 1. missing: bytes that the file is shorter than it says."""
+    """The pages of a database file, numbered from 1.
+
+    size: of each, bytes. missing: bytes that the file is shorter than it says. unread: pages that the disk cannot read.
+    """
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         header = file.read(_FILE_HEADER).ljust(_FILE_HEADER, b"\0")
         (page_size,) = struct.unpack_from(">H", header, 16)
         page_size = 65536 if page_size == 1 else page_size
         is_sound = header.startswith(SQLITE_MAGIC) and page_size >= 512 and page_size & (page_size - 1) == 0
-        self._page_size = page_size if is_sound else DEFAULT_PAGE_SIZE
-        self._usable = self._page_size - (header[20] if is_sound and header[20] <= 32 else 0)
+        self.size = page_size if is_sound else DEFAULT_PAGE_SIZE
+        self._usable = self.size - (header[20] if is_sound and header[20] <= 32 else 0)
         self._file = file
-        self.count = -(-size // self._page_size)  # the last may be cut
+        self.unread: set[int] = set()
+        self.count = -(-size // self.size)  # the last may be cut
         (said,) = struct.unpack_from(">I", header, 28)
-        self.missing = max(0, said * self._page_size - size) if is_sound else 0
+        self.missing = max(0, said * self.size - size) if is_sound else 0
 
     def rows(self, number: int) -> Iterator[_Row]:
         """The whole rows of a page, if it is a leaf of a table."""
@@ -107,7 +133,7 @@ class _Pages:
         if len(page) < start + _LEAF_HEADER or page[start] != _LEAF:
             return
         (n_cells,) = struct.unpack_from(">H", page, start + 3)
-        for i in range(min(n_cells, self._page_size // 4)):
+        for i in range(min(n_cells, self.size // 4)):
             try:
                 (cell,) = struct.unpack_from(">H", page, start + _LEAF_HEADER + 2 * i)
                 yield self._row(page, cell)
@@ -115,13 +141,18 @@ class _Pages:
                 continue
 
     def _read(self, number: int) -> bytes:
-        self._file.seek((number - 1) * self._page_size)
-        return self._file.read(self._page_size)
+        at = (number - 1) * self.size
+        self._file.seek(at)
+        page = self._file.read(self.size)
+        if holes_in(self._file, at, at + self.size):
+            self.unread.add(number)
+            return b""
+        return page
 
     def _row(self, page: bytes, at: int) -> _Row:
         size, at = _varint(page, at)
         number, at = _varint(page, at)
-        if size > min(LARGEST_RECORD, self.count * self._page_size):
+        if size > min(LARGEST_RECORD, self.count * self.size):
             raise ValueError("longer than the file")
         return _Row(number, _columns(self._payload(page, at, size)))
 

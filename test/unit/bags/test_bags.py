@@ -27,11 +27,14 @@ from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dvl_calib_ros.bags.reader import BagReader, BagWriter, Compression, Storage
+from dvl_calib_ros.bags import sorting
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.samples import DvlSample, VelocityFrame
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
+from dvl_calib_ros.messages.encode import SampleWriter
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -125,12 +128,21 @@ def test_mcap_files_of_other_writers_give_the_same_messages(tmp_path, plain, com
     assert messages == raw(plain) and not notes
 
 
-def test_log_times_out_of_order_in_a_file_without_chunks_are_no_damage(tmp_path, plain):
-    messages = raw(plain)[:200]
-    messages[50], messages[51] = messages[51], messages[50]
-    (tmp_path / "swapped.mcap").write_bytes(mcap_bytes(messages, use_chunking=False))
-    found, notes = raw_and_notes(tmp_path / "swapped.mcap")
-    assert found == messages and not notes
+@pytest.mark.parametrize("in_memory", [sorting.IN_MEMORY, 20_000])
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_log_times_out_of_order_in_a_file_without_index_are_put_in_order(
+    tmp_path, plain, monkeypatch, in_memory, is_cut
+):
+    """One topic after the other, as of a recorder that caches by topic; in memory, or for the greater part on disk."""
+    monkeypatch.setattr(sorting, "IN_MEMORY", in_memory)
+    by_topic = sorted(raw(plain), key=lambda message: message[0])
+    content = mcap_bytes(by_topic, use_chunking=False)
+    (tmp_path / "by_topic.mcap").write_bytes(content[:-37] if is_cut else content)
+    found, notes = raw_and_notes(tmp_path / "by_topic.mcap")
+    assert [log_ns for _, log_ns, _ in found] == sorted(log_ns for _, log_ns, _ in by_topic)
+    assert sorted(found) == sorted(by_topic)
+    assert len(notes) == is_cut
+    assert estimates(tmp_path / "by_topic.mcap") == estimates(plain)
 
 
 def test_a_file_is_known_by_its_content_whatever_its_name(tmp_path, plain):
@@ -280,8 +292,8 @@ def test_a_bag_that_cannot_be_finished_is_not_left_behind(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(InputError, match="No space left"), BagWriter(tmp_path / "bag") as bag:
-        bag.dvl("dvl/twist", DvlSample(1, (1.0, 0.0, 0.0)))
-        bag._writer.close = full
+        SampleWriter(bag).dvl("dvl/twist", DvlSample(1, (1.0, 0.0, 0.0)))
+        bag._parts[0].writer.close = full
     assert not (tmp_path / "bag").exists()
 
 

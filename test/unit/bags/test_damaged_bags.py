@@ -25,7 +25,7 @@ from io_fixtures import estimates, mcap_bytes, raw, raw_and_notes, replayed, run
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
-from dvl_calib_ros.bags import reader as bags
+from dvl_calib_ros.bags import files
 from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
@@ -274,7 +274,7 @@ def test_a_compressed_message_that_unpacks_to_gigabytes_is_left_out_and_told_of(
 
 
 def test_a_compressed_file_that_unpacks_to_far_more_than_a_recording_does_not_fill_the_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr(bags, "SMALL_FILE", 10**6)
+    monkeypatch.setattr(files, "SMALL_FILE", 10**6)
     whole = content(NONE)
     (tmp_path / "bomb.mcap.zstd").write_bytes(zstd.compress(whole[:-37]) + zstd_zeros(200_000_000))
     found, notes = raw_and_notes(tmp_path / "bomb.mcap.zstd")
@@ -385,10 +385,10 @@ def test_a_topic_of_another_type_is_named_with_the_option_to_set(tmp_path, capsy
 def test_a_file_without_permission_is_named_in_one_line(tmp_path, capsys, monkeypatch):
     bag = write_bag(tmp_path / "bag", run(6.0))
 
-    def denied(self, *_):
-        raise PermissionError(13, "Permission denied", str(self))
+    def denied(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "open", denied)
+    monkeypatch.setattr(os, "open", denied)
     assert main(["replay", str(bag)]) == 2
     assert "Permission denied" in capsys.readouterr().err
 

@@ -1,0 +1,93 @@
+"""A recording's bytes from a disk that may not give all of them."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+# What the system reads at once from a disk, and so the least that one bad sector takes with it.
+SECTOR = 4096
+# Heads of records are read one by one
+_BUFFER = 1 << 16
+
+Hole = tuple[int, int]
+"""First byte and the one after the last of what cannot be read."""
+
+
+class _RawFile(io.RawIOBase):
+    """Zeros stand where the disk reports an error; `holes` says where, in order, as far as has been read."""
+
+    def __init__(self, path: Path) -> None:
+        self.holes: list[Hole] = []
+        self._at = 0
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: os.fstat(self._descriptor).st_size}[whence]
+        if start + offset < 0:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        self._at = start + offset
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._read(len(buffer), self._at)
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+    def close(self) -> None:
+        if not self.closed:
+            os.close(self._descriptor)
+        super().close()
+
+    def _read(self, size: int, at: int) -> bytes:
+        """What is there; after an error once more in halves, for a bad sector to cost no more than itself."""
+        try:
+            return os.pread(self._descriptor, size, at)
+        except OSError as error:
+            length = os.fstat(self._descriptor).st_size
+            if at >= length:  # a damaged index leads to places that no file has
+                return b""
+            if error.errno != errno.EIO:
+                raise
+        size = min(size, length - at)
+        if at // SECTOR == (at + size - 1) // SECTOR:
+            self._note(at, at + size)
+            return bytes(size)
+        middle = (at + max(size // 2, 1) + SECTOR - 1) // SECTOR * SECTOR
+        middle = middle if middle < at + size else (at // SECTOR + 1) * SECTOR
+        first = self._read(middle - at, at)
+        return first + self._read(at + size - middle, middle)
+
+    def _note(self, start: int, end: int) -> None:
+        touching = [hole for hole in self.holes if hole[0] <= end and start <= hole[1]]
+        self.holes = sorted(
+            [hole for hole in self.holes if hole not in touching]
+            + [(min([start, *(hole[0] for hole in touching)]), max([end, *(hole[1] for hole in touching)]))]
+        )
+
+
+def open_recording(path: Path) -> io.BufferedReader:
+    """Open a file to be read past unreadable places, which `holes_in` tells. Raises OSError."""
+    return io.BufferedReader(_RawFile(path), _BUFFER)
+
+
+def holes_in(file: Any, start: int, end: int) -> list[Hole]:
+    """What between two places of an open file, which has been read, is not its content but zeros for want of it."""
+    holes: list[Hole] = getattr(getattr(file, "raw", None), "holes", [])
+    return [(max(first, start), min(last, end)) for first, last in holes if first < end and start < last]
+
+
+def unreadable(file: Any) -> int:
+    """Bytes of an open file that could not be read so far."""
+    holes: list[Hole] = getattr(getattr(file, "raw", None), "holes", [])
+    return sum(last - first for first, last in holes)

@@ -1,0 +1,174 @@
+"""Records of MCAP files: what they hold, and where they go on after damage."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from io import BytesIO
+from operator import itemgetter
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+from mcap.summary import Summary
+
+from ..raw_file import Hole
+from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
+from .mcap_chunks import RECORD_HEAD
+
+# plain numbers: they are compared for every message
+SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_RECORD_BEGIN = re.compile(rb"(?=[\x03-\x05].{4}\0{4})", re.DOTALL)
+_WINDOW, _OVERLAP = 1 << 20, 64
+# What damaged bytes make the mcap library raise when it parses records
+PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
+
+Found = tuple[int, int, bytes]
+"""Log time (ns), channel and content of a message."""
+
+
+class Tables:
+    """The schemas and channels that are known; at the beginning, those of the summary."""
+
+    def __init__(self, summary: Summary | None) -> None:
+        self.schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
+        self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
+        self._made: dict[int, tuple[str, str, str, str]] = {}
+
+    def note(self, at: int, opcode: int, content: bytes) -> None:
+        """Take note of a schema or channel; DamagedError if it is none."""
+        try:
+            if opcode == SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(content)))
+                self.schemas[schema.id] = schema
+            else:
+                channel = Channel.read(ReadDataStream(BytesIO(content)))
+                self.channels[channel.id] = channel
+        except PARSING as error:
+            raise DamagedError(f"the record at byte {at} is damaged") from error
+        self._made.clear()
+
+    def salvaged(self, message: Found) -> Salvaged:
+        """A message with what is known of its channel."""
+        log_ns, channel_id, data = message
+        if channel_id not in self._made:
+            self._made[channel_id] = self._of(self.channels[channel_id])
+        return Salvaged(*self._made[channel_id], log_ns, data)
+
+    def _of(self, channel: Channel) -> tuple[str, str, str, str]:
+        known = self.schemas.get(channel.schema_id)
+        if known is None:
+            return channel.topic, "", "", ""
+        return channel.topic, known.name, known.encoding, known.data.decode("utf-8", "replace")
+
+
+def record_head(file: BinaryIO, at: int) -> tuple[int, int]:
+    """Opcode and length of a record."""
+    file.seek(at)
+    head = file.read(RECORD_HEAD.size)
+    if len(head) < RECORD_HEAD.size:
+        raise DamagedError(f"cut off at byte {at + len(head)}")
+    opcode, length = RECORD_HEAD.unpack(head)
+    return opcode, length
+
+
+def search(
+    file: BinaryIO, start: int, size: int, pattern: re.Pattern[bytes], accept: Callable[[int], bool]
+) -> int | None:
+    """The first place from `start` on where the pattern matches and accept(place) agrees."""
+    for window in range(start, size, _WINDOW):
+        file.seek(window)
+        data = file.read(_WINDOW + _OVERLAP)
+        for match in pattern.finditer(data):
+            if match.start() < _WINDOW and accept(window + match.start()):
+                return window + match.start()
+    return None
+
+
+def sound_end(file: BinaryIO, at: int, size: int, tables: Tables) -> int | None:
+    """Where the record at `at` says that it ends, if records follow there."""
+    with suppress(DamagedError):
+        end = at + RECORD_HEAD.size + record_head(file, at)[1]
+        if end <= size and _records_follow(file, end, size, tables):
+            return end
+    return None
+
+
+def _next_record(file: BinaryIO, at: int, size: int, tables: Tables) -> int:
+    """Where schemas, channels or messages go on after damage in the record at `at`; `size` if nowhere."""
+    end = sound_end(file, at, size, tables)
+    return search_records(file, at, size, tables) if end is None else end
+
+
+def search_records(file: BinaryIO, at: int, size: int, tables: Tables) -> int:
+    """As `_next_record`, of a record whose own end is known to lead nowhere."""
+    place = search(file, at + 1, size, _RECORD_BEGIN, lambda place: _records_follow(file, place, size, tables))
+    return size if place is None else place
+
+
+def _records_follow(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
+    """Whether this is where records go on: three in a row make sense, or all up to the end of the file."""
+    with suppress(DamagedError, struct.error):
+        for number in range(3):
+            if at >= size:
+                return at == size or number > 1
+            opcode, length = record_head(file, at)
+            if not 0 < opcode <= Opcode.DATA_END or length > LARGEST_RECORD:
+                return False
+            if opcode == MESSAGE:
+                channel, *_ = _MESSAGE_HEAD.unpack(file.read(_MESSAGE_HEAD.size))
+                if length < _MESSAGE_HEAD.size or channel not in tables.channels:
+                    return False
+            if opcode == Opcode.FOOTER:
+                return True
+            at += RECORD_HEAD.size + length
+        return True
+    return False
+
+
+def messages_of(
+    at: int,
+    records: bytes,
+    tables: Tables,
+    damage: Damage,
+    wanted: Collection[int] | None = None,
+    holes: Sequence[Hole] = (),
+) -> list[Found]:
+    """Messages of a chunk's records, in order of log time; what is damaged among them is skipped and noted.
+
+    wanted: the channels whose messages are given, None for all; the others' are checked, but not copied. holes: what
+    of the records could not be read.
+    """
+    found: list[Found] = []
+    channels, n = tables.channels, len(records)
+    head, message_head = RECORD_HEAD.unpack_from, _MESSAGE_HEAD.unpack_from
+    here = 0
+    while here < n:
+        try:
+            if holes and any(first < here + 9 and here < last for first, last in holes):
+                raise DamagedError(f"at byte {at}: a record cannot be read from the disk")
+            opcode, length = head(records, here)
+            end = here + 9 + length
+            if end > n or not SCHEMA <= opcode <= MESSAGE:
+                raise DamagedError(f"in the chunk at byte {at}: a record is cut off or damaged")
+            if holes and any(first < end and here < last for first, last in holes):
+                damage.note(f"at byte {at}: a record cannot be read from the disk", end - here)
+            elif opcode == MESSAGE:
+                channel_id, _, log_ns, _ = message_head(records, here + 9)
+                if length < 22 or channel_id not in channels:
+                    raise DamagedError(f"in the chunk at byte {at}: a message is of no known channel")
+                if wanted is None or channel_id in wanted:
+                    found.append((log_ns, channel_id, records[here + 31 : end]))
+            else:
+                tables.note(at, opcode, records[here + 9 : end])
+            here = end
+        except (struct.error, DamagedError) as error:
+            start, here = here, _next_record(BytesIO(records), here, n, tables)
+            damage.note(str(error), here - start)
+    found.sort(key=itemgetter(0))
+    return found

@@ -1,0 +1,91 @@
+"""rosbag2 databases, read by SQLite while they are sound."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from .channels import Channel, definition_of
+from .definitions import Definition
+from .salvage.damage import LARGEST_RECORD, DamagedError
+
+
+class Database:
+    """A recording in SQLite; raises sqlite3.Error or DamagedError where it cannot be read.
+
+    counts: channel -> number of its messages. span_ns: first and last log time. astray: messages of topics that it
+    does not name.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with closing(self._connection()) as connection:
+            self._channels = _channels(connection)
+            rows = _rows(
+                connection,
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id",
+                (int, int, int, int),
+            )
+        self.counts: dict[Channel, int] = dict.fromkeys(self._channels.values(), 0)
+        self.astray = 0
+        for number, count, *_ in rows:
+            if number in self._channels:
+                self.counts[self._channels[number]] += count
+            else:
+                self.astray += count
+        known = [row for row in rows if row[0] in self._channels]
+        self.span_ns = (min((row[2] for row in known), default=0), max((row[3] for row in known), default=0))
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[int, Channel, bytes]]:
+        """Messages of these topics in order of log time."""
+        numbers = [number for number, channel in self._channels.items() if channel.topic in topics]
+        query = (
+            "SELECT timestamp, topic_id, data FROM messages "
+            f"WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD} "
+            "ORDER BY timestamp"
+        )
+        channels = self._channels
+        with closing(self._connection()) as connection:
+            for log_ns, number, data in connection.execute(query, numbers):
+                if type(log_ns) is not int or type(data) is not bytes or log_ns < 0:
+                    raise DamagedError("a message is none")
+                yield log_ns, channels[number], data
+
+    def _connection(self) -> sqlite3.Connection:
+        # immutable: no journal and no lock is looked for, so that nothing is written beside a recording
+        uri = f"file:{quote(str(self._path.absolute()), safe='/')}?immutable=1&mode=ro"
+        return sqlite3.connect(uri, uri=True, check_same_thread=False)
+
+
+def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
+    tables = {name for (name,) in _rows(connection, "SELECT name FROM sqlite_master WHERE type = 'table'", (str,))}
+    if not {"topics", "messages"} <= tables:
+        raise DamagedError("its tables of topics and messages are missing")
+    of_topics = {row[1] for row in connection.execute("PRAGMA table_info(topics)")}
+    has_hash = "type_description_hash" in of_topics
+    hashed = "type_description_hash" if has_hash else "''"
+    topics = _rows(connection, f"SELECT id, name, type, {hashed} FROM topics ORDER BY id", (int, str, str, str))
+    definitions: dict[tuple[str, str], Definition] = {}
+    if "message_definitions" in tables:
+        columns = f"topic_type, {hashed}, encoding, encoded_message_definition"
+        query = f"SELECT {columns} FROM message_definitions ORDER BY id"
+        for msgtype, digest, encoding, text in _rows(connection, query, (str, str, str, str)):
+            definition = definition_of(encoding, text)
+            definitions.setdefault((msgtype, digest), definition)
+            definitions.setdefault((msgtype, ""), definition)  # for topics that do not say which of several
+    return {
+        number: Channel(name, msgtype, definitions.get((msgtype, digest)) or definitions.get((msgtype, "")))
+        for number, name, msgtype, digest in topics
+    }
+
+
+def _rows(connection: sqlite3.Connection, query: str, types: tuple[type, ...]) -> list[Any]:
+    """All rows of a query, whose columns are of these types; damaged pages can hold anything."""
+    rows = connection.execute(query).fetchall()
+    if any(type(value) is not expected for row in rows for value, expected in zip(row, types, strict=True)):
+        raise DamagedError("a table holds what recordings do not")
+    return rows

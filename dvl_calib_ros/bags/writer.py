@@ -1,0 +1,206 @@
+"""New rosbag2 recordings, written by rosbags."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from enum import Enum
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from urllib.parse import quote
+
+import yaml
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+from rosbags.typesys import Stores, get_typestore
+
+from ..errors import InputError
+from ..files.yaml_files import load_yaml
+from .attachments import attach
+from .channels import Channel
+from .definitions import Definition, DefinitionError, typestore
+
+
+class Storage(Enum):
+    """Storage of a new bag."""
+
+    MCAP = "mcap"
+    SQLITE3 = "sqlite3"
+
+
+class Compression(Enum):
+    """Compression of a new bag; chunk is MCAP's own."""
+
+    NONE = "none"
+    CHUNK = "chunk"
+    MESSAGE = "message"
+    FILE = "file"
+
+
+_COMPRESSION = {
+    Compression.NONE: CompressionMode.NONE,
+    Compression.CHUNK: CompressionMode.STORAGE,
+    Compression.MESSAGE: CompressionMode.MESSAGE,
+    Compression.FILE: CompressionMode.FILE,
+}
+UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
+_NO_SPACE = "free some space, or name another place"
+
+
+class _Sqlite3Writer(Sqlite3Writer):
+    """As rosbags', for any path: rosbags' takes what looks like an escape, a query or a fragment in it for such."""
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        self.path = path / f"{path.name}.db3"
+        self.conn = sqlite3.connect(f"file:{quote(str(self.path.absolute()), safe='/')}", uri=True)
+        self.conn.executescript(self.SQLITE_SCHEMA)
+        self.cursor = self.conn.cursor()
+
+
+class _Writer(Writer):
+    STORAGE_PLUGINS = {**Writer.STORAGE_PLUGINS, StoragePlugin.SQLITE3: _Sqlite3Writer}  # noqa: RUF012
+
+
+class BagWriter:
+    """Writes messages to a new rosbag2 folder. A context manager. Raises InputError."""
+
+    def __init__(
+        self, path: Path, storage: Storage = Storage.MCAP, compression: Compression = Compression.NONE
+    ) -> None:
+        if path.exists():
+            raise InputError(f"{path}: exists already; give another name, or remove it first")
+        if storage is Storage.SQLITE3 and compression is Compression.CHUNK:
+            raise InputError("compression chunk is MCAP's; with sqlite3 use message or file")
+        self.typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._path, self._storage, self._compression = path, storage, compression
+        self._attachments: list[tuple[str, str, bytes]] = []
+        # a file holds one definition of each type: rosbag2 and rosbags look it up by the type's name
+        self._parts: list[_Part] = []
+        self._part_of: dict[Channel, _Part] = {}
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Attach a file to the bag. Raises InputError unless it is plain MCAP."""
+        if self._storage is not Storage.MCAP or self._compression is Compression.FILE:
+            raise InputError(f"{name}: only MCAP holds attachments; use storage mcap, and no file compression")
+        self._attachments.append((name, media_type, data))
+
+    def __enter__(self) -> BagWriter:
+        try:
+            self._new_part()
+        except (OSError, sqlite3.Error) as error:
+            raise self._unwritable(error) from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            for part in self._parts:
+                part.writer.__exit__(kind, error, trace)
+            if error is None:
+                self._join_parts()
+            for name, media_type, data in self._attachments if error is None else ():
+                attach(
+                    self._path / f"{self._path.name}.mcap", name, media_type, data,
+                    self._compression is Compression.CHUNK,
+                )  # fmt: skip
+        except (OSError, sqlite3.Error) as failure:
+            error = failure
+        if error is not None:  # half a bag would pass for a whole one
+            shutil.rmtree(self._path, ignore_errors=True)
+        if isinstance(error, OSError | sqlite3.Error):
+            raise self._unwritable(error) from error
+
+    def message(self, topic: str, msgtype: str, log_ns: int, message: Any) -> None:
+        """Write a message of a type that `typestore` has."""
+        data = bytes(self.typestore.serialize_cdr(message, msgtype))
+        self._write(Channel(topic, msgtype), log_ns, data)
+
+    def raw(self, channel: Channel, log_ns: int, data: bytes) -> None:
+        """Write a message as it was recorded, its definition with it."""
+        self._write(channel, log_ns, data)
+
+    def _write(self, channel: Channel, log_ns: int, data: bytes) -> None:
+        part = self._part_of.get(channel)
+        if part is None:
+            part = self._part_of[channel] = self._part_for(channel)
+        part.writer.write(part.connections[channel], log_ns, data)
+
+    def _part_for(self, channel: Channel) -> _Part:
+        fitting = [part for part in self._parts if part.fits(channel)]
+        part = fitting[0] if fitting else self._new_part()
+        part.add(channel)
+        return part
+
+    def _new_part(self) -> _Part:
+        number = len(self._parts)
+        path = self._path / f"{self._path.name}_{number}" if number else self._path
+        writer = _Writer(
+            path,
+            version=9,
+            storage_plugin=StoragePlugin.MCAP if self._storage is Storage.MCAP else StoragePlugin.SQLITE3,
+        )
+        writer.set_compression(_COMPRESSION[self._compression], CompressionFormat.ZSTD)
+        writer.open()
+        self._parts.append(_Part(writer))
+        return self._parts[-1]
+
+    def _join_parts(self) -> None:
+        """Make one bag of several files of what was written as bags of their own."""
+        first, *others = (part.writer.path for part in self._parts)
+        if not others:
+            return
+        metadata = [load_yaml(path / "metadata.yaml", "metadata file") for path in (first, *others)]
+        whole, *rest = (each["rosbag2_bagfile_information"] for each in metadata)
+        for path, part in zip(others, rest, strict=True):
+            for name in part["relative_file_paths"]:
+                os.replace(path / name, first / name)
+            shutil.rmtree(path)
+            for key in ("relative_file_paths", "files", "topics_with_message_count"):
+                whole[key] += part[key]
+            whole["message_count"] += part["message_count"]
+        files = [each for each in whole["files"] if each["message_count"]]
+        starts = [each["starting_time"]["nanoseconds_since_epoch"] for each in files]
+        ends = [start + each["duration"]["nanoseconds"] for start, each in zip(starts, files, strict=True)]
+        whole["starting_time"] = {"nanoseconds_since_epoch": min(starts)}
+        whole["duration"] = {"nanoseconds": max(ends) - min(starts)}
+        (first / "metadata.yaml").write_text(yaml.safe_dump(metadata[0], sort_keys=False), encoding="utf-8")
+
+    def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:
+        why = getattr(error, "strerror", None) or error
+        return InputError(f"{self._path}: cannot be written ({why}); {_NO_SPACE}")
+
+
+class _Part:
+    """One file of a bag."""
+
+    def __init__(self, writer: Writer) -> None:
+        self.writer = writer
+        self.connections: dict[Channel, Any] = {}
+
+    def fits(self, channel: Channel) -> bool:
+        """Whether the file says of the channel's topic and type nothing else than the channel does."""
+        same = [each for each in self.connections if each.msgtype == channel.msgtype]
+        return all(each.definition == channel.definition for each in same)
+
+    def add(self, channel: Channel) -> None:
+        topic, msgtype, definition = channel
+        if definition is None and msgtype in _JAZZY.types:
+            connection = self.writer.add_connection(topic, msgtype, typestore=_JAZZY)
+        else:
+            text = definition.text if definition else ""
+            digest = _type_hash(definition, msgtype)
+            connection = self.writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest)
+        self.connections[channel] = connection
+
+
+_JAZZY = get_typestore(Stores.ROS2_JAZZY)
+
+
+def _type_hash(definition: Definition | None, msgtype: str) -> str:
+    try:
+        return typestore(definition, msgtype).hash_rihs01(msgtype)
+    except (DefinitionError, LookupError):  # a damaged definition, or one without the type; its messages are whole
+        return UNKNOWN_HASH

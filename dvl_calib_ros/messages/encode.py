@@ -1,0 +1,70 @@
+"""Samples to ROS messages, in bags."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ..bags.writer import BagWriter
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Sample, VelocityFrame
+from .drivers import IMU_TYPE, TWIST_TYPE
+
+FRAME_IDS = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
+
+
+class SampleWriter:
+    """Writes samples to a bag, log time is the stamp."""
+
+    def __init__(self, bag: BagWriter) -> None:
+        self._bag = bag
+        self._types: Any = bag.typestore.types
+
+    def recording(self, *sensors: Iterable[Sample]) -> None:
+        """Write the samples of any sensors, each in order of time, to the node's topics in order of time."""
+        for sample in heapq.merge(*sensors, key=lambda sample: sample.stamp_ns):
+            if isinstance(sample, DvlSample):
+                self.dvl("dvl/twist", sample)
+            elif isinstance(sample, ReferenceSample):
+                self.reference("gnss/twist", sample, FRAME_IDS[sample.frame])
+            else:
+                self.imu("imu/data", sample)
+
+    def dvl(self, topic: str, sample: DvlSample, frame_id: str = "dvl_link") -> None:
+        """Write a DVL velocity as TwistWithCovarianceStamped."""
+        self._bag.message(topic, TWIST_TYPE, sample.stamp_ns, self._twist(sample, frame_id))
+
+    def reference(self, topic: str, sample: ReferenceSample, frame_id: str) -> None:
+        """Write a reference velocity as TwistWithCovarianceStamped."""
+        self._bag.message(topic, TWIST_TYPE, sample.stamp_ns, self._twist(sample, frame_id))
+
+    def imu(self, topic: str, sample: ImuSample, frame_id: str = "base_link") -> None:
+        """Write attitude and angular velocity as Imu, with covariance -1 where there is none."""
+        quaternion, vector = self._types["geometry_msgs/msg/Quaternion"], self._types["geometry_msgs/msg/Vector3"]
+        unknown = np.array([-1.0, *[0.0] * 8])
+        message = self._types[IMU_TYPE](
+            header=self._header(sample.stamp_ns, frame_id),
+            orientation=quaternion(*(sample.orientation or (0.0, 0.0, 0.0, 1.0))),
+            orientation_covariance=np.zeros(9) if sample.orientation else unknown,
+            angular_velocity=vector(*(sample.angular_velocity or (0.0, 0.0, 0.0))),
+            angular_velocity_covariance=np.zeros(9) if sample.angular_velocity else unknown,
+            linear_acceleration=vector(0.0, 0.0, 0.0),
+            linear_acceleration_covariance=unknown,
+        )
+        self._bag.message(topic, IMU_TYPE, sample.stamp_ns, message)
+
+    def _twist(self, sample: DvlSample | ReferenceSample, frame_id: str) -> Any:
+        types = self._types
+        vector = types["geometry_msgs/msg/Vector3"]
+        covariance = np.zeros((6, 6))
+        if sample.covariance is not None:
+            covariance[:3, :3] = sample.covariance
+        twist = types["geometry_msgs/msg/Twist"](vector(*sample.velocity), vector(0.0, 0.0, 0.0))
+        inner = types["geometry_msgs/msg/TwistWithCovariance"](twist, covariance.ravel())
+        return types[TWIST_TYPE](self._header(sample.stamp_ns, frame_id), inner)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        time = self._types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
+        return self._types["std_msgs/msg/Header"](time, frame_id)
