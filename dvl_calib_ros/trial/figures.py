@@ -121,11 +121,16 @@ def _simulated(scored: Sequence[Scored]) -> list[Figure]:
 
 def _at_sea(scored: Sequence[Scored], twins: Sequence[Scored]) -> list[Figure]:
     """Real motion: large effects, alone and together. twins: cases with all axes."""
+
+    def of_category(category: Category) -> list[Scored]:
+        return [case for case in scored if case.truth.category is category]
+
     known = [case for case in scored if case.truth.category in KNOWN]
     with_all_axes = {case.truth.id: case for case in twins}
     pairs = [(case, with_all_axes[case.truth.twin]) for case in scored if case.truth.twin in with_all_axes]
     return [
-        share("false alarms, nulls", _at_most(0.02), (case.claimed for case in scored if case.is_null)),
+        share("false alarms, nulls", _at_most(0.02), (case.claimed for case in of_category(Category.NULL))),
+        share("false alarms, hard nulls", _at_most(0.02), (case.claimed for case in of_category(Category.HARD_NULL))),
         share("exactly the true effects", _at_least(0.95), (case.is_exact for case in known)),
         *(
             share(f"exactly the true effects, {category.value}s", NO_TARGET, hits)

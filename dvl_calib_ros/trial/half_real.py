@@ -78,7 +78,7 @@ def _chances() -> list[float]:
 
 def faults(case: Case, drawn: Scene, rng: np.random.Generator) -> Known | None:
     """Draw the faults of a case; None where the data could not tell them."""
-    if case.category is Category.NULL:
+    if case.category in (Category.NULL, Category.HARD_NULL):
         return {}, {}
     if case.category is Category.UNKNOWN:
         return _unknown(case, drawn, rng)

@@ -91,7 +91,9 @@ def plan(kinds: Sequence[str] = KINDS, families: Sequence[Family] = tuple(Family
     Families take turns as long as they have cases; what is at sea goes with the kind `RECORDED`.
     """
     wanted = {*kinds, STRAIGHT, ONE_SPEED_BOX}
-    half_real = _mixed(_nulls_at_sea(), _singles_at_sea(), _several_faults_at_sea(), _unknowns_at_sea())
+    half_real = _mixed(
+        _nulls_at_sea(), _hard_nulls_at_sea(), _singles_at_sea(), _several_faults_at_sea(), _unknowns_at_sea()
+    )
     ordered = {
         Family.SIMULATED: _mixed(
             _nulls(), _hard_nulls(), _singles(), _pairs(), _unknowns(), _unidentifiables()
@@ -176,6 +178,10 @@ def _at_sea(
 
 def _nulls_at_sea() -> list[Case]:
     return _at_sea(Category.NULL, 120)
+
+
+def _hard_nulls_at_sea() -> list[Case]:
+    return [replace(case, hardness=hardness) for hardness in HARDNESSES for case in _at_sea(Category.HARD_NULL, 12)]
 
 
 def _singles_at_sea() -> list[Case]:

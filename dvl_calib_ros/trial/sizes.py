@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .strength import Scene, Yardstick
-from .vehicle import FAULTS, ODDITIES, Faults, Values
+from .vehicle import FAULTS, HOUR_S, ODDITIES, Faults, Values
 
 MAX_STEPS = 8
 ALWAYS_S = 1e6
@@ -63,7 +63,7 @@ def as_at_sea(name: str, scene: Scene, rng: np.random.Generator) -> dict[str, fl
         "reference_time_offset": {"seconds": either(rng, 0.2, 3.0)},
         "attitude_time_offset": {"seconds": either(rng, 0.1, 1.5)},
         "time_offset_jump": {"seconds": either(rng, 0.2, 2.0)},
-        "clock_drift": {"rate": either(rng, 0.3, 3.0) / seconds},
+        "clock_drift": {"seconds_per_hour": either(rng, 0.3, 3.0) / seconds * HOUR_S},
         "reference_lag": {"time_constant_s": float(rng.uniform(0.3, 2.0))},
         "lever_arm": {"x_m": either(rng, 0.5, 3.0), "y_m": either(rng, 0.0, 1.0), "z_m": either(rng, 0.0, 1.0)},
     }

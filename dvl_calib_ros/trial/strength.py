@@ -38,7 +38,7 @@ ON_REFERENCE = frozenset({*OF_THE_DAY, "reference_lag", "heading_error"})
 # Faults whose trace bends with their one size, so that small ones do not tell of large ones, and their largest size
 BENT: Mapping[str, tuple[str, float]] = {
     **dict.fromkeys(OF_THE_DAY[:3], ("seconds", 4.0)),
-    "clock_drift": ("rate", 0.02),
+    "clock_drift": ("seconds_per_hour", 36.0),
     "reference_lag": ("time_constant_s", 4.0),
 }
 

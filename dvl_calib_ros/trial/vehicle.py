@@ -58,7 +58,7 @@ FAULTS: Mapping[str, Fault] = {
     "tilt_coupling": Fault({"x_per_pitch": 0.5, "z_per_pitch": 0.5, "y_per_roll": 0.5, "z_per_roll": 0.5}, 12.0),
     "attitude_time_offset": Fault({"seconds": 0.1}, 8.0),
     "time_offset_jump": Fault({"seconds": 0.2}, 8.0),
-    "clock_drift": Fault({"rate": 5e-4}, 20.0),
+    "clock_drift": Fault({"seconds_per_hour": 1.0}, 36.0),
     "mounting_moved": Fault({"roll_rad": 0.02, "pitch_rad": 0.02, "yaw_rad": 0.02}, 5.0, between=True),
 }
 # What a reference in the body's frame cannot show
@@ -209,7 +209,8 @@ def dvl_stamps(times: Floats, faults: Faults) -> Floats:
     late = np.full(len(times), faults.get("dvl_time_offset", {}).get("seconds", 0.0))
     if jump := faults.get("time_offset_jump"):
         late += jump["seconds"] * (since >= jump["at_s"])
-    return np.asarray(times + late + faults.get("clock_drift", {}).get("rate", 0.0) * since)
+    gain = faults.get("clock_drift", {}).get("seconds_per_hour", 0.0) / HOUR_S  # per hour of its own
+    return np.asarray(times + late + gain / (1.0 - gain) * since)
 
 
 def dvl_velocity(motion: Motion, vehicle: Vehicle, faults: Faults, times: Floats) -> Floats:

@@ -81,10 +81,12 @@ def test_a_clock_stamps_with_offset_jump_and_drift():
     faults = {
         "dvl_time_offset": {"seconds": 1.5},
         "time_offset_jump": {"seconds": 0.5, "at_s": 4.0},
-        "clock_drift": {"rate": 0.01},
+        "clock_drift": {"seconds_per_hour": 36.0},
     }
     since = times - 10.0
-    assert np.allclose(dvl_stamps(times, faults), times + 1.5 + 0.5 * (since >= 4.0) + 0.01 * since)
+    stamps = dvl_stamps(times, faults)
+    # an hour of the clock's own has 36 s too many
+    assert np.allclose(stamps - 0.5 * (since >= 4.0) - 11.5, since / (1.0 - 0.01))
 
 
 def test_a_clock_that_steps_back_leaves_stamps_in_order():
