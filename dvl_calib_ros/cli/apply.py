@@ -41,28 +41,27 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.urdf is None and (arguments.output is not None or arguments.joint is not None):
         raise InputError("--output and --joint go with --urdf; name that, too")
+    common.check_outputs(arguments, "urdf" if arguments.output is None else "output", "launch", "fusion")
     if arguments.rollback:
         _roll_back(arguments)
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
-    from ..files.atomic import backup_of, save_bytes
+    from ..files.atomic import backup_of, own_stream, save_bytes
     from ..files.mounting import load_calibrated_mounting
 
     calibrated = load_calibrated_mounting(arguments.result)
-    common.check_outputs(arguments, "urdf" if arguments.output is None else "output", "launch", "fusion")
     targets = _targets(arguments)
-    if arguments.result in targets:
-        raise InputError(f"{arguments.result}: is the result itself; name another file to write")
     if targets and calibrated.objections and not arguments.force:
         raise InputError(f"{arguments.result}: {'; '.join(calibrated.objections)}; to apply it all the same: --force")
     contents = _contents(arguments, calibrated)
     _print(calibrated, arguments)
     for path, content in contents.items():
-        if path.exists() and path.read_bytes() == content:
+        is_there = own_stream(path) is None and path.exists()
+        if is_there and path.read_bytes() == content:
             print(f"{path}: is so already")
             continue
-        kept = f"; the one before is {backup_of(path).name}" if path.exists() else ""
+        kept = f"; the one before is {backup_of(path).name}" if is_there else ""
         save_bytes(path, content)
         print(f"{path}: written{kept}")
 

@@ -74,20 +74,28 @@ def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(given))
 
 
-def check_outputs(arguments: argparse.Namespace, *options: str) -> None:
-    """Raise InputError if the file that an option names could not be written, before work is done for it."""
-    from ..errors import InputError
-    from ..files.atomic import check_writable
+def check_outputs(
+    arguments: argparse.Namespace, *files: str, folders: Sequence[str] = (), also_read: Sequence[Path] = ()
+) -> None:
+    """Raise InputError if what options name could not be written, or is read by the same command, before work is done.
 
-    named: dict[Path, str] = {}
-    for option in options:
-        path = getattr(arguments, option)
-        if path is None:
-            continue
-        check_writable(path)
-        if path in named:
-            raise InputError(f"--{named[path]} and --{option}: both name {path}; give them names of their own")
-        named[path] = option
+    files, folders: options that name what is written. Every other path in the arguments, and what the parameters name,
+    is read. also_read: what is read beside.
+    """
+    from ..files.atomic import check_writable
+    from ..files.outputs import check_outputs as check_apart
+
+    given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
+    for name in files:
+        if name in given:
+            check_writable(given[name])
+    read = [*also_read, *(path for name, path in given.items() if name not in (*files, *folders))]
+    read += [path for value in vars(arguments).values() if isinstance(value, list) for path in value
+             if isinstance(path, Path)]  # fmt: skip
+    if hasattr(arguments, "overrides") and (initial := load(arguments).initial_calibration):
+        read.append(Path(initial))
+    as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
+    check_apart(as_options[0], read, as_options[1])
 
 
 def console(stderr: bool = False) -> Console:

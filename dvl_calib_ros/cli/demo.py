@@ -47,9 +47,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
-    common.check_outputs(arguments, "report")
-    write_report = report_writer(arguments, "write_replay_report")
     bag = common.share_folder() / "bags" / BAG
+    common.check_outputs(arguments, "report", also_read=[bag])
+    write_report = report_writer(arguments, "write_replay_report")
     os.environ.update(private_domain())
     try:
         import rclpy

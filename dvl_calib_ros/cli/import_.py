@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
         storage=Storage(arguments.storage),
         compression=Compression(arguments.compression),
     )
+    common.check_outputs(arguments, folders=["output"])
     if arguments.dvl.is_dir():
         if arguments.gnss or arguments.attitude:
             raise InputError("--gnss and --attitude go with a file; in a folder they are found by their names")

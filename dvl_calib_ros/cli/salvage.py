@@ -27,6 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.writer import BagWriter, Compression, Storage
     from ..errors import InputError, printable
 
+    common.check_outputs(arguments, folders=["output"])
     counts: Counter[str] = Counter()
     with BagReader(arguments.bags) as reader:
         topics, total = reader.topics, max(sum(reader.message_counts.values()), 1)

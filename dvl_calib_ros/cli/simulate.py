@@ -96,6 +96,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulation.waves import Waves
 
     _check(arguments)
+    common.check_outputs(arguments, folders=["output"])
     roll, pitch, yaw = map(math.radians, arguments.misalignment)
     scale = [0.01 * s for s in arguments.scale] * (3 if len(arguments.scale) == 1 else 1)
     bias_x, bias_y, bias_z = map(math.radians, arguments.gyro_bias)

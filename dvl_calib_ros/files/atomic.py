@@ -91,6 +91,14 @@ def backup_of(path: Path) -> Path:
     return target.with_name(f"{target.name}.bak")
 
 
+def backups_of(path: Path) -> list[Path]:
+    """Every backup that there is of a file, and the one that the next `save_bytes` will make."""
+    target = Path(os.path.realpath(path))
+    with suppress(OSError):
+        return sorted({backup_of(target), *_backups(target)})
+    return [backup_of(target)]
+
+
 def own_stream(path: Path) -> int | None:
     """The file descriptor of this process that a path names (/dev/stdout, /dev/fd/3), None if it names a file.
 

@@ -1,0 +1,272 @@
+"""No command writes over what it reads, or writes one file twice, whatever the names are that lead there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from io_fixtures import replayed, run, write_bag
+
+from dvl_calib_ros.cli.main import COMMANDS, build_parser, main
+from dvl_calib_ros.files.result_file import result_document, result_text
+from dvl_calib_ros.files.urdf import numbers
+
+
+class Command(NamedTuple):
+    """arguments: before the outputs, inputs by their names in the folder. files, folders: options that write."""
+
+    arguments: str
+    inputs: tuple[str, ...]
+    files: tuple[str, ...] = ()
+    folders: tuple[str, ...] = ()
+
+
+LOOSE = "loose/run.db3"
+COMMAND = {
+    "replay": Command(
+        "replay bag --params params.yaml -p initial_calibration:=initial.yaml",
+        ("bag", "bag/bag.mcap", "bag/metadata.yaml", "params.yaml", "initial.yaml"), ("--json", "--save", "--report"),
+    ),
+    "replay of a file": Command("replay loose/run.db3", (LOOSE, f"{LOOSE}-wal"), ("--json", "--save", "--report")),
+    "diagnose": Command(
+        "diagnose bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--apply", "--report")
+    ),
+    "evaluate": Command(
+        "evaluate runs --partial --params params.yaml", ("runs", "runs/T_dvl.npy", "params.yaml"),
+        ("--json", "--csv", "--report"),
+    ),
+    "evaluate bags": Command("evaluate bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), ("--json",)),
+    "apply": Command("apply result.yaml", ("result.yaml",), ("--launch", "--fusion")),
+    "apply to a URDF": Command("apply result.yaml --urdf r.urdf", ("result.yaml", "r.urdf"), ("-o", "--launch", "--fusion")),
+    "apply in place": Command("apply result.yaml", ("result.yaml",), ("--urdf", "--launch")),
+    "salvage": Command("salvage bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), (), ("-o",)),
+    "import": Command(
+        "import runs/T_dvl.npy --gnss runs/T_gnss.npy", ("runs/T_dvl.npy", "runs/T_gnss.npy"), (), ("-o",)
+    ),
+    "import a folder": Command("import runs", ("runs", "runs/T_dvl.npy"), (), ("-o",)),
+    "simulate": Command("simulate --motion-of bag", ("bag", "bag/bag.mcap"), (), ("",)),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    """A folder with an input of every kind."""
+    folder = tmp_path_factory.mktemp("outputs") / "original"
+    folder.mkdir()
+    bag = write_bag(folder / "bag", run(10.0))
+    write_bag(folder / "loose_bag", run(10.0), "sqlite3")
+    (folder / "loose").mkdir()
+    (folder / "loose_bag" / "loose_bag.db3").rename(folder / LOOSE)
+    shutil.rmtree(folder / "loose_bag")
+    (folder / f"{LOOSE}-wal").touch()
+    text = result_text(result_document(replayed(bag).result))
+    for name in ("result.yaml", "initial.yaml"):
+        (folder / name).write_text(text)
+    (folder / "params.yaml").write_text("/**: {ros__parameters: {min_speed: 0.5}}\n")
+    (folder / "runs").mkdir()
+    for name in ("T_dvl", "T_gnss"):
+        np.save(folder / "runs" / name, [[0.2 * i, 1.5, 0.1, 0.0] for i in range(20)])
+    rpy = numbers(np.zeros(3))
+    (folder / "r.urdf").write_text(
+        f'<robot name="r"><joint name="j" type="fixed"><parent link="base_link"/><child link="dvl_link"/>'
+        f'<origin xyz="0 0 0" rpy="{rpy}"/></joint></robot>'
+    )
+    return folder
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# How an input is named once more: (folder, input) -> the name for the output
+ALIASES: dict[str, Callable[[Path, Path], Path]] = {}
+
+
+def alias(function: Callable[[Path, Path], Path]) -> Callable[[Path, Path], Path]:
+    ALIASES[function.__name__] = function
+    return function
+
+
+@alias
+def the_same(folder: Path, path: Path) -> Path:
+    return path
+
+
+@alias
+def absolute(folder: Path, path: Path) -> Path:
+    return folder / path
+
+
+@alias
+def roundabout(folder: Path, path: Path) -> Path:
+    return Path("runs") / ".." / path
+
+
+@alias
+def link(folder: Path, path: Path) -> Path:
+    (folder / "alias").symlink_to(folder / path)
+    return Path("alias")
+
+
+@alias
+def link_to_a_link(folder: Path, path: Path) -> Path:
+    (folder / "first").symlink_to(folder / path)
+    (folder / "alias").symlink_to("first")
+    return Path("alias")
+
+
+@alias
+def through_a_linked_folder(folder: Path, path: Path) -> Path:
+    (folder / "elsewhere").symlink_to(folder / path.parent)
+    return Path("elsewhere") / path.name
+
+
+@alias
+def hard_link(folder: Path, path: Path) -> Path:
+    if (folder / path).is_dir():
+        return path
+    os.link(folder / path, folder / "alias")
+    return Path("alias")
+
+
+@alias
+def by_descriptor(folder: Path, path: Path) -> Path:
+    handle = os.open(folder / path, os.O_RDONLY)
+    return Path(f"/proc/self/fd/{handle}")
+
+
+@alias
+def what_its_backup_would_replace(folder: Path, path: Path) -> Path:
+    if (folder / path).is_dir():
+        return path
+    (folder / path).rename(folder / "alias.bak")
+    (folder / path).symlink_to(folder / "alias.bak")
+    return Path("alias")
+
+
+@alias
+def new_inside(folder: Path, path: Path) -> Path:
+    return path / "new" if (folder / path).is_dir() else path
+
+
+@pytest.fixture
+def scratch(original, tmp_path, monkeypatch):
+    """Makes the folder anew, and makes it the working directory."""
+    monkeypatch.chdir(tmp_path)
+
+    def make() -> Path:
+        folder = tmp_path / "folder"
+        os.chdir(tmp_path)
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(original, folder)
+        os.chdir(folder)
+        return folder
+
+    return make
+
+
+def refused(capsys, words: list[str]) -> str:
+    try:
+        code = main(words)
+    except SystemExit as stop:
+        code = stop.code
+    error = capsys.readouterr().err
+    assert code == 2, words
+    assert error.count("\n") == 1 and "Traceback" not in error
+    return error
+
+
+@pytest.mark.parametrize("name", COMMAND)
+def test_no_output_of_a_command_can_be_one_of_its_inputs_by_any_name(scratch, capsys, name):
+    command = COMMAND[name]
+    for path in command.inputs:
+        for number, option in enumerate(command.files + command.folders):
+            for how, other_name in ALIASES.items():
+                if number and how not in ("the_same", "link"):
+                    continue  # all outputs of a command are looked at by one function
+                if command.folders and how == "what_its_backup_would_replace":
+                    continue  # a new folder replaces nothing
+                if name == "import a folder" and how == "new_inside":
+                    continue  # its bags may lie beside what they are made of
+                folder = scratch()
+                output = other_name(folder, Path(path))
+                before = snapshot(folder)
+                error = refused(capsys, [*command.arguments.split(), *([option] if option else []), str(output)])
+                assert snapshot(folder) == before, (path, option, how)
+                assert str(output) in error
+                if how == "by_descriptor":
+                    os.close(int(output.name))
+
+
+def test_every_option_that_names_a_path_is_known_here_as_read_or_written():
+    """A new option that writes is to be checked as the others are."""
+    known = {word for command in COMMAND.values() for word in (*command.files, *command.folders, *command.arguments.split())}
+    harmless = {"--out", "-h"}  # a trial reads nothing, and goes on in its folder
+    for module in COMMANDS:
+        parser = build_parser([module.NAME])._subparsers._group_actions[0].choices[module.NAME]
+        for action in parser._actions:
+            if action.type is Path and action.option_strings and module.NAME != "parameters":
+                assert known & {*action.option_strings} or harmless & {*action.option_strings} or (
+                    module.NAME == "demo" or action.option_strings[0] in ("--attitude", "--params", "--urdf")
+                ), f"{module.NAME} {action.option_strings}"
+
+
+@pytest.mark.parametrize("name", [name for name, command in COMMAND.items() if len(command.files) > 1])
+def test_no_two_outputs_can_be_one_file_by_any_name(scratch, capsys, name):
+    command = COMMAND[name]
+    for number, one in enumerate(command.files):
+        for other in command.files[number + 1 :]:
+            for how in ("the_same", "link", "hard_link", "through_a_linked_folder", "backup"):
+                folder = scratch()
+                (folder / "out").write_text("before")
+                second = Path("out.bak") if how == "backup" else ALIASES[how](folder, Path("out"))
+                before = snapshot(folder)
+                error = refused(capsys, [*command.arguments.split(), one, "out", other, str(second)])
+                assert "names of their own" in error
+                assert snapshot(folder) == before
+
+
+PATHS = st.sampled_from(
+    ["bag/bag.mcap", "bag/metadata.yaml", "bag/new.json", "bag.mcap", "loose/x", "out", "out.bak", "out.bak.2", "link",
+     "link.bak", "up/out", "sub/../out", "params.yaml", "params.yaml.bak", "initial.yaml", "./out", "fifo", "dir"]
+)  # fmt: skip
+
+
+@settings(max_examples=60)
+@given(outputs=st.lists(PATHS, min_size=1, max_size=3), target=PATHS)
+def test_whatever_outputs_are_named_every_input_stays_as_it_is_and_the_code_says_what_happened(
+    original, tmp_path_factory, outputs, target
+):
+    folder = tmp_path_factory.mktemp("any") / "folder"
+    shutil.copytree(original, folder)
+    (folder / "link").symlink_to(target)
+    (folder / "up").symlink_to(".")
+    (folder / "dir").mkdir()
+    (folder / "sub").mkdir()
+    os.mkfifo(folder / "fifo")
+    before = snapshot(folder)
+    here = os.getcwd()
+    os.chdir(folder)
+    try:
+        words = COMMAND["replay"].arguments.split()
+        for option, output in zip(("--json", "--save", "--report"), outputs, strict=False):
+            words += [option, output]
+        code = main(words)
+    finally:
+        os.chdir(here)
+    after = snapshot(folder)
+    for name in ("bag/bag.mcap", "bag/metadata.yaml", "params.yaml", "initial.yaml"):
+        assert after[name] == before[name]
+    assert (folder / "fifo").is_fifo() and (folder / "link").is_symlink()
+    if code == 0:
+        written = {os.path.realpath(folder / output) for output in outputs}
+        assert len(written) == len(outputs) and all(map(os.path.isfile, written))
+    else:
+        assert code == 2 and after == before
