@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from .motion import Motion
 from .plan import Case, Family
 from .recorded import WITH_INS, WITHOUT_INS, recorded
 from .simulated import MIN_OUTSIDE_SHARE, Known, vehicle
@@ -28,7 +27,9 @@ HORIZONTAL = ("huge", "large", "minus_one", "zero", "zero_without_covariance")
 ONE_HZ_SHARE = 0.6
 # Of groups of recordings, how many have a reference without a vertical
 HORIZONTAL_SHARE = 0.3
-SMOOTHINGS_WITH_INS, SMOOTHINGS_WITHOUT_INS = (0.0, 0.7), (0.7, 1.5)
+# Seconds. What is sampled at 1 Hz cannot tell the turn rates between samples of a motion that is not smoothed at all;
+# there are such, but they are the fewer
+SMOOTHINGS = {True: (0.0, 0.7, 1.0), False: (0.7, 1.0, 1.5)}
 
 
 def scene(case: Case, rng: np.random.Generator) -> Scene:
@@ -37,8 +38,9 @@ def scene(case: Case, rng: np.random.Generator) -> Scene:
     one_hz, same_instants = rng.uniform() < ONE_HZ_SHARE, rng.uniform() < 0.5
     rate = 1.0 if one_hz else 5.0
     phase = 0.0 if same_instants else float(rng.uniform(0.0, 1.0 / rate))
+    sources = _sources(n, rng)
     return Scene(
-        motions=_motions(n, rng),
+        motions=tuple(recorded(*source) for source in sources),
         vehicle=vehicle(rng),
         dvl_rate=rate,
         gnss_rate=rate,
@@ -51,6 +53,7 @@ def scene(case: Case, rng: np.random.Generator) -> Scene:
         rates_differenced=one_hz and bool(rng.uniform() < 0.5),
         vertical=str(rng.choice(HORIZONTAL)) if rng.uniform() < HORIZONTAL_SHARE and n > 1 else "",
         days=n > 1,
+        sources=sources,
     )
 
 
@@ -61,14 +64,10 @@ def as_recorded(case: Case, drawn: Scene) -> Scene:
     return replace(drawn, vertical=HORIZONTAL[case.number % len(HORIZONTAL)])
 
 
-def _motions(n: int, rng: np.random.Generator) -> tuple[Motion, ...]:
+def _sources(n: int, rng: np.random.Generator) -> tuple[tuple[str, float, bool], ...]:
+    """Of n recordings: name, smoothing in s, whether the velocity is that of the inertial system."""
     names = rng.choice([*WITH_INS, *WITHOUT_INS], n, replace=False, p=_chances())
-    motions = []
-    for name in map(str, names):
-        by_ins = name in WITH_INS
-        smoothing_s = float(rng.choice(SMOOTHINGS_WITH_INS if by_ins else SMOOTHINGS_WITHOUT_INS))
-        motions.append(recorded(name, smoothing_s, by_ins))
-    return tuple(motions)
+    return tuple((name, float(rng.choice(SMOOTHINGS[name in WITH_INS])), name in WITH_INS) for name in names.tolist())
 
 
 def _chances() -> list[float]:

@@ -49,7 +49,8 @@ class Scene:
 
     in_body: the reference is recorded in the body's frame, else in east-north-up. rates_differenced: angular velocities
     are the turn from each attitude to the next, as those of imported files are, else measured. vertical: how a
-    reference without a vertical shows that; '': it has one. days: every recording has its own time offsets.
+    reference without a vertical shows that; '': it has one. days: every recording has its own time offsets. sources:
+    of recorded motions, as `recorded` takes them.
     """
 
     motions: tuple[Motion, ...]
@@ -65,6 +66,7 @@ class Scene:
     rates_differenced: bool = False
     vertical: str = ""
     days: bool = False
+    sources: tuple[tuple[str, float, bool], ...] = ()
 
     def dvl_times(self, motion: Motion) -> Floats:
         """(N,) s, when the DVL measures, by a true clock."""

@@ -269,6 +269,9 @@ def _detail_table(scored: Sequence[Scored]) -> Table:
         hits = _share_cell(case.verdict == "unknown" for case in unknown if name in case.truth.faults)
         rows.append((f"unknown: {name}", hits))
     at_sea = [c for c in scored if c.truth.category in KNOWN and c.truth.family != Family.SIMULATED.value]
+    for smoothing_s in sorted({source[1] for case in at_sea for source in case.truth.scene["sources"]}):
+        hits = _share_cell(c.is_exact for c in at_sea if smoothing_s in [each[1] for each in c.truth.scene["sources"]])
+        rows.append((f"real motion, exact, smoothed by s: {smoothing_s:g}", hits))
     for what, key in (("rate Hz", "dvl_rate"), ("rates differenced", "rates_differenced"), ("vertical", "vertical")):
         for value in sorted({str(case.truth.scene.get(key)) for case in at_sea}):
             hits = _share_cell(case.is_exact for case in at_sea if str(case.truth.scene.get(key)) == value)

@@ -154,7 +154,16 @@ BOTH = ARM_X | {"dvl_time_offset": {"seconds@0": 1.0, "seconds@1": 2.0}}
 
 
 def at_sea(number: int, category: Category, faults=(), family="half_real", **rest) -> Truth:
-    return Truth(f"case{number:03d}", category, "snapir", family=family, faults=dict(faults), noise_mps=0.03, **rest)
+    return Truth(
+        f"case{number:03d}",
+        category,
+        "snapir",
+        family=family,
+        faults=dict(faults),
+        noise_mps=0.03,
+        scene={"sources": []},
+        **rest,
+    )
 
 
 def says(verdict, left_mps, **parameters):
