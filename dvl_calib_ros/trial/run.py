@@ -32,6 +32,12 @@ Document = dict[str, Any]
 Answerer = Callable[[Sequence[Path], Parameters], Document]
 """Bags of one vehicle, and what is known of its mounting -> the diagnosis as in its JSON."""
 
+# When a fault is there, of which an answer does not say
+AT_ANY_TIME = {
+    "water_lock": {"from_s": 0.0, "to_s": math.inf},
+    "time_offset_jump": {"at_s": 0.0},
+    "mounting_moved": {"from_recording": 1.0},
+}
 # The draws or the physics of the generator have changed: answers to older cases are answers to others
 GENERATOR_VERSION = 4
 
@@ -127,8 +133,10 @@ def said(document: Document) -> Faults:
     """The faults that an answer names, as far as the generator knows such, at the sizes that it gives."""
     faults: dict[str, dict[str, float]] = {}
     for effect in document.get("effects", []):
-        if effect["name"] in FAULTS:
-            faults[effect["name"]] = {name: each["value"] for name, each in effect["parameters"].items()}
+        if known := FAULTS.get(effect["name"]):
+            given = {name: each["value"] for name, each in effect["parameters"].items()}
+            usable = {name: value for name, value in given.items() if value is not None and not math.isnan(value)}
+            faults[effect["name"]] = dict.fromkeys(known.typical, 0.0) | AT_ANY_TIME.get(effect["name"], {}) | usable
     return faults
 
 

@@ -378,6 +378,34 @@ def test_a_diagnosis_that_breaks_is_scored_as_failed_and_one_that_refuses_as_see
         assert score(join(unseal(trial.sealed), answers)).n_failed == (name == "a")
 
 
+def test_what_was_said_is_computed_again_by_the_generator(tmp_path):
+    """The error that is left: none with the truth said, all of it with nothing said, whatever the diagnosis claims."""
+    case = Case(Category.SINGLE, "box", "velocity_bias", 20.0)
+    true = draw(case, 0).truth
+
+    def answer_of(faults):
+        effects = [{"name": n, "parameters": {k: {"value": v} for k, v in p.items()}} for n, p in faults.items()]
+        return lambda paths, parameters: {"verdict": "known", "effects": effects, "gap": {"closure": 1.0}}
+
+    left = {}
+    for name, faults in {
+        "truth": true.faults,
+        "nothing": {},
+        "nonsense": {"water_lock": {"east_mps": None}, "a_plug_in": {"x": 1.0}},
+    }.items():
+        (answered,) = Trial(tmp_path / name, jobs=1, answerer=answer_of(faults)).run([case]).values()
+        left[name] = answered["left_mps"]
+    assert left["truth"] < 1e-9
+    assert left["nothing"] == pytest.approx(true.before_mps) and true.before_mps > 1e-3
+    assert left["nonsense"] == pytest.approx(true.before_mps)
+
+
+def test_a_trial_begins_no_case_after_its_time(tmp_path):
+    cases = short_cases(3)
+    assert Trial(tmp_path, jobs=1, answerer=count_messages).run(cases, seconds=0.0) == {}
+    assert len(Trial(tmp_path, jobs=1, answerer=count_messages).run(cases)) == 3
+
+
 def test_a_folder_with_another_trial_is_refused(tmp_path):
     Trial(tmp_path, seed=1, jobs=1, answerer=count_messages).run([])
     with pytest.raises(InputError, match=r"trial.json: holds a trial of .*give another folder or the same seed"):
@@ -393,6 +421,8 @@ def test_a_folder_with_another_trial_is_refused(tmp_path):
         (["--cases", "0"], "--cases: 0 is no number of cases"),
         (["--jobs", "-1"], "--jobs: -1 is negative"),
         (["--seed", "-1"], "--seed: -1 is negative"),
+        (["--minutes", "-1"], "--minutes: -1.0 is no time"),
+        (["--case", "half_real/nothing"], "--case half_real/nothing: no such case; give a key or an id"),
     ],
 )
 def test_bad_options_are_told_before_anything_is_done(options, message, tmp_path):
