@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.serde import SerdeError
 
 from .channels import Channel, Decoder, DecodingError
 from .layout import Columns, Layout, NoLayoutError, layout_of
@@ -18,6 +17,8 @@ from .sorting import BagMessage
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
 WINDOW_MESSAGES, WINDOW_BYTES = 4096, 4 << 20
+# Messages that are taken before their bytes are looked at
+TAKEN = 256
 # A recorder has one layout or a few; garbage could have ever new ones.
 _MOST_LAYOUTS = 8
 Stamps = NDArray[np.int64]
@@ -87,7 +88,7 @@ def _taken(messages: Iterator[BagMessage]) -> list[BagMessage]:
     taken: list[BagMessage] = []
     size = 0
     while len(taken) < WINDOW_MESSAGES and size < WINDOW_BYTES:
-        some = list(islice(messages, 256))
+        some = list(islice(messages, TAKEN))
         if not some:
             break
         taken += some
@@ -130,6 +131,6 @@ class _Layouts:
             return False
         try:
             known.append(layout_of(store, channel.msgtype, data))
-        except (NoLayoutError, SerdeError, LookupError):
+        except (NoLayoutError, LookupError):
             return False
         return True

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
 _FORMATS = {
@@ -109,7 +110,11 @@ def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
         }
     )
     layout = Layout(dtype, data[:2], walk.lengths, frozenset(walk.flags))
-    _compare(layout, layout.view([data]), store.deserialize_cdr(data, msgtype))
+    try:
+        message = store.deserialize_cdr(data, msgtype)
+    except SerdeError as error:
+        raise NoLayoutError(str(error)) from error
+    _compare(layout, layout.view([data]), message)
     return layout
 
 
