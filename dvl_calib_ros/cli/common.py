@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from ..calibration.parameters import Parameters
     from ..calibration.results import Estimate, Result
+    from ..discovery.discover import Discovery
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
@@ -36,9 +37,42 @@ def _parameter_completions(**_: Any) -> list[str]:
 
 
 def add_topic_options(parser: argparse.ArgumentParser) -> None:
-    """--dvl-topic, --gnss-topic, --imu-topic."""
+    """--dvl-topic, --gnss-topic, --imu-topic, of the node."""
     for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
         parser.add_argument(f"--{role}-topic", default=default, metavar="TOPIC", help=f"default: {default}")
+
+
+def add_discovery_options(parser: argparse.ArgumentParser) -> None:
+    """--dvl-topic, --gnss-topic, --imu-topic of recordings, where they are looked for by type and content."""
+    for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
+        none = "" if role == "dvl" else "; none: do without"
+        help_ = f"default: {default}, else found by type and content{none}"
+        parser.add_argument(f"--{role}-topic", metavar="TOPIC", help=help_)
+
+
+def discovered(arguments: argparse.Namespace, bags: Sequence[Path], parameters: Parameters) -> Discovery:
+    """What recordings say of topics, mounting and frames, under what the options of a command give. Raises InputError.
+
+    parameters: as `load` made them of the same options.
+    """
+    from ..discovery.discover import Given, discover
+    from ..files.parameter_files import given_parameters
+
+    named = given_parameters(arguments.params, arguments.overrides)
+    given = Given(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic, named)
+    return discover(bags, parameters, given)
+
+
+def print_found(discovery: Discovery, bags: Sequence[Path]) -> None:
+    """What was found in recordings, and where; on standard output, dim."""
+    from rich.markup import escape
+
+    from ..errors import printable
+
+    out = console()
+    names = ", ".join(bag.name or str(bag) for bag in bags)
+    for sentence in (f"{names}: {discovery.found[0]}", *discovery.found[1:]):
+        out.print(f"[dim]{escape(printable(sentence))}[/]")
 
 
 def add_storage_options(parser: argparse.ArgumentParser) -> None:

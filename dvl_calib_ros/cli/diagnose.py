@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_report_option(parser)
     common.add_parameter_options(parser)
-    common.add_topic_options(parser)
+    common.add_discovery_options(parser)
     parser.add_argument("--trial", action="store_true", help="try the diagnosis itself, blindly, on simulated bags")
     trial.add_arguments(parser)
 
@@ -58,17 +58,18 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.results import diagnosis_document
     from ..files.atomic import save_text
-    from ..replay.replay import Topics
 
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "apply", "report")
     write_report = report_writer(arguments, "write_diagnosis_report")
-    topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
+    discovery = common.discovered(arguments, arguments.bags, parameters)
+    parameters = discovery.parameters
+    common.print_found(discovery, arguments.bags)
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(
             arguments.bags,
-            common.load(arguments, DEFAULTS),
-            topics,
+            common.load(arguments, DEFAULTS).replace(**discovery.values),
+            discovery.topics,
             on_progress,
             with_series=write_report is not None,
         )

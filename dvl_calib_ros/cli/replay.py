@@ -1,4 +1,8 @@
-"""Calibrate with recorded bags: the same estimator as the node's, over rosbag2 folders or files, several as one."""
+"""Calibrate with recorded bags: the same estimator as the node's, over rosbag2 folders or files, several as one.
+
+Topics, mounting, lever arm and frames are found in the bag where no option says otherwise. The answer comes first: a
+verdict, the corrected mounting and what to type next. -p takes angles in degrees: -p mounting_rpy:="[0, 0, 45deg]".
+"""
 
 from __future__ import annotations
 
@@ -11,38 +15,44 @@ from . import common
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ..discovery.discover import Discovery
     from ..replay.replay import Replayed
 
 NAME = "replay"
 HELP = "calibrate with recorded bags"
-VERDICT_COLOURS = {"accept": "green", "marginal": "yellow", "reject": "red"}
-EXAMPLE = "dvl-calib replay my_bag --models all --params calibration.yaml --save calibration_result.yaml"
+EXAMPLE = "dvl-calib replay my_bag --save calibration.yaml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
-    parser.add_argument("--models", default="all", help="models to show, such as M3,M7; default: all")
+    parser.add_argument("--models", metavar="NAMES", help="show these models beside the answer, such as M3,M7 or all")
+    parser.add_argument("-v", "--verbose", action="store_true", help="show counts, selection and all models as well")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
     add_report_option(parser)
     common.add_parameter_options(parser)
-    common.add_topic_options(parser)
+    common.add_discovery_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Replay, print, save."""
+    """Look into the bags, replay them, save, print."""
     from ..calibration.models import MODELS
     from ..files.result_file import result_document, save_result
-    from ..replay.replay import Topics, replay, replay_document
+    from ..replay.replay import replay, replay_document
 
-    models = common.chosen("--models", arguments.models, tuple(MODELS))
+    asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
+    models = list(MODELS) if arguments.verbose or not asked else asked
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "save", "report")
     write_report = report_writer(arguments, "write_replay_report")
-    topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
+    discovery = common.discovered(arguments, arguments.bags, parameters)
     with common.progress("replaying") as on_progress:
-        replayed = replay(arguments.bags, parameters, topics, on_progress, with_history=write_report is not None)
+        replayed = replay(
+            arguments.bags, discovery.parameters, discovery.topics, on_progress, with_history=write_report is not None
+        )
     result = replayed.result
     if arguments.json is not None:
         common.write_json(
@@ -51,6 +61,7 @@ def run(arguments: argparse.Namespace) -> None:
             | {
                 "dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned},
                 "findings": [found.as_dict() for found in replayed.findings],
+                "discovery": discovery.document(),
             },
         )
     if arguments.save is not None:
@@ -58,28 +69,51 @@ def run(arguments: argparse.Namespace) -> None:
         save_result(arguments.save, document, round(parameters.result_backups))
     if write_report is not None:
         write_report(arguments.report, replayed, arguments.bags, models)
-    _print(replayed, models)
+    _print(arguments, replayed, discovery, models if arguments.verbose else asked)
 
 
-def _print(replayed: Replayed, models: Sequence[str]) -> None:
+def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
+    from rich.markup import escape
+
+    from .answer import next_commands, print_answer, shown_findings
+
+    result, out = replayed.result, common.console()
+    common.print_found(discovery, arguments.bags)
+    findings = shown_findings(replayed, [result.selected, *models])
+    known = {str(found) for found in replayed.findings}
+    common.print_warnings(
+        [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
+    )
+    out.print()
+    print_answer(out, replayed, discovery)
+    commands = next_commands(replayed, arguments.bags, arguments.save, _options(arguments), bool(findings))
+    for word, command in zip(("next", *[""] * len(commands)), commands, strict=False):
+        out.print(f"{word:5} {escape(command)}", soft_wrap=True)
+    if models:
+        out.print()
+        _print_details(out, replayed, models)
+
+
+def _options(arguments: argparse.Namespace) -> list[str]:
+    """Options of this run that say what is calibrated, for the next command."""
+    options = [] if arguments.params is None else ["--params", str(arguments.params)]
+    for override in arguments.overrides:
+        options += ["-p", override]
+    for role in ("dvl", "gnss", "imu"):
+        topic = getattr(arguments, f"{role}_topic")
+        options += [] if topic is None else [f"--{role}-topic", topic]
+    return options
+
+
+def _print_details(out: Console, replayed: Replayed, models: Sequence[str]) -> None:
+    """Models in figures, and what became of every message."""
     result = replayed.result
-    common.print_warnings(replayed.notes)
-    out = common.console()
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
-    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
-    title = f"{dvl['accepted']} DVL samples over {seconds:.1f} s, {pairing['paired']} paired with GNSS"
+    title = f"{dvl['accepted']} DVL samples, {pairing['paired']} with a reference velocity at their time"
     out.print(common.result_table(result, models, title))
+    out.print(f"selected: {result.selected} ({result.selected_because})")
+    out.print(f"dvl data: {replayed.dvl_data}")
     for name in ("dvl", "reference", "imu"):
         counts = result.counts[name]
         lost = ", ".join(f"{value} {key}" for key, value in counts.items() if value and key != "received")
         out.print(f"{name}: {counts['received']} received" + (f": {lost}" if lost else ""))
-    out.print(f"dvl data: {replayed.dvl_data}")
-    out.print(f"selected: {result.selected} ({result.selected_because})")
-    for entry in result.estimate.observability:
-        if entry.missing:
-            out.print(f"{result.selected} has not seen {entry.name} ({entry.axis}) yet; it needs {entry.missing}")
-    verification = result.verifications[result.selected]
-    word = verification.verdict.value
-    out.print(
-        f"verdict on {result.selected}: [bold {VERDICT_COLOURS[word]}]{word}[/]: {'; '.join(verification.reasons)}"
-    )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import fnmatch
+import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,27 +27,62 @@ def load_parameters(
 ) -> Parameters:
     """Parameters of a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
 
-    defaults: values, other than the schema's own, of what neither sets.
+    defaults: values, other than the schema's own, of what neither sets. An override may give angles in degrees: 45deg.
     """
     values = dict(defaults or {}) | ({} if path is None else _node_parameters(path))
     try:
         Parameters.from_mapping(values)
     except ParameterError as error:
         raise InputError(f"{path}: {error}") from error
-    for override in overrides:
-        name, separator, text = override.partition(":=")
-        if not separator:
-            raise InputError(f"{override!r}: give parameters as name:=value")
-        value = parse_scalar(text)
-        if not is_ros_parameter(name):
-            values[name] = "" if value is None else value
+    values |= dict(_override(override) for override in overrides)
     try:
-        parameters = Parameters.from_mapping(values)
+        parameters = Parameters.from_mapping({k: v for k, v in values.items() if not is_ros_parameter(k)})
     except ParameterError as error:
         raise InputError(f"-p {error}") from error
     for name in TYPES_OF:
         velocity_type(name, getattr(parameters, name))
     return parameters
+
+
+def given_parameters(path: Path | None, overrides: Sequence[str] = ()) -> frozenset[str]:
+    """Names of the parameters that a user has set: by an override, or in a file to another value than the default.
+
+    A file that lists every parameter at its default, as the shipped one, has set none. Raises InputError.
+    """
+    in_file = {} if path is None else changed_parameters(load_parameters(path))
+    return frozenset({*in_file, *(_override(override)[0] for override in overrides)})
+
+
+def _override(text: str) -> tuple[str, Any]:
+    """Name and value of ``name:=value``. Raises InputError."""
+    name, separator, written = text.partition(":=")
+    if not separator:
+        raise InputError(f"{text!r}: give parameters as name:=value")
+    value = parse_scalar(written)
+    if name in SCHEMA and SCHEMA[name].unit == "rad":
+        value = _in_radians(value)
+    return name, "" if value is None else value
+
+
+_DEGREES = re.compile(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?:deg|°)$")
+
+
+def _in_radians(value: Any) -> Any:
+    """Angles as written: 45deg becomes a number in radians, a text of several an array; the rest stays as it is."""
+    if isinstance(value, str):
+        parts = re.sub(r"\s+(?=deg|°)", "", value).replace(",", " ").split()
+        return [_number_or_degrees(part) for part in parts] if len(parts) > 1 else _number_or_degrees(value)
+    return [_number_or_degrees(each) for each in value] if isinstance(value, list) else value
+
+
+def _number_or_degrees(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    found = _DEGREES.match(value.strip())
+    try:
+        return math.radians(float(found[1])) if found else float(value)
+    except ValueError:
+        return value
 
 
 def _node_parameters(path: Path) -> dict[str, Any]:

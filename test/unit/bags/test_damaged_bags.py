@@ -365,14 +365,16 @@ def test_what_cannot_be_replayed_is_named_in_one_line_with_exit_code_2(tmp_path,
     ("options", "expected"),
     [
         (
-            ["--dvl-topic", "imu/data", "--imu-topic", "x"],
+            ["--dvl-topic", "imu/data"],
             "topic imu/data holds sensor_msgs/msg/Imu, expected geo",
         ),
-        (["--gnss-topic", "imu/data", "--imu-topic", "x"], "set --gnss-topic"),
-        (["--gnss-topic", "imu/data", "--imu-topic", "x", "-p", "prior_source:=reference"], "set --gnss-topic"),
-        (["--imu-topic", "gnss/twist", "--gnss-topic", "x"], "expected sensor_msgs/msg/Imu; set --imu-topic"),
+        (["--gnss-topic", "imu/data"], "set --gnss-topic"),
+        (["--gnss-topic", "imu/data", "-p", "prior_source:=reference"], "set --gnss-topic"),
+        (["--imu-topic", "gnss/twist"], "expected sensor_msgs/msg/Imu; set --imu-topic"),
         (["--gnss-topic", "dvl/twist"], "must be different topics"),
         (["--dvl-topic", "[/b]"], "no topic '[/b]'"),
+        (["--gnss-topic", "gnss/twits"], "did you mean gnss/twist?"),
+        (["--imu-topic", "/imu/dat"], "did you mean imu/data?"),
     ],
 )
 def test_a_topic_of_another_type_is_named_with_the_option_to_set(tmp_path, capsys, options, expected):

@@ -38,8 +38,8 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.bags import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.messages.decode import MessageFeed
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES, driver_table, velocity_type
-from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.replay.replay import Topics, replay
 from dvl_calib_ros.simulation.recorded import Recording, recorded_motion
@@ -445,7 +445,7 @@ def test_a_motion_is_taken_from_an_odometry_reference_too(tmp_path):
 def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_path, capsys):
     changes = {5: lambda m: setattr(m, "num_good_beams", 1)}
     bag = write_driver_bag(tmp_path / "bag", steady_run(50), MARINE, changes=changes)
-    assert main(["replay", str(bag), "--json", str(tmp_path / "out.json")]) == 0
+    assert main(["replay", str(bag), "-v", "--json", str(tmp_path / "out.json")]) == 0
     said = "marine_acoustic_msgs/msg/Dvl, turned from forward-right-down to forward-left-up"
     shown = capsys.readouterr().out
     assert said in shown and "1 few_beams" in shown

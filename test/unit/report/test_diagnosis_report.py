@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from io_fixtures import run, write_bag
 from report_fixtures import OWN_EFFECT, Page, assert_described, diagnosis, drawn
 
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -169,10 +170,10 @@ def test_the_command_writes_the_report_and_collects_series_only_for_it(tmp_path,
         return diagnosis()
 
     monkeypatch.setattr("dvl_calib_ros.diagnosis.diagnose.diagnose", answer)
-    report = tmp_path / "report.html"
-    succeed(capsys, "diagnose", tmp_path, "--report", report)
-    succeed(capsys, "diagnose", tmp_path)
+    report, bag = tmp_path / "report.html", write_bag(tmp_path / "bag", run(6.0))
+    succeed(capsys, "diagnose", bag, "--report", report)
+    succeed(capsys, "diagnose", bag)
     assert asked == [True, False]
     assert diagnosis().sentence in Page(report).text
-    assert "does not exist" in fail(capsys, "diagnose", tmp_path, "--report", tmp_path / "none" / "report.html")
+    assert "does not exist" in fail(capsys, "diagnose", bag, "--report", tmp_path / "none" / "report.html")
     assert len(asked) == 2  # refused before the work

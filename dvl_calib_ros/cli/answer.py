@@ -1,0 +1,148 @@
+"""The answer of a replay, first and short: what to do with it, the mounting to paste, and what to type next."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from ..calibration.findings import Finding
+    from ..discovery.discover import Discovery
+    from ..replay.replay import Replayed
+
+# What the verdict's word asks of the reader, and its colour.
+VERDICTS = {
+    "accept": ("Use this calibration.", "green"),
+    "marginal": ("Use this calibration with care:", "yellow"),
+    "reject": ("Do not use this calibration:", "red"),
+}
+# Findings that discovery has dealt with: it says itself where the IMU's orientation is from, and that there is no GNSS.
+SETTLED = ("IMU_FRAME", "BAG_NO_GNSS")
+
+
+def shown_findings(replayed: Replayed, models: Sequence[str]) -> list[Finding]:
+    """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
+    other = [f"{name}: " for name in replayed.result.estimates if name not in models]
+    return [
+        found
+        for found in replayed.findings
+        if found.code not in SETTLED and not any(found.says.startswith(prefix) for prefix in other)
+    ]
+
+
+def print_answer(out: Console, replayed: Replayed, discovery: Discovery) -> None:
+    """One paragraph, one table, the mounting in the form to paste."""
+    from rich.markup import escape
+
+    result = replayed.result
+    verification = result.verifications[result.selected]
+    advice, colour = VERDICTS[verification.verdict.value]
+    reasons = "; ".join(verification.reasons)
+    text = f"{advice} {_capital(reasons) if advice.endswith('.') else reasons}."
+    out.print(f"[bold {colour}]{verification.verdict.value}[/]: {escape(text)}")
+    out.print()
+    out.print(escape(_headline(replayed)))
+    out.print(_table(replayed))
+    for sentence in _not_shown(replayed):
+        out.print(escape(sentence), soft_wrap=False)
+    out.print(f"\nURDF  {escape(origin(replayed, discovery))}", soft_wrap=True)
+
+
+def _headline(replayed: Replayed) -> str:
+    """By how much the mounting is off, by which model, from how much data."""
+    import numpy as np
+
+    from ..calibration.parameters import Parameters
+
+    result = replayed.result
+    parameters = Parameters.from_mapping(result.parameters)
+    turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
+    angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
+    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
+    return (
+        f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} (model "
+        f"{result.selected}, {result.estimate.used} samples used of {seconds:.0f} s):"
+    )
+
+
+def _angle(degrees: float) -> str:
+    return f"{round(degrees, 2) + 0.0:.2f}°"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _table(replayed: Replayed) -> Table:
+    """Nominal and corrected mounting with its standard deviation, and the scale."""
+    import numpy as np
+    from rich import box
+    from rich.table import Table
+
+    from ..calibration.frames import rpy_from_rotation
+    from ..calibration.models import MODELS
+    from ..calibration.observability import body_angle_std, scale_std_ahead
+    from ..calibration.parameters import Parameters
+
+    result = replayed.result
+    estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
+    nominal = np.degrees(parameters.mounting_rpy) + 0.0
+    corrected = np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)))
+    std = np.degrees(body_angle_std(estimate.covariance, parameters))
+    unseen = {entry.axis for entry in estimate.observability if not entry.observed}
+    table = Table(box=box.SIMPLE_HEAD)
+    for column in ("", "nominal", "corrected", "±1σ"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for index, name in enumerate(("roll", "pitch", "yaw")):
+        mark = " ?" if name in unseen else ""
+        table.add_row(name, _angle(nominal[index]), _angle(corrected[index]), f"{std[index]:.2f}°{mark}")
+    model = MODELS[estimate.model]
+    scale_std = scale_std_ahead(model, estimate.covariance, parameters)
+    if len(scale_std):
+        ahead = float(parameters.rotation_dvl_from_body[:, 0] ** 2 @ estimate.scale)
+        mark = " ?" if "scale" in unseen else ""
+        table.add_row("scale", "0.00 %", f"{100 * ahead:+.2f} %", f"{100 * scale_std[0]:.2f} %{mark}")
+    return table
+
+
+def _not_shown(replayed: Replayed) -> list[str]:
+    """What the recording does not show, and the manoeuvre that would; one sentence per cause."""
+    causes: dict[str, list[str]] = {}
+    for entry in replayed.result.estimate.observability:
+        if entry.missing:
+            causes.setdefault(entry.missing, []).append(entry.axis)
+    return [
+        f"? {' and '.join(dict.fromkeys(axes))}: not shown by this recording; it needs {missing}"
+        for missing, axes in causes.items()
+    ]
+
+
+def origin(replayed: Replayed, discovery: Discovery) -> str:
+    """The corrected mounting as a URDF joint's origin."""
+    from ..calibration.frames import rpy_from_rotation
+    from ..files.urdf import numbers
+
+    result, parameters = replayed.result, discovery.parameters
+    rpy = rpy_from_rotation(result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body))
+    return f'<origin xyz="{numbers(parameters.lever_arm)}" rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
+
+
+def next_commands(
+    replayed: Replayed, bags: Sequence[Path], saved: Path | None, options: Sequence[str], doubts: bool
+) -> list[str]:
+    """What to type next, in order. options: of this run, which the next needs as well."""
+    named = " ".join(shlex.quote(str(bag)) for bag in bags)
+    given = "".join(f" {shlex.quote(option)}" for option in options)
+    verdict = replayed.result.verifications[replayed.result.selected].verdict.value
+    if verdict == "reject":
+        return [f"dvl-calib doctor {named}", f"dvl-calib diagnose {named}{given}"]
+    if saved is None:
+        return [f"dvl-calib replay {named}{given} --save calibration.yaml"]
+    commands = [f"dvl-calib apply {shlex.quote(str(saved))} --urdf robot.urdf"]
+    return commands + ([f"dvl-calib doctor {named}"] if doubts else [])

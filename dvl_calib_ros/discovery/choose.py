@@ -1,0 +1,157 @@
+"""Which topic is the DVL's, the reference's and the IMU's: by type, by name, and by what is on it."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from ..errors import InputError
+from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
+from .survey import Look, Survey
+
+NONE = "none"
+DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
+# Satellites first, then what knows its motion otherwise. A simulator's truth is as good as either.
+GNSS_WORDS = ("gnss", "gps", "navsat", "rtk", "ublox", "septentrio", "novatel", "fix", "nmea")
+TRUTH_WORDS = ("truth", "pose_gt", "p3d", "mocap", "qualisys", "optitrack")
+INS_WORDS = ("ins", "spatial", "sbg", "phins", "xsens", "mti", "vectornav", "microstrain", "navigation", "rovins")
+# What is made from the DVL proves nothing about it; what is commanded is not measured.
+DERIVED_WORDS = (
+    "filtered", "ekf", "ukf", "fused", "dead_reckoning", "deadreckoning", "calibrated", "dvl_calibration",
+    "local_position", "estimate",
+)  # fmt: skip
+COMMAND_WORDS = ("cmd", "command", "setpoint", "desired", "target", "goal", "joy", "teleop", "thrust", "current")
+# A vehicle that nowhere reaches this speed does not move; m/s.
+MOVES_FROM = 0.02
+# Two velocities that differ by less than this share of the speed were made from each other.
+SAME_SHARE = 1e-4
+
+Difference = Callable[[Look, Look], float | None]
+"""DVL and reference -> what no rotation can explain of their difference, as a share of the speed; None: unknown."""
+
+
+def _words(look: Look) -> set[str]:
+    """Parts of a topic's name and frame."""
+    return set(re.split(r"[^a-z0-9]+", f"{look.topic} {look.frame_id}".lower()))
+
+
+def _has(look: Look, words: Iterable[str]) -> bool:
+    """Whether its name or frame holds one of these words; short ones only as a part of their own."""
+    text, parts = f"{look.topic} {look.frame_id}".lower(), _words(look)
+    return any(word in parts or (len(word) > 3 and word in text) for word in words)
+
+
+def is_derived(look: Look) -> bool:
+    """Whether a velocity looks as if the DVL's were in it, or as if nobody had measured it."""
+    return _has(look, (*DERIVED_WORDS, *COMMAND_WORDS))
+
+
+def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, where: str) -> str:
+    """A topic that was named, as the recording spells it. Raises InputError if it is not there or of another type."""
+    present = survey.topics
+    spelled = next((each for each in (name, f"/{name}", name.lstrip("/")) if each in present), None)
+    wanted = set(kinds)
+    if spelled is not None and present[spelled] not in wanted:
+        expected = " or ".join(kinds)
+        raise InputError(f"{where}: topic {spelled} holds {present[spelled]}, expected {expected}; set {option}")
+    if spelled is None:
+        fitting = sorted(topic for topic, kind in present.items() if kind in wanted)
+        near = difflib.get_close_matches(name, fitting, n=1, cutoff=0.5)
+        hint = f"; did you mean {near[0]}?" if near else f"; set {option}."
+        listing = ", ".join(fitting) or "none"
+        raise InputError(f"{where}: no topic {name!r}{hint} Of types that fit, the bag has: {listing}")
+    return spelled
+
+
+def choose_dvl(survey: Survey, default: str, where: str) -> str:
+    """The DVL's topic. Raises InputError if nothing in the recording is one."""
+    present = survey.topics
+    standard = _spelled(default, present)
+    if standard is not None and present[standard] in VELOCITY_TYPES:
+        return standard
+    looks = [look for look in survey.looks.values() if look.msgtype in VELOCITY_TYPES]
+    own_type = [look for look in looks if look.msgtype not in REFERENCE_TYPES]
+    named = [look for look in looks if _has(look, DVL_WORDS) and not is_derived(look)]
+    found = own_type or named
+    if not found:
+        velocities = [look for look in looks if not _has(look, (*GNSS_WORDS, *TRUTH_WORDS)) and not is_derived(look)]
+        if len(velocities) == 1 and len(looks) > 1:
+            return velocities[0].topic
+        raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic. {_listing(survey)}")
+    order = list(VELOCITY_TYPES)
+    # a driver that sends several forms sends the plain one, the raw type, in full
+    order.sort(key=lambda name: (name in REFERENCE_TYPES, name != TWIST_TYPE))
+    return min(found, key=lambda look: (order.index(look.msgtype), not look.speed, -look.count, look.topic)).topic
+
+
+def choose_reference(survey: Survey, default: str, dvl: str, difference: Difference) -> tuple[str | None, list[str]]:
+    """The reference's topic, or None; and what was passed over, in sentences."""
+    standard = _spelled(default, survey.topics)
+    if standard is not None and survey.topics[standard] in REFERENCE_TYPES:
+        return standard, []
+    dvl_look = survey.looks.get(dvl)
+    ranked: list[tuple[tuple[float, ...], Look]] = []
+    said: list[str] = []
+    for look in survey.looks.values():
+        if look.topic == dvl or look.msgtype not in REFERENCE_TYPES or _has(look, COMMAND_WORDS):
+            continue
+        if look.speed < MOVES_FROM:
+            said.append(f"{look.topic} does not move; not taken as a reference")
+            continue
+        share = None if dvl_look is None else difference(dvl_look, look)
+        if _has(look, DVL_WORDS) or (share is not None and share < SAME_SHARE):
+            said.append(f"{look.topic} looks as if it were made from the DVL; not taken as a reference")
+            continue
+        if is_derived(look):
+            said.append(
+                f"{look.topic} may have the DVL in it (a filter's output?); not taken as a reference. If it has not: "
+                f"--gnss-topic {look.topic}"
+            )
+            continue
+        kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(look, words)), 3)
+        fits = 0.0 if share is None or share < 0.5 else 1.0
+        ranked.append(((fits, kind, _rank(look), -look.rate_hz), look))
+    if not ranked:
+        return None, said
+    ranked.sort(key=lambda each: (each[0], each[1].topic))
+    chosen = ranked[0][1]
+    others = [look.topic for _, look in ranked[1:]]
+    if others:
+        said.append(f"{chosen.topic} is taken as the reference, not {', '.join(others)}; --gnss-topic names another")
+    return chosen.topic, said
+
+
+def _rank(look: Look) -> float:
+    """Of two forms of one velocity the one with a covariance goes first."""
+    return 0.0 if look.msgtype == TWIST_TYPE else 1.0
+
+
+def choose_imu(survey: Survey, default: str) -> str | None:
+    """The IMU's topic, or None."""
+    standard = _spelled(default, survey.topics)
+    if standard is not None and survey.topics[standard] == IMU_TYPE:
+        return standard
+    looks = [look for look in survey.looks.values() if look.msgtype == IMU_TYPE]
+    if not looks:
+        return None
+
+    def order(look: Look) -> tuple[object, ...]:
+        name = look.topic.lower()
+        return (not look.has_orientation, _has(look, DVL_WORDS), "raw" in name, "filtered" in name, -look.count, name)
+
+    return min(looks, key=order).topic
+
+
+def _spelled(name: str, present: Mapping[str, str]) -> str | None:
+    return next((each for each in (name, f"/{name}", name.lstrip("/")) if each in present), None)
+
+
+def _listing(survey: Survey) -> str:
+    held = ", ".join(f"{name} ({kind})" for name, kind in sorted(survey.topics.items()))
+    return f"The bag has: {held}" if held else "The bag is empty"
+
+
+def wanted_types(role: str) -> Sequence[str]:
+    """Message types that a role's topic may have."""
+    return {"dvl": list(VELOCITY_TYPES), "gnss": list(REFERENCE_TYPES), "imu": [IMU_TYPE]}[role]

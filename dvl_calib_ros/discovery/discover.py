@@ -1,0 +1,402 @@
+"""What a recording says of itself: topics, mounting, lever arm and frames, so that a calibration needs no options.
+
+What the user gives always stands. What is found is said, with its source; nothing is changed silently.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bags.reader import BagReader
+from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
+from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
+from ..calibration.samples import VelocityFrame
+from ..errors import InputError
+from ..messages.decode import EARTH_FRAMES
+from ..messages.drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES
+from ..replay.replay import Topics
+from . import choose
+from .fit import CLEARLY, FITS, Fit, Hypothesis, ImuFrame, best_rotation, fit, nominal_rpy, together
+from .survey import Look, Survey, survey
+from .transforms import FrameTree, Placed
+
+# A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
+OTHER_MOUNTING = math.radians(12.0)
+# An accelerometer at rest shows gravity upwards; one that shows so much downwards (m/s²) is turned over.
+GRAVITY_SHOWS = 5.0
+# Of a vehicle that goes ahead, the mean velocity has at least this share of the speed.
+STRAIGHT_SHARE = 0.7
+# Reference frames, in the order in which they are taken for one that the data cannot tell.
+USUAL = (VelocityFrame.ENU, VelocityFrame.BODY, VelocityFrame.NED)
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user named, which is not looked for: topics (None: not named) and names of parameters."""
+
+    dvl_topic: str | None = None
+    gnss_topic: str | None = None
+    imu_topic: str | None = None
+    parameters: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What to calibrate with.
+
+    found: what was found and where; doubts: what the user should not overlook; sentences. values: the parameters that
+    were found, which are in `parameters`.
+    """
+
+    topics: Topics
+    parameters: Parameters
+    found: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    values: Mapping[str, Any] = field(default_factory=dict)
+    survey: Survey | None = field(default=None, repr=False)
+
+    def document(self) -> dict[str, Any]:
+        """Plain data, for JSON: topics, what was found, doubts."""
+        topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
+        return {"topics": topics, "found": list(self.found), "doubts": list(self.doubts)}
+
+
+def discover(paths: Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
+    """Look into recordings for what is not given. Raises InputError for named topics that are not there."""
+    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+        seen = survey(bag)
+    where = ", ".join(map(str, paths))
+    if not seen.topics:
+        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
+    return _Search(seen, parameters, given or Given(), where).run()
+
+
+class _Search:
+    """One search; what it finds is collected on the way."""
+
+    def __init__(self, seen: Survey, parameters: Parameters, given: Given, where: str) -> None:
+        self._seen, self._parameters, self._given, self._where = seen, parameters, given, where
+        self._tree = FrameTree.of(seen.transforms, seen.descriptions)
+        self._values: dict[str, Any] = {}
+        self._found: list[str] = []
+        self._doubts: list[str] = list(self._tree.problems)
+
+    def run(self) -> Discovery:
+        topics = self._topics()
+        looks = self._seen.looks
+        dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
+        if dvl is not None:
+            self._frames(dvl, reference, imu)
+        self._found.insert(0, self._topics_said(topics))
+        return Discovery(
+            topics,
+            self._parameters.replace(**self._values),
+            tuple(self._found),
+            tuple(self._doubts),
+            dict(self._values),
+            self._seen,
+        )
+
+    # ------------------------------------------------------------------ topics
+
+    def _topics(self) -> Topics:
+        given, default = self._given, Topics()
+        dvl = self._named("dvl", given.dvl_topic) or choose.choose_dvl(self._seen, default.dvl, self._where)
+        gnss, imu = default.gnss, default.imu
+        if given.gnss_topic is None:
+            chosen, said = choose.choose_reference(self._seen, default.gnss, dvl, _difference)
+            gnss = chosen or default.gnss
+            self._doubts += said
+        elif given.gnss_topic != choose.NONE:
+            gnss = self._named("gnss", given.gnss_topic) or gnss
+        else:
+            gnss = choose.NONE
+        if given.imu_topic is None:
+            imu = choose.choose_imu(self._seen, default.imu) or default.imu
+        else:
+            imu = choose.NONE if given.imu_topic == choose.NONE else self._named("imu", given.imu_topic) or imu
+        return Topics(dvl, gnss, imu)
+
+    def _named(self, role: str, name: str | None) -> str | None:
+        if name is None:
+            return None
+        return choose.checked_topic(f"--{role}-topic", name, choose.wanted_types(role), self._seen, self._where)
+
+    def _topics_said(self, topics: Topics) -> str:
+        parts = []
+        for role, name in (("DVL", topics.dvl), ("reference", topics.gnss), ("IMU", topics.imu)):
+            kind = self._seen.topics.get(name)
+            if kind is None:
+                parts.append(f"no {role}")
+                continue
+            look = self._seen.looks.get(name)
+            rate = "" if look is None else f", {look.rate_hz:.3g} Hz"
+            frame = ""
+            if role == "reference" and look is not None:
+                chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
+                declared = self._declared_reference(look)
+                shown = chosen if chosen != FROM_FRAME_ID else "" if declared is None else declared.value
+                frame = f", {shown}" if shown else ""
+            parts.append(f"{role} {name} ({kind.split('/')[-1]}{frame}{rate})")
+        return "; ".join(parts)
+
+    # ------------------------------------------------------------------ frames
+
+    def _gives(self, name: str) -> bool:
+        return name in self._given.parameters
+
+    def _frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
+        placed = self._place_dvl(dvl)
+        known = self._parameters.rotation_dvl_from_body.T if self._gives("mounting_rpy") else None
+        if known is None and placed is not None:
+            known = placed.rotation
+        turned = self._declared_turned(dvl, placed)
+        imu_frames = self._imu_frames(imu)
+        chosen = None
+        if reference is not None:
+            chosen = self._fit(dvl, reference, imu, known, turned, imu_frames, placed)
+        elif known is None:
+            self._mounting_from_motion(dvl, turned)
+        if chosen is not None:
+            turned = chosen.hypothesis.turned
+            self._take(chosen, known, imu_frames, reference)
+        elif imu_frames and imu is not None:
+            self._take_imu(imu_frames[0], imu)
+        if self._parameters.dvl_axes == FROM_MESSAGE and turned != self._turned_by_message(dvl):
+            self._values["dvl_axes"] = FRD if turned else FLU
+            which = "forward-right-down" if turned else "as they come, the axes that the transform has"
+            self._found.append(f"the DVL's data are taken {which} (dvl_axes {self._values['dvl_axes']})")
+        if known is not None and not self._gives("mounting_rpy"):
+            self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
+        if placed is not None and placed.source:
+            self._place_lever_arm(placed, reference)
+        elif reference is not None and not self._gives("lever_arm"):
+            self._found.append(
+                f"lever arm {_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} says where the "
+                "DVL sits; half a metre turns the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
+            )
+
+    def _place_dvl(self, dvl: Look) -> Placed | None:
+        base_frame = self._parameters.base_frame
+        frame = self._parameters.dvl_frame or dvl.frame_id
+        if self._is_body_or_earth(dvl.frame_id) and not self._parameters.dvl_frame:
+            self._values["dvl_frame"] = dvl.frame_id
+            self._doubts.append(
+                f"{dvl.topic}: the DVL's messages carry frame {dvl.frame_id!r} and not one of its own; they are taken "
+                "as they are"
+            )
+        placed = self._tree.placed(frame, base_frame)
+        if placed is None and not self._is_body_or_earth(frame):
+            like = self._tree.likely(choose.DVL_WORDS)
+            placed = None if like is None else self._tree.placed(like, base_frame)
+            if placed is not None:
+                self._doubts.append(
+                    f"no transform has the DVL's frame {frame!r}; that of {placed.frame!r} is taken for it"
+                )
+        if placed is not None and placed.base != base_frame.strip("/") and not self._gives("base_frame"):
+            self._values["base_frame"] = placed.base
+        return placed
+
+    def _is_body_or_earth(self, frame_id: str) -> bool:
+        name = frame_id.strip("/")
+        return name == self._parameters.base_frame.strip("/") or name.lower() in EARTH_FRAMES
+
+    def _turned_by_message(self, dvl: Look) -> bool:
+        """Whether the calibration turns the DVL's data if nobody tells it: by the frame's name, else by the type."""
+        suffix = dvl.frame_id.lower().rpartition("_")[2]
+        return suffix == "frd" or (VELOCITY_TYPES[dvl.msgtype].points_down and suffix != "flu")
+
+    def _declared_turned(self, dvl: Look, placed: Placed | None) -> bool:
+        """Whether the DVL's data are forward-right-down, by parameter, frame, transform and type."""
+        if self._parameters.dvl_axes != FROM_MESSAGE:
+            return self._parameters.dvl_axes == FRD
+        if dvl.frame_id.lower().endswith(("_frd", "_flu")):
+            return self._turned_by_message(dvl)
+        # a frame whose z points down, as the sensor's own does, is that of the driver's axes and not REP-103's
+        driver_axes = placed is not None and placed.rotation[2, 2] < 0.0 and not self._gives("mounting_rpy")
+        return self._turned_by_message(dvl) and not driver_axes
+
+    def _declared_reference(self, reference: Look) -> VelocityFrame | None:
+        if self._parameters.gnss_frame != FROM_FRAME_ID:
+            return VelocityFrame(self._parameters.gnss_frame)
+        name = reference.frame_id.strip("/")
+        base = self._values.get("base_frame", self._parameters.base_frame).strip("/")
+        if name in (base, self._parameters.base_frame.strip("/")):
+            return VelocityFrame.BODY
+        return EARTH_FRAMES.get(name.lower())
+
+    def _imu_frames(self, imu: Look | None) -> list[ImuFrame]:
+        """How the IMU's data may be meant, the likeliest first."""
+        if imu is None:
+            return []
+        if self._gives("imu_rpy") or self._gives("imu_frame"):
+            rotation = rotation_from_rpy(self._parameters.imu_rpy)
+            return [ImuFrame(rotation, self._parameters.imu_frame, "as given")]
+        placed = self._tree.placed(imu.frame_id, self._parameters.base_frame)
+        at = np.eye(3) if placed is None else placed.rotation
+        says = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
+        upright = ImuFrame(at, "enu", says)
+        marine = ImuFrame(at @ FLU_FROM_FRD, "ned", f"forward-right-down in NED, {says}")
+        frames = [upright, marine, ImuFrame(at, "ned", f"in NED, {says}")]
+        if placed is not None and not np.allclose(at, np.eye(3)):
+            frames.append(ImuFrame(np.eye(3), "enu", "as the body, whatever its transform says"))
+        acceleration = imu.values[np.isfinite(imu.values[:, 7:]).all(axis=1), 7:]
+        if not len(acceleration):
+            return frames
+        up = [float((each.rotation_body_from_imu @ acceleration.mean(axis=0))[2]) for each in frames]
+        return [each for each, height in zip(frames, up, strict=True) if height > -GRAVITY_SHOWS]
+
+    def _fit(
+        self,
+        dvl: Look,
+        reference: Look,
+        imu: Look | None,
+        known: Array | None,
+        turned: bool,
+        imu_frames: Sequence[ImuFrame],
+        placed: Placed | None,
+    ) -> Fit | None:
+        data = together(dvl, reference, imu)
+        if data is None:
+            return None
+        declared = self._declared_reference(reference)
+        fixed = self._parameters.gnss_frame != FROM_FRAME_ID
+        references = [declared] if fixed and declared is not None else list(USUAL)
+        said = self._parameters.dvl_axes != FROM_MESSAGE or dvl.frame_id.lower().endswith(("_frd", "_flu"))
+        turns = [turned] if said else [turned, not turned]
+        imus: list[ImuFrame | None] = [*imu_frames] or [None]
+        hypotheses = [Hypothesis(frame, each, turn) for frame in references for each in imus for turn in turns]
+        position = None if placed is None else placed.position - self._reference_position(reference)
+        fits = fit(data, hypotheses, None if known is None else known.T, position)
+        if not fits:
+            return None
+        wanted = Hypothesis(declared or USUAL[0], imu_frames[0] if imu_frames else None, turned)
+        return _decided(fits, wanted, declared is not None)
+
+    def _take(self, chosen: Fit, known: Array | None, imu_frames: Sequence[ImuFrame], reference: Look | None) -> None:
+        """Write what a fit says into the parameters."""
+        hypothesis, parameters = chosen.hypothesis, self._parameters
+        assert reference is not None
+        declared = self._declared_reference(reference)
+        if hypothesis.reference is not declared:
+            self._values["gnss_frame"] = hypothesis.reference.value
+            name = hypothesis.reference.value
+            if declared is None:
+                self._found.append(
+                    f"reference in {name}, which fits best: its frame {reference.frame_id!r} does not say (-p "
+                    f"gnss_frame:={name})"
+                )
+            else:
+                self._doubts.append(
+                    f"{reference.topic}: frame {reference.frame_id!r} says {declared.value}, but DVL and reference "
+                    f"agree only as {name}; taken so. To insist: -p gnss_frame:={declared.value}"
+                )
+        elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
+            self._values["gnss_frame"] = declared.value
+        if hypothesis.imu is not None and imu_frames:
+            self._take_imu(hypothesis.imu, None if hypothesis.imu is imu_frames[0] else reference)
+        found = chosen.rotation_dvl_from_body.T
+        if known is None:
+            if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
+                self._mounting_found(nominal_rpy(found), "where DVL and reference agree best")
+        elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
+            self._doubts.append(
+                f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "
+                f"{_degrees(nominal_rpy(found))}: try -p mounting_rpy:={_option(nominal_rpy(found))}"
+            )
+
+    def _take_imu(self, frame: ImuFrame, seen: Look | None) -> None:
+        if self._gives("imu_rpy") or self._gives("imu_frame"):
+            return
+        rpy = tuple((rpy_from_rotation(frame.rotation_body_from_imu) + 0.0).tolist())
+        if np.allclose(rpy, 0.0, atol=1e-9) and frame.world == "enu":
+            return
+        self._values |= {"imu_rpy": rpy, "imu_frame": frame.world}
+        self._found.append(f"the IMU's data are taken {frame.says}: imu_rpy {_degrees(rpy)}, imu_frame {frame.world}")
+
+    def _mounting_found(self, rpy: tuple[float, float, float], why: str) -> None:
+        if not any(rpy):
+            return
+        self._values["mounting_rpy"] = rpy
+        self._found.append(
+            f"mounting {_degrees(rpy)}, {why}: nothing in the bag says how the DVL is mounted (-p "
+            f"mounting_rpy:={_option(rpy)})"
+        )
+
+    def _mounting_from_motion(self, dvl: Look, turned: bool) -> None:
+        """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well."""
+        velocity = dvl.values @ FLU_FROM_FRD if turned else dvl.values
+        if not len(velocity):
+            return
+        mean = velocity.mean(axis=0)
+        if np.linalg.norm(mean) < STRAIGHT_SHARE * dvl.speed or dvl.speed < choose.MOVES_FROM:
+            return
+        ahead = np.tile([np.linalg.norm(mean), 0.0, 0.0], (2, 1))
+        rotation_dvl_from_body = best_rotation(np.tile(mean, (2, 1)), ahead, np.eye(3))
+        yaw = math.atan2(rotation_dvl_from_body[0, 1], rotation_dvl_from_body[0, 0])
+        if abs(yaw) > OTHER_MOUNTING:
+            self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "where the vehicle goes ahead")
+
+    def _reference_position(self, reference: Look) -> Array:
+        """Where in the body the point is whose velocity the reference is."""
+        placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
+        return np.zeros(3) if placed is None else placed.position
+
+    def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
+        given_mounting = self._gives("mounting_rpy")
+        said = [] if given_mounting else [f"mounting {_degrees(rpy_from_rotation(placed.rotation))}"]
+        if not self._gives("lever_arm"):
+            position = placed.position
+            if reference is not None:
+                position = position - self._reference_position(reference)
+            if np.abs(position).max() <= 100.0:  # the parameter's range; more is a transform in another unit
+                self._values["lever_arm"] = tuple((position + 0.0).tolist())
+                said.append(f"lever arm {_metres(position)} m")
+        if said:
+            self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
+
+
+def _decided(fits: Sequence[Fit], wanted: Hypothesis, declared: bool) -> Fit | None:
+    """The fit of what is declared, unless another reading of the data fits clearly better.
+
+    None if what is declared cannot be tried, for want of an attitude: then it stands.
+
+    declared: the recording says the reference's frame; else the usual order decides between frames that fit alike.
+    """
+    best = fits[0]
+    own = [each for each in fits if each.hypothesis == wanted]
+    if declared and not own:
+        return None
+    if own and not (best.left < CLEARLY * own[0].left and best.left < FITS):
+        return own[0]
+    if declared or best.left >= FITS:
+        return best
+    alike = [each for each in fits if CLEARLY * each.left <= best.left]
+    return min(alike, key=lambda each: (USUAL.index(each.hypothesis.reference), fits.index(each)))
+
+
+def _difference(dvl: Look, reference: Look) -> float | None:
+    """What no rotation explains of the difference of two velocities, both taken as in the body."""
+    data = together(dvl, reference, None)
+    if data is None:
+        return None
+    fits = fit(data, [Hypothesis(VelocityFrame.BODY, None, False)], None)
+    return fits[0].best_left if fits else None
+
+
+def _degrees(rpy: Iterable[float]) -> str:
+    return " ".join(f"{round(math.degrees(angle), 2) + 0.0:g}°" for angle in rpy)
+
+
+def _metres(position: Iterable[float]) -> str:
+    return " ".join(f"{value + 0.0:.3g}" for value in position)
+
+
+def _option(rpy: Iterable[float]) -> str:
+    return "[" + ",".join(f"{math.degrees(angle):.4g}deg" for angle in rpy) + "]"

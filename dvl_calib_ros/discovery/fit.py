@@ -1,0 +1,174 @@
+"""Which frames a recording's velocities and attitudes are in: the hypothesis under which DVL and reference agree best.
+
+For every hypothesis (reference in the body, ENU or NED; IMU as its transform says or as marine instruments give it;
+DVL forward-left-up or forward-right-down) the reference is turned into the body and compared with the DVL. Where the
+mounting is known, by what is left of the difference; where it is not, by what is left after the best rotation (Wahba's
+problem, solved by singular values).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_quaternion, rpy_from_rotation
+from ..calibration.samples import VelocityFrame
+from .survey import Look, comparable
+
+# Fewer samples, or a slower vehicle (m/s), say nothing about frames.
+ENOUGH_SAMPLES, SLOW = 12, 0.1
+# Weight of "as it is" in the rotation's fit, as a share of the mean squared speed: it decides the turns that the motion
+# does not show (roll of a vehicle that only goes ahead), and moves one that is shown by less than 0.1 degrees.
+AS_IT_IS = 1e-3
+# The worst tenth of the samples (outliers, lags in turns) does not take part.
+KEPT_SHARE = 0.9
+# What is declared is doubted if another hypothesis leaves less than this share of the difference ...
+CLEARLY = 0.5
+# ... and fits in itself: what it leaves is below this share of the speed (17 degrees of misalignment).
+FITS = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class ImuFrame:
+    """How an IMU's data may be meant. rotation_body_from_imu (3, 3); world: "enu" or "ned"."""
+
+    rotation_body_from_imu: Array
+    world: str
+    says: str
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One reading of the data. turned: the DVL's data are forward-right-down."""
+
+    reference: VelocityFrame
+    imu: ImuFrame | None
+    turned: bool
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well one reading of the data fits.
+
+    left: root mean square of what is left of the difference of DVL and reference, as a share of the speed, at the
+    mounting that is given or, without one, at the best. rotation_dvl_from_body: (3, 3) the best; best_left: what that
+    leaves.
+    """
+
+    hypothesis: Hypothesis
+    left: float
+    rotation_dvl_from_body: Array
+    best_left: float
+
+    @property
+    def angle(self) -> float:
+        """Angle of the best rotation, rad."""
+        return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(self.rotation_dvl_from_body)) - 1.0))))
+
+
+@dataclass(frozen=True)
+class Together:
+    """DVL and reference at the same times, N of them, as their messages have them.
+
+    dvl, reference: (N, 3) m/s. orientation: (N, 4), rates: (N, 3) rad/s, as the IMU has them, or None.
+    """
+
+    dvl: Array
+    reference: Array
+    orientation: Array | None
+    rates: Array | None
+
+
+def together(dvl: Look, reference: Look, imu: Look | None) -> Together | None:
+    """Put the looks side by side at the DVL's times; None if they have too little in common."""
+    velocity, near = comparable(reference, dvl.stamps_s)
+    orientation = rates = None
+    if imu is not None:
+        columns, imu_near = comparable(imu, dvl.stamps_s)
+        if imu.has_orientation:
+            near = near & imu_near & np.isfinite(columns[:, :4]).all(axis=1)
+            orientation, rates = columns[:, :4], columns[:, 4:7]
+    speed = np.linalg.norm(dvl.values, axis=1)
+    near = near & (speed > SLOW)
+    if np.count_nonzero(near) < ENOUGH_SAMPLES:
+        return None
+    return Together(
+        dvl.values[near],
+        velocity[near],
+        None if orientation is None else orientation[near],
+        None if rates is None else rates[near],
+    )
+
+
+def body_velocity(data: Together, hypothesis: Hypothesis) -> Array | None:
+    """The reference (N, 3) m/s in the body, under a hypothesis; None if that needs an attitude that is not there."""
+    if hypothesis.reference is VelocityFrame.BODY:
+        return data.reference
+    if data.orientation is None or hypothesis.imu is None:
+        return None
+    enu = data.reference @ ENU_FROM_NED.T if hypothesis.reference is VelocityFrame.NED else data.reference
+    world_from_imu = rotation_from_quaternion(data.orientation)
+    if hypothesis.imu.world == "ned":
+        world_from_imu = ENU_FROM_NED @ world_from_imu
+    imu = np.einsum("nij,ni->nj", world_from_imu, enu)
+    return imu @ hypothesis.imu.rotation_body_from_imu.T
+
+
+def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
+    """The rotation M (3, 3) that minimises mean |a - M b|² + AS_IT_IS |b|² |M - as_it_is|²; a, b: (N, 3)."""
+    square = float((b**2).sum(axis=1).mean())
+    u, _, vt = np.linalg.svd(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    return u @ np.diag([1.0, 1.0, sign]) @ vt
+
+
+def _rms(difference: Array) -> float:
+    """Root mean square over the better samples."""
+    squares = np.sort((difference**2).sum(axis=1))
+    return float(np.sqrt(squares[: max(1, int(KEPT_SHARE * len(squares)))].mean()))
+
+
+def fit(
+    data: Together,
+    hypotheses: Sequence[Hypothesis],
+    rotation_dvl_from_body: Array | None,
+    position: Array | None = None,
+) -> list[Fit]:
+    """All hypotheses that can be tried, the best first.
+
+    rotation_dvl_from_body: the mounting (3, 3), None if it is not known. position: (3,) m of the DVL in the body, from
+    the point whose velocity the reference is.
+    """
+    fits = []
+    for hypothesis in hypotheses:
+        body = body_velocity(data, hypothesis)
+        if body is None:
+            continue
+        if position is not None and data.rates is not None and hypothesis.imu is not None:
+            rates = data.rates @ hypothesis.imu.rotation_body_from_imu.T
+            body = body + np.where(np.isfinite(rates), np.cross(rates, position), 0.0)
+        dvl = data.dvl @ FLU_FROM_FRD if hypothesis.turned else data.dvl
+        speed = _rms(dvl)
+        known = rotation_dvl_from_body
+        best = best_rotation(dvl, body, np.eye(3) if known is None else known)
+        # a second time without the worst
+        errors = ((dvl - body @ best.T) ** 2).sum(axis=1)
+        kept = errors <= np.quantile(errors, KEPT_SHARE)
+        best = best_rotation(dvl[kept], body[kept], np.eye(3) if known is None else known)
+        best_left = _rms(dvl - body @ best.T) / speed
+        left = best_left if known is None else _rms(dvl - body @ known.T) / speed
+        fits.append(Fit(hypothesis, left, best, best_left))
+    # of two that fit alike the one that asks for the smaller turn
+    return sorted(fits, key=lambda each: each.left + (0.0 if rotation_dvl_from_body is not None else 0.02 * each.angle))
+
+
+def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
+    """The mounting that somebody may have meant (rad): whole 45 degrees where the data is close, else whole degrees."""
+    rpy = np.degrees(rpy_from_rotation(rotation_body_from_dvl))
+    near = 45.0 * np.round(rpy / 45.0)
+    meant = np.where(np.abs(rpy - near) < 8.0, near, np.round(rpy))
+    roll, pitch, yaw = np.radians(meant + 0.0).tolist()
+    return roll, pitch, yaw

@@ -1,0 +1,191 @@
+"""A first look at recordings: which topics could be what, and some messages of each as columns.
+
+Messages are taken in bursts spread over the recording, so that a look at hours costs no more than one at minutes, and
+yet the streams have samples at the same times, which can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..bags.reader import BagReader
+from ..calibration.frames import Array
+from ..calibration.samples import Mask
+from ..messages.decode import stamp_ns
+from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
+
+# Bursts: so many over the recording, each so long, of each topic at most so often. 60 bursts of 2 s show turns and
+# straights; 10 Hz is what a DVL gives at most.
+BURSTS, BURST_NS, BURST_EVERY_NS = 60, 2_000_000_000, 95_000_000
+TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
+# Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
+MOST_STATIC = 200
+MOVING_TYPES = frozenset({*VELOCITY_TYPES, IMU_TYPE})
+
+
+@dataclass(frozen=True)
+class Look:
+    """Some messages of one topic, N of them.
+
+    count: messages in the recording. rate_hz: over the whole of it. frame_id: of the velocity or of the IMU's data, the
+    first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the log where it is zero.
+    values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and
+    acceleration m/s², nan where not given.
+    """
+
+    topic: str
+    msgtype: str
+    count: int
+    rate_hz: float
+    frame_id: str
+    stamps_s: Array
+    values: Array
+
+    @property
+    def speed(self) -> float:
+        """Root mean square of the velocity, m/s; 0 without samples."""
+        return float(np.sqrt((self.values**2).sum(axis=1).mean())) if len(self.values) else 0.0
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether an IMU gives an orientation: most quaternions are of unit length, and they are not all the same."""
+        q = self.values[:, :4]
+        if len(q) < 2 or np.isnan(q).any(axis=1).mean() > 0.5:
+            return False
+        given = q[~np.isnan(q).any(axis=1)]
+        unit = np.abs(np.linalg.norm(given, axis=1) - 1.0) < 0.01
+        return bool(unit.mean() > 0.5 and np.ptp(given, axis=0).max() > 0.0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was seen. looks: by topic. transforms: messages of tf_static; descriptions: of robot_description."""
+
+    topics: Mapping[str, str]
+    counts: Mapping[str, int]
+    looks: Mapping[str, Look]
+    transforms: tuple[Any, ...]
+    descriptions: tuple[str, ...]
+
+
+def survey(bag: BagReader) -> Survey:
+    """Look at recordings that are open."""
+    types, counts = bag.topics, bag.message_counts
+    moving = {topic for topic, kind in types.items() if kind in MOVING_TYPES}
+    static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
+    start_ns, end_ns = bag.span_ns if types else (0, 0)
+    seconds = max(1e-9 * (end_ns - start_ns), 1e-9)
+    taken: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in moving}
+    transforms: list[Any] = []
+    descriptions: list[str] = []
+    wanted = _Bursts(start_ns, end_ns, static)
+    for topic, log_ns, message, _ in bag.messages(moving | static, wanted):
+        if message is None:
+            continue
+        if topic in moving:
+            taken[topic].append((log_ns, message))
+        elif types[topic] == TF_TYPE:
+            transforms += list(message.transforms)
+        else:
+            descriptions.append(message.data)
+    looks = {}
+    for topic, messages in taken.items():
+        look = _look(topic, types[topic], counts[topic], counts[topic] / seconds, start_ns, messages)
+        if look is not None:
+            looks[topic] = look
+    return Survey(types, counts, looks, tuple(transforms), tuple(dict.fromkeys(descriptions)))
+
+
+def _is_static(topic: str, kind: str) -> bool:
+    name = topic.rsplit("/", 1)[-1]
+    return (kind == TF_TYPE and name == "tf_static") or (kind == STRING_TYPE and name == "robot_description")
+
+
+class _Bursts:
+    """Whether a message is one to look at."""
+
+    def __init__(self, start_ns: int, end_ns: int, static: set[str]) -> None:
+        self._start_ns = start_ns
+        self._period_ns = max((end_ns - start_ns) // BURSTS, BURST_NS)
+        self._static = dict.fromkeys(static, 0)
+        self._next_ns: dict[str, int] = {}
+
+    def __call__(self, topic: str, log_ns: int) -> bool:
+        if topic in self._static:
+            self._static[topic] += 1
+            return self._static[topic] <= MOST_STATIC
+        if (log_ns - self._start_ns) % self._period_ns >= BURST_NS or log_ns < self._next_ns.get(topic, 0):
+            return False
+        self._next_ns[topic] = log_ns + BURST_EVERY_NS
+        return True
+
+
+def _look(
+    topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, messages: list[tuple[int, Any]]
+) -> Look | None:
+    """None for a topic whose messages cannot be read."""
+    read = _imu_row if msgtype == IMU_TYPE else _velocity_row(msgtype)
+    rows, stamps, frame_id = [], [], ""
+    for log_ns, message in messages:
+        try:
+            rows.append(read(message))
+            stamps.append(1e-9 * ((stamp_ns(message.header.stamp) or log_ns) - start_ns))
+            frame_id = frame_id or _frame_id(msgtype, message)
+        except (AttributeError, TypeError, ValueError, IndexError):
+            continue
+    if not rows:
+        return None
+    values = np.array(rows, dtype=float)
+    whole = np.isfinite(values).all(axis=1) if msgtype != IMU_TYPE else np.ones(len(values), dtype=bool)
+    order = np.argsort(np.array(stamps)[whole], kind="stable")
+    return Look(topic, msgtype, count, rate_hz, frame_id, np.array(stamps)[whole][order], values[whole][order])
+
+
+def _frame_id(msgtype: str, message: Any) -> str:
+    kind = VELOCITY_TYPES.get(msgtype)
+    return str(message.header.frame_id if kind is None else kind.frame_id(message))
+
+
+def _velocity_row(msgtype: str) -> Callable[[Any], list[float]]:
+    velocity = VELOCITY_TYPES[msgtype].velocity
+
+    def row(message: Any) -> list[float]:
+        v = velocity(message)
+        if v.x == v.y == v.z == 0.0:  # what drivers send for want of a measurement
+            return [np.nan] * 3
+        return [v.x, v.y, v.z]
+
+    return row
+
+
+def _imu_row(message: Any) -> list[float]:
+    nothing = [np.nan] * 4
+    q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
+    return [
+        *(nothing if message.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w)),
+        *(nothing[:3] if message.angular_velocity_covariance[0] == -1.0 else (w.x, w.y, w.z)),
+        *(nothing[:3] if message.linear_acceleration_covariance[0] == -1.0 else (a.x, a.y, a.z)),
+    ]
+
+
+def comparable(a: Look, at_s: Array, longest_gap_s: float = 1.5) -> tuple[Array, Mask]:
+    """Columns of a look at other times: (M, k) and whether they lie between two samples that are close (M,)."""
+    n = len(a.stamps_s)
+    if n < 2:
+        return np.full((len(at_s), a.values.shape[1]), np.nan), np.zeros(len(at_s), dtype=bool)
+    after = np.clip(np.searchsorted(a.stamps_s, at_s), 1, n - 1)
+    t0, t1 = a.stamps_s[after - 1], a.stamps_s[after]
+    near = (t1 - t0 <= longest_gap_s) & (at_s >= t0) & (at_s <= t1) & (t1 > t0)
+    share = np.divide(at_s - t0, t1 - t0, out=np.zeros(len(at_s)), where=t1 > t0)[:, None]
+    before, later = a.values[after - 1], a.values[after].copy()
+    if a.msgtype == IMU_TYPE:  # the shorter way round; samples are close, so that a straight line will do
+        other_way = (before[:, :4] * later[:, :4]).sum(axis=1) < 0.0
+        later[other_way, :4] *= -1.0
+    values = before + share * (later - before)
+    if a.msgtype == IMU_TYPE:
+        values[:, :4] /= np.linalg.norm(values[:, :4], axis=1, keepdims=True)
+    return values, near

@@ -1,0 +1,126 @@
+"""Where the sensors sit, from what a recording has of it: /tf_static, else the fixed joints of /robot_description."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.frames import Array, rotation_from_quaternion, rotation_from_rpy
+from ..errors import InputError
+from ..files.urdf import parse_urdf
+
+# Frames above the vehicle, which are no place to mount a sensor on.
+EARTH_NAMES = ("map", "odom", "world", "earth", "enu", "ned", "utm")
+# A chain of more transforms than this is a circle.
+LONGEST_CHAIN = 100
+
+
+class Placed(NamedTuple):
+    """A frame in another. rotation: (3, 3) ``rotation_base_from_frame``. position: (3,) m, in the base."""
+
+    base: str
+    frame: str
+    rotation: Array
+    position: Array
+    source: str
+
+
+@dataclass
+class FrameTree:
+    """Fixed transforms, by child. Names without a leading slash."""
+
+    _parents: dict[str, tuple[str, Array, Array, str]] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def of(transforms: Iterable[Any], descriptions: Iterable[str]) -> FrameTree:
+        """From messages (geometry_msgs/TransformStamped) and texts of URDFs; a transform of the former goes first."""
+        tree = FrameTree()
+        for text in descriptions:
+            tree._add_urdf(text)
+        for each in transforms:
+            t, q = each.transform.translation, each.transform.rotation
+            quaternion = np.array([q.x, q.y, q.z, q.w])
+            length = float(np.linalg.norm(quaternion))
+            if not 0.5 < length < 2.0 or not np.isfinite([t.x, t.y, t.z]).all():
+                tree.problems.append(
+                    f"/tf_static: the transform of {each.child_frame_id!r} is not a rotation; not used"
+                )
+                continue
+            rotation = rotation_from_quaternion(quaternion / length)
+            parent, child = _plain(each.header.frame_id), _plain(each.child_frame_id)
+            tree._parents[child] = (parent, rotation, np.array([t.x, t.y, t.z]), "/tf_static")
+        return tree
+
+    def _add_urdf(self, text: str) -> None:
+        try:
+            joints = parse_urdf(Path("/robot_description"), text.encode()).joints
+        except InputError as error:
+            self.problems.append(f"{error}; not used")
+            return
+        for joint in joints:
+            if joint.kind == "fixed":
+                rotation, position = rotation_from_rpy(joint.rpy), np.array(joint.xyz)
+                self._parents[_plain(joint.child)] = (_plain(joint.parent), rotation, position, "/robot_description")
+
+    @property
+    def frames(self) -> set[str]:
+        """All frames that have a parent."""
+        return set(self._parents)
+
+    def named(self, frame_id: str) -> str | None:
+        """The frame as the tree spells it: with or without a namespace before the link's name; None if unknown."""
+        name = _plain(frame_id)
+        known = {*self._parents, *(parent for parent, *_ in self._parents.values())}
+        if name in known:
+            return name
+        last = name.rsplit("/", 1)[-1]
+        same = [each for each in known if last and each.rsplit("/", 1)[-1] == last]
+        return same[0] if len(same) == 1 else None
+
+    def base(self, frame: str, wanted: str) -> str | None:
+        """The body above a frame: `wanted`, with any namespace; else the highest that is no earth frame."""
+        name = frame
+        above: list[str] = []
+        while name in self._parents and len(above) < LONGEST_CHAIN:
+            name = self._parents[name][0]
+            above.append(name)
+        last = _plain(wanted).rsplit("/", 1)[-1]
+        for each in above:
+            if each.rsplit("/", 1)[-1] == last:
+                return each
+        vehicle = [each for each in above if each.rsplit("/", 1)[-1].lower() not in EARTH_NAMES]
+        return vehicle[-1] if vehicle else None
+
+    def placed(self, frame_id: str, base_frame: str) -> Placed | None:
+        """Where a frame sits in the body; None if the transforms do not lead from one to the other."""
+        frame = self.named(frame_id)
+        if frame is None:
+            return None
+        base = self.base(frame, base_frame)
+        if base is None:
+            return Placed(frame, frame, np.eye(3), np.zeros(3), "") if _same(frame, base_frame) else None
+        rotation, position, sources = np.eye(3), np.zeros(3), []
+        name = frame
+        while name != base:
+            name, above, offset, source = self._parents[name]
+            rotation, position = above @ rotation, above @ position + offset
+            sources.append(source)
+        return Placed(base, frame, rotation, position, " and ".join(dict.fromkeys(sources)))
+
+    def likely(self, words: Iterable[str]) -> str | None:
+        """The one frame whose name holds one of these words, for a frame_id that the tree does not have."""
+        found = [frame for frame in sorted(self._parents) if any(word in frame.lower() for word in words)]
+        return found[0] if len(found) == 1 else None
+
+
+def _plain(frame_id: str) -> str:
+    return frame_id.strip("/")
+
+
+def _same(frame: str, base: str) -> bool:
+    return frame.rsplit("/", 1)[-1] == _plain(base).rsplit("/", 1)[-1]
