@@ -58,7 +58,7 @@ def watch(folder: Path) -> None:
     from dvl_calib_ros.calibration.calibrator import Calibrator
     from dvl_calib_ros.calibration.parameters import Parameters
     from dvl_calib_ros.cli.live_view import rendered
-    from dvl_calib_ros.messages.decode import MessageFeed
+    from dvl_calib_ros.messages.feed import MessageFeed
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
     from dvl_calib_ros.node.status import Status
 
@@ -72,7 +72,7 @@ def watch(folder: Path) -> None:
             if log_ns - first_ns > 250e9:
                 break
             handlers[topic](message, log_ns)
-    found = diagnose(calibrator, feed.dvl_type, [], Silence(0.0), RecentCounts(), 0.0)
+    found = diagnose(calibrator, feed.decoder.dvl_type, [], Silence(0.0), RecentCounts(), 0.0)
     values = {item.key: item.value for item in found.values}
     shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
     terminal(shown, folder, "watch", "dvl-calib run --watch", 100, 318)

@@ -33,7 +33,7 @@ def work(bag):
         for connection, _, data in reader.messages():
             reader.deserialize(data, connection.msgtype)
 """
-_MEASURE = """
+_MEASURE = r"""
 import json, re, sys, time
 started = time.process_time()
 work(sys.argv[1])

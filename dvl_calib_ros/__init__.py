@@ -1,3 +1,20 @@
 """Calibrate a Doppler velocity log before a dive: live on ROS 2 Jazzy and over recorded bags."""
 
-__version__ = "0.1.0"
+import sys as _sys
+from pathlib import Path as _Path
+
+
+def _version() -> str:
+    """The version that package.xml says: of the source tree, else as installed under share/."""
+    for folder in (_Path(__file__).resolve().parents[1], _Path(_sys.prefix, "share", "dvl_calib_ros")):
+        package = folder / "package.xml"
+        if package.is_file():
+            head, _, rest = package.read_text(encoding="utf-8").partition("<version>")
+            if "<name>dvl_calib_ros</name>" in head:
+                return rest.partition("</version>")[0]
+    from importlib.metadata import version  # 20 ms, which the command line would feel
+
+    return version("dvl_calib_ros")
+
+
+__version__ = _version()

@@ -22,7 +22,8 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.files.yaml_files import load_yaml
-from dvl_calib_ros.messages.decode import MessageFeed, stamp_ns
+from dvl_calib_ros.messages.decode import stamp_ns
+from dvl_calib_ros.messages.feed import MessageFeed
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FRAMES = {VelocityFrame.BODY: "base_link", VelocityFrame.ENU: "map", VelocityFrame.NED: "ned"}

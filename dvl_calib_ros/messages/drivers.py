@@ -7,7 +7,7 @@ dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.water
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
@@ -24,17 +24,19 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 BOTTOM_TRACK, WATER_TRACK = 1, 2
 # a velocity in three axes takes as many beams
 ENOUGH_BEAMS = 3
+_LARGEST = sys.float_info.max
 
 
 class Rule(NamedTuple):
     """When a message's velocity is not to be believed, however plausible it looks.
 
-    counter: under which such messages are counted. says: what is wrong with them, in words. remedy: what to do.
+    counter: under which such messages are counted. says: what is wrong with them, in words. broken: by a message, or by
+    each of many as columns, so it is written with operators for both. remedy: what to do.
     """
 
     counter: str
     says: str
-    broken: Callable[[Any, Parameters], bool]
+    broken: Callable[[Any, Parameters], Any]
     remedy: str
 
     @property
@@ -48,7 +50,9 @@ class VelocityType:
     """One message type.
 
     velocity: message -> something with x, y, z, m/s. covariance: message -> of that velocity, row-major, 9 numbers or
-    36 of a twist, (m/s)²; None where it gives none. frame_id: message -> frame of the velocity. points_down: its axes
+    36 of a twist, (m/s)²; None where it gives none. lacks_covariance: message -> whether what is there is none.
+    frame_id: message -> frame of the velocity. is_read_in_columns: whether these are written for columns of messages as
+    well, which takes a type without lists. points_down: its axes
     are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
     is_reference: whether reference velocities come in this type, too. definitions: for bags that embed none, the
     versions of it that are about. install: how to get its package, where ROS does not bring it.
@@ -59,7 +63,9 @@ class VelocityType:
     velocity: Callable[[Any], Any]
     covariance: Callable[[Any], Any]
     covariance_says: str
-    frame_id: Callable[[Any], str] = attrgetter("header.frame_id")
+    lacks_covariance: Callable[[Any], Any] = lambda _: False
+    is_read_in_columns: bool = True
+    frame_id: Callable[[Any], Any] = attrgetter("header.frame_id")
     frame_says: str = "`header.frame_id`"
     points_down: bool = False
     rules: tuple[Rule, ...] = ()
@@ -84,9 +90,9 @@ class VelocityType:
 
 
 def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
-    def broken(message: Any, _: Parameters) -> bool:
+    def broken(message: Any, _: Parameters) -> Any:
         velocity = read(message)
-        return bool(velocity.x == 0.0 and velocity.y == 0.0 and velocity.z == 0.0)
+        return (velocity.x == 0.0) & (velocity.y == 0.0) & (velocity.z == 0.0)
 
     # no sensor measures exactly nothing on three axes, but drivers send it for want of a measurement
     return Rule("zero_velocity", "exactly zero on all three axes", broken, "check bottom lock, and the driver")
@@ -94,7 +100,7 @@ def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
 
 def _flagged(field: str) -> Rule:
     flag = attrgetter(field)
-    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: not flag(message), _CHECK_LOCK)
+    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: flag(message) == 0, _CHECK_LOCK)
 
 
 _CHECK_LOCK = "check that the bottom is in range and nothing is before the beams"
@@ -102,19 +108,19 @@ _CHECK_LOCK = "check that the bottom is in range and nothing is before the beams
 _NO_BOTTOM = Rule(
     "no_bottom",
     "`altitude` is negative or not finite",
-    lambda message, _: not 0.0 <= message.altitude < math.inf,
+    lambda message, _: _is_outside(message.altitude, 0.0, _LARGEST),
     _CHECK_LOCK,
 )
+
+
+def _is_outside(value: Any, least: float, most: float) -> Any:
+    """Whether a value, or each of many, is not within bounds; nan is not."""
+    return (value < least) | (value > most) | (value != value)
 
 
 def _few_beams_listed(message: Any, _: Parameters) -> bool:
     beams = message.beams
     return len(beams) > 0 and sum(1 for beam in beams if beam.valid) < ENOUGH_BEAMS
-
-
-def _marine_covariance(message: Any) -> Any:
-    covariance = message.velocity_covar
-    return None if covariance[0] == -1.0 else covariance
 
 
 def _dvl_msgs_covariance(message: Any) -> Any:
@@ -209,7 +215,8 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             name="marine_acoustic_msgs/msg/Dvl",
             sent_by="Water Linked's driver, others",
             velocity=_VELOCITY,
-            covariance=_marine_covariance,
+            covariance=attrgetter("velocity_covar"),
+            lacks_covariance=lambda message: np.asarray(message.velocity_covar)[..., 0] == -1.0,
             covariance_says="`velocity_covar`; -1 or zero: not given",
             points_down=True,  # the definition: z in the direction the DVL points, x forward
             rules=(
@@ -243,6 +250,7 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             sent_by="dvl-a50 (Water Linked A50, A125)",
             velocity=_VELOCITY,
             covariance=_dvl_msgs_covariance,
+            is_read_in_columns=False,
             covariance_says="`covariance` where the version has it, else `fom`²",
             points_down=True,  # the sensor's axes (docs.waterlinked.com/dvl/axes), handed on as they are
             rules=(
@@ -254,7 +262,7 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
                 Rule(
                     "poor_fom",
                     "`fom` (m/s) above `max_fom`, negative or not finite",
-                    lambda message, parameters: not 0.0 <= message.fom <= parameters.max_fom,
+                    lambda message, parameters: _is_outside(message.fom, 0.0, parameters.max_fom),
                     _CHECK_LOCK,
                 ),
                 _zero_velocity(_VELOCITY),

@@ -38,8 +38,8 @@ from ..files.result_file import (
     result_text,
     save_result,
 )
-from ..messages.decode import MessageFeed
 from ..messages.drivers import velocity_type
+from ..messages.feed import MessageFeed
 from .diagnostics import RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
@@ -199,7 +199,7 @@ class CalibrationNode(Node):
         message = self._estimate
         if calibrator.last_ns is not None:
             _set_stamp(message.header.stamp, calibrator.last_ns)
-        message.header.frame_id = self._feed.dvl_frame or "dvl_link"
+        message.header.frame_id = self._feed.decoder.dvl_frame or "dvl_link"
         linear, angular = message.twist.twist.linear, message.twist.twist.angular
         linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = terms.tolist()
         message.twist.covariance = covariance.ravel()
@@ -226,11 +226,11 @@ class CalibrationNode(Node):
         self._corrected_publisher.publish(message)
 
     def _publish_diagnostics(self) -> None:
-        feed = self._feed
-        problems = [*feed.problems.values(), *self._topic_problems()]
+        decoder = self._feed.decoder
+        problems = [*decoder.problems.values(), *self._topic_problems()]
         if self._save_problem:
             problems.append(self._save_problem)
-        status = diagnose(self._calibrator, feed.dvl_type, problems, self._silence, self._recent, time.monotonic())
+        status = diagnose(self._calibrator, decoder.dvl_type, problems, self._silence, self._recent, time.monotonic())
         status.name = status_name(self.get_fully_qualified_name())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
@@ -249,7 +249,7 @@ class CalibrationNode(Node):
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
-        self._feed.forget()
+        self._feed.decoder.forget()
         self._recent = RecentCounts()
         self._correction = None
         self._publish_estimate()
@@ -283,8 +283,8 @@ class CalibrationNode(Node):
             raise
 
     def _result_document(self) -> dict[str, Any]:
-        feed = self._feed
-        return result_document(self._calibrator.result(), feed.dvl_frame or "dvl_link", feed.turns_dvl)
+        decoder = self._feed.decoder
+        return result_document(self._calibrator.result(), decoder.dvl_frame or "dvl_link", decoder.turns_dvl)
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -299,6 +299,7 @@ class CalibrationNode(Node):
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         before = self._calibrator.selected
         self._calibrator.set_parameters(self._changed(parameters))
+        self._feed.decoder.parameters = self._calibrator.parameters
         if self._calibrator.selected != before:
             self.get_logger().info(f"running {self._calibrator.selected} instead of {before}")
             self._publish_estimate()

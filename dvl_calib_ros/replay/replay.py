@@ -25,8 +25,9 @@ from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..calibration.verification import verification_document
 from ..errors import InputError
 from ..files.result_file import estimate_document, load_initial_calibration
-from ..messages.decode import MessageFeed
+from ..messages.decode import MessageDecoder, Refusal
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
+from ..messages.feed import MessageFeed
 from .recorder import Recorder, RunHistory
 
 BLOCK_SIZE = 512
@@ -110,11 +111,11 @@ def replay(
             on_block=recorder.observe if recorder else on_block,
             verified=True,
         )
-        feed = MessageFeed(calibrator, lambda _: None)
+        feed = MessageFeed(calibrator)
         if recorder:
             recorder.expect(bag.message_counts[chosen.dvl])
         _feed_all(bag, chosen, feed, recorder, on_progress)
-        found += feed.problems.values()
+        found += feed.decoder.problems.values()
     result = calibrator.result()
     found += _warnings(result, topics, feed)
     history = recorder.history(calibrator) if recorder else None
@@ -122,11 +123,11 @@ def replay(
         result,
         (*bag.notes, *events, *map(str, found)),
         tuple(found),
-        feed.dvl_frame or "dvl_link",
+        feed.decoder.dvl_frame or "dvl_link",
         history,
-        feed.reference_frame,
-        feed.dvl_type.name,
-        feed.turns_dvl,
+        feed.decoder.frame_of_reference,
+        feed.decoder.dvl_type.name,
+        feed.decoder.turns_dvl,
     )
 
 
@@ -213,16 +214,17 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
         typed = _of_types(bag, chosen, parameters)
-        feed = MessageFeed(Calibrator(typed.replace(prior_source="fixed")), lambda _: None)
+        decoder = MessageDecoder(typed)
         for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
             if undecodable:
                 continue
             if topic == chosen.imu:
-                orientation = unit_quaternion(feed.imu(message, log_ns).orientation)
+                attitude = decoder.imu(message, log_ns)
+                orientation = None if isinstance(attitude, Refusal) else unit_quaternion(attitude.orientation)
                 rotation = None if orientation is None else rotation_from_quaternion(orientation).T
                 continue
-            sample = feed.reference(message, log_ns)
-            if sample is None or not is_valid_velocity(sample.velocity, parameters.max_speed):
+            sample = decoder.reference(message, log_ns)
+            if isinstance(sample, Refusal) or not is_valid_velocity(sample.velocity, parameters.max_speed):
                 continue
             first_ns = sample.stamp_ns if first_ns is None else first_ns
             if sample.stamp_ns - first_ns >= parameters.prior_window * 1e9:
@@ -247,9 +249,9 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[Finding
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    found = message_advice(result.counts) + feed.dvl_type.advice(dvl) + data_advice(result.counts)
-    if feed.zero_stamps:
-        found.append(finding("STAMPS_MISSING_IN_BAG", count=feed.zero_stamps))
+    found = message_advice(result.counts) + feed.decoder.dvl_type.advice(dvl) + data_advice(result.counts)
+    if feed.decoder.zero_stamps:
+        found.append(finding("STAMPS_MISSING_IN_BAG", count=feed.decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_advice(estimate)
     return found
@@ -257,8 +259,8 @@ def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[Finding
 
 def _remedy(feed: MessageFeed) -> str:
     """What is known of the DVL's messages that were refused."""
-    known = [str(found) for kind, found in feed.problems.items() if kind.startswith("dvl")]
-    known += map(str, feed.dvl_type.advice(feed.calibrator.counts["dvl"]))
+    known = [str(found) for kind, found in feed.decoder.problems.items() if kind.startswith("dvl")]
+    known += map(str, feed.decoder.dvl_type.advice(feed.calibrator.counts["dvl"]))
     return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 

@@ -11,13 +11,12 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..bags.reader import BagReader
-from ..calibration.calibrator import Calibrator
 from ..calibration.frames import ENU_FROM_NED, Array, Quaternion, Vector
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..errors import InputError
-from ..messages.decode import MessageFeed
+from ..messages.decode import MessageDecoder, Refusal
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES
 from ..replay.replay import Topics
 from .trajectories import Motion
@@ -81,24 +80,26 @@ def _read(recording: Recording) -> _Samples:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
         _check_topics(recording, topics, bag.topics)
         parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=bag.topics[topics.gnss])
-        feed = MessageFeed(Calibrator(parameters), lambda _: None)
+        decoder = MessageDecoder(parameters)
         for topic, log_ns, message, undecodable in bag.messages([topics.gnss, topics.imu]):
             if undecodable:
                 continue
             if topic == topics.imu:
-                attitude = feed.imu(message, log_ns)
+                attitude = decoder.imu(message, log_ns)
+                if isinstance(attitude, Refusal):
+                    continue
                 orientation = unit_quaternion(attitude.orientation)
                 if orientation is not None:
                     attitudes[attitude.stamp_ns] = orientation
                 continue
-            sample = feed.reference(message, log_ns)
-            if sample is not None and is_valid_velocity(sample.velocity, parameters.max_speed):
+            sample = decoder.reference(message, log_ns)
+            if not isinstance(sample, Refusal) and is_valid_velocity(sample.velocity, parameters.max_speed):
                 velocities[sample.stamp_ns] = sample.velocity, sample.frame
     for what, found in ((recording.gnss_topic, velocities), (recording.imu_topic, attitudes)):
         if len(found) < 2:
             raise InputError(
                 f"{recording.path}: {what} holds {len(found)} usable samples; a motion takes reference velocity and "
-                f"attitude. {' '.join(map(str, feed.problems.values()))}".strip()
+                f"attitude. {' '.join(map(str, decoder.problems.values()))}".strip()
             )
     velocity_ns, attitude_ns = sorted(velocities), sorted(attitudes)
     first_ns = min(velocity_ns[0], attitude_ns[0])

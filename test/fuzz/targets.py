@@ -31,8 +31,8 @@ from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.trajectories import read_columns
 from dvl_calib_ros.files.urdf import read_urdf
 from dvl_calib_ros.files.yaml_files import parse_scalar
-from dvl_calib_ros.messages.decode import MessageFeed
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.messages.feed import MessageFeed
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))

@@ -207,14 +207,18 @@ def test_no_output_of_a_command_can_be_one_of_its_inputs_by_any_name(scratch, ca
 
 def test_every_option_that_names_a_path_is_known_here_as_read_or_written():
     """A new option that writes is to be checked as the others are."""
-    known = {word for command in COMMAND.values() for word in (*command.files, *command.folders, *command.arguments.split())}
+    known = {
+        word for command in COMMAND.values() for word in (*command.files, *command.folders, *command.arguments.split())
+    }
     harmless = {"--out", "-h"}  # a trial reads nothing, and goes on in its folder
     for module in COMMANDS:
         parser = build_parser([module.NAME])._subparsers._group_actions[0].choices[module.NAME]
         for action in parser._actions:
             if action.type is Path and action.option_strings and module.NAME != "parameters":
-                assert known & {*action.option_strings} or harmless & {*action.option_strings} or (
-                    module.NAME == "demo" or action.option_strings[0] in ("--attitude", "--params", "--urdf")
+                assert (
+                    known & {*action.option_strings}
+                    or harmless & {*action.option_strings}
+                    or (module.NAME == "demo" or action.option_strings[0] in ("--attitude", "--params", "--urdf"))
                 ), f"{module.NAME} {action.option_strings}"
 
 

@@ -406,7 +406,7 @@ def test_messages_without_a_stamp_are_taken_at_their_reception_and_said(world):
         for i in range(3):
             dvl.send(twist(0.0))
             until(lambda i=i: received(node) == i + 1, "the sample")
-        assert node._feed.zero_stamps == 3
+        assert node._feed.decoder.zero_stamps == 3
         assert node._calibrator.counts["dvl"]["accepted"] == 3
 
 

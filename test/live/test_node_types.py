@@ -22,8 +22,8 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.yaml_files import load_yaml
-from dvl_calib_ros.messages.decode import MessageFeed
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
+from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
@@ -103,7 +103,7 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
             callback(message, {"received_timestamp": 0, "source_timestamp": 0})
         counts = node._calibrator.counts["dvl"]
         assert (received(node), counts["no_bottom"], counts["accepted"]) == (len(samples), 1, len(samples) - 1)
-        assert node._feed.turns_dvl
+        assert node._feed.decoder.turns_dvl
 
 
 def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wrong_with_them_is_said():

@@ -38,8 +38,8 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.bags import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.yaml_files import load_yaml
-from dvl_calib_ros.messages.decode import MessageFeed
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES, driver_table, velocity_type
+from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.replay.replay import Topics, replay
 from dvl_calib_ros.simulation.recorded import Recording, recorded_motion

@@ -10,7 +10,8 @@ import pytest
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.messages.decode import LinearCovariance, MessageFeed, stamp_ns
+from dvl_calib_ros.messages.decode import LinearCovariance, stamp_ns
+from dvl_calib_ros.messages.feed import MessageFeed
 
 SECOND = 10**9
 
@@ -154,7 +155,7 @@ def test_a_zero_stamp_is_replaced_by_the_time_of_reception_and_said_once_per_str
         assert feed.feed.dvl(twist(0), second * SECOND).stamp_ns == second * SECOND
         assert feed.feed.reference(twist(0, "base_link"), second * SECOND).stamp_ns == second * SECOND
         assert feed.feed.imu(imu(0), second * SECOND).stamp_ns == second * SECOND
-    assert feed.feed.zero_stamps == 6
+    assert feed.feed.decoder.zero_stamps == 6
     assert [sentence.split(":")[0] for sentence in feed.said] == ["dvl", "reference", "imu"]
 
 
@@ -167,4 +168,4 @@ def test_ever_new_wrong_frames_and_garbage_are_counted_but_told_of_once():
     assert feed.counts("dvl")["wrong_frame"] == feed.counts("reference")["wrong_frame"] == 50
     assert feed.counts("dvl")["invalid"] == 50
     assert len(feed.said) == 3
-    assert "frame1" in str(feed.feed.problems["dvl frame"])  # the newest is kept for the diagnostics
+    assert "frame1" in str(feed.feed.decoder.problems["dvl frame"])  # the newest is kept for the diagnostics

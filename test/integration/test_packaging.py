@@ -1,0 +1,159 @@
+"""What packages, package.xml, the changelog and the launch file say is true."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import sys
+import types
+import warnings
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+import dvl_calib_ros
+
+SETUP = (ROOT / "setup.py").read_text()
+PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
+MODULES = sorted((ROOT / "dvl_calib_ros").rglob("*.py"))
+# how distributions call what we import, where it is not the module's own name
+DISTRIBUTIONS = {"yaml": "pyyaml", "backports": "backports.zstd"}
+# of ROS, of an extra, of Python 3.14, or replaced where it is missing
+NOT_REQUIRED = {"compression", "rclpy", "ament_index_python", "rosbag2_py", "argcomplete", "distributed", "pandas"}
+
+
+def required() -> dict[str, str]:
+    """Lowest version of every distribution that setup.py asks for."""
+    return dict(re.findall(r'["\']([a-z][a-z0-9_.]*)>=([\d.]+)', SETUP.partition("DASK =")[0]))
+
+
+def parts(version: str) -> list[int]:
+    return [int(part) for part in version.split(".")]
+
+
+def imported() -> set[str]:
+    """Top names of what the package imports, anywhere."""
+    names = set()
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
+                names.add(node.module.partition(".")[0])
+    return names
+
+
+def test_the_version_is_the_same_everywhere():
+    (in_setup,) = re.findall(r"version=\"(\d+\.\d+\.\d+)\",", SETUP)  # the form that catkin_prepare_release looks for
+    assert PACKAGE.findtext("version") == in_setup == dvl_calib_ros.__version__
+
+
+def test_everything_that_is_imported_is_declared():
+    ours = {"dvl_calib_ros", "test", *sys.stdlib_module_names}
+    messages = {name for name in imported() if name.endswith(("_msgs", "_srvs", "_interfaces"))}
+    others = imported() - ours - messages - NOT_REQUIRED
+    assert {DISTRIBUTIONS.get(name, name) for name in others} - required().keys() == set()
+
+
+def test_the_lowest_versions_that_ci_tries_are_those_that_setup_asks_for():
+    tried = dict(re.findall(r"^([\w.]+)==([\d.]+)$", (ROOT / ".ci" / "lowest.txt").read_text(), re.M))
+    assert tried.keys() == required().keys()
+    for name, lowest in required().items():
+        assert parts(tried[name])[: len(parts(lowest))] == parts(lowest), name
+
+
+def test_package_xml_has_the_keys_of_all_that_the_node_imports():
+    keys = {element.text for element in PACKAGE.findall("exec_depend")}
+    node = (ROOT / "dvl_calib_ros" / "node").glob("*.py")
+    messages = {
+        name.partition(".")[0]
+        for path in node
+        for name in re.findall(r"^from (\w+)[\w.]* import", path.read_text(), re.M)
+        if name.endswith(("_msgs", "_srvs", "_interfaces")) or name == "rclpy"
+    }
+    assert len(messages) >= 5 and messages <= keys
+    assert {"python3-numpy", "python3-scipy", "python3-yaml", "launch_ros"} <= keys
+
+
+def test_a_release_finds_maintainer_licence_and_a_changelog_of_its_version():
+    assert PACKAGE.find("maintainer").get("email") and PACKAGE.findtext("license") == "Apache-2.0"
+    changelog = (ROOT / "CHANGELOG.rst").read_text()
+    versions = re.findall(r"^(Forthcoming|\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\))\n-+$", changelog, re.M)
+    assert versions[0] == "Forthcoming" and any(each.startswith(dvl_calib_ros.__version__) for each in versions)
+
+
+def test_types_are_handed_on():
+    assert (ROOT / "dvl_calib_ros" / "py.typed").is_file() and '"py.typed"' in SETUP
+
+
+def test_no_file_gives_a_syntax_warning():
+    """Python 3.12 and later tell users of every one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for folder in ("dvl_calib_ros", "benchmarks", "test", "launch", "examples"):
+            for path in (ROOT / folder).rglob("*.py"):
+                compile(path.read_text(encoding="utf-8"), str(path), "exec")
+
+
+class Anything:
+    """Stands in for a class of launch: remembers what it was made of."""
+
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
+
+
+class Configuration(Anything):
+    def perform(self, context: dict) -> str:
+        return context[self.args[0]]
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """launch is no wheel: the file runs against stand-ins, and gives the node as it would be started."""
+    modules = {
+        "ament_index_python.packages": {"get_package_share_directory": lambda _: str(ROOT)},
+        "launch": {"LaunchContext": dict, "LaunchDescription": Anything},
+        "launch.actions": {"DeclareLaunchArgument": Anything, "OpaqueFunction": Anything},
+        "launch.substitutions": {"LaunchConfiguration": Configuration},
+        "launch_ros": {},
+        "launch_ros.actions": {"Node": Anything},
+    }
+    for name, content in modules.items():
+        module = types.ModuleType(name)
+        module.__dict__.update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    path = ROOT / "launch" / "calibration.launch.py"
+    spec = importlib.util.spec_from_file_location("calibration_launch", path)
+    launch_file = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(launch_file)
+    *declared, opaque = launch_file.generate_launch_description().args[0]
+    defaults = {each.args[0]: each.kwargs["default_value"] for each in declared}
+
+    def start(**given):
+        assert given.keys() <= defaults.keys()
+        (node,) = opaque.kwargs["function"]({**defaults, **given})
+        return node.kwargs
+
+    return start
+
+
+def test_the_launch_file_remaps_the_topics_it_is_given_and_no_other(launched):
+    assert launched()["remappings"] == []
+    assert launched(dvl_topic="/a50/velocity")["remappings"] == [("dvl/twist", "/a50/velocity")]
+
+
+def test_the_launch_file_leaves_use_sim_time_of_a_parameter_file_alone(launched):
+    assert launched(params_file="mine.yaml")["parameters"] == ["mine.yaml"]
+    assert launched(use_sim_time="true")["parameters"][1] == {"use_sim_time": True}
+    assert launched(use_sim_time="false")["parameters"][1] == {"use_sim_time": False}
+
+
+def test_the_launch_file_starts_a_node_again_only_if_told_to(launched):
+    assert launched()["respawn"] is False and launched(respawn="true")["respawn"] is True
+
+
+def test_the_launch_files_default_parameters_are_there(launched):
+    assert Path(launched()["parameters"][0]).is_file()

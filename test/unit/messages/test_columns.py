@@ -1,0 +1,185 @@
+"""Recorded messages as columns are the same samples, refusals and problems as one by one."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from driver_fixtures import MARINE, ODOMETRY, TWIST, TWIST_STAMPED, TYPES, Maker, write_driver_bag
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from io_fixtures import IMU_TYPE, JAZZY, TWIST_TYPE, mcap_bytes, run, write_bag
+
+from dvl_calib_ros.bags import columns as bag_columns
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import Stream
+from dvl_calib_ros.messages.columns import sample_streams
+from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
+from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
+
+TOPICS = {"dvl/twist": Stream.DVL, "gnss/twist": Stream.REFERENCE, "imu/data": Stream.IMU}
+
+
+def plain(decoded):
+    """To be compared: nan as nan of either sign, and of an IMU as if there were nothing, for it says as much."""
+    if isinstance(decoded, str | Refusal):
+        return decoded if isinstance(decoded, str) else decoded.reason
+    values = {
+        name: None if value is None else bits(value)
+        for name, value in decoded._asdict().items()
+        if name not in ("stamp_ns", "frame")
+    }
+    if not hasattr(decoded, "velocity"):
+        values = {name: None if value is None or value[0] == "nan" else value for name, value in values.items()}
+    return type(decoded), decoded.stamp_ns, values, getattr(decoded, "frame", None)
+
+
+def bits(values) -> list[str]:
+    return list(map(repr, np.ravel(np.asarray(values, dtype=float)).tolist()))
+
+
+def as_columns(paths, parameters, on_problem=print):
+    decoder = MessageDecoder(parameters, on_problem)
+    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+        found = [
+            (stream, plain(sample))
+            for stretch in sample_streams(bag, TOPICS, decoder)
+            for stream, sample in stretch.streams.in_order()
+        ]
+    return found, decoder
+
+
+def one_by_one(paths, parameters, on_problem=print):
+    decoder = MessageDecoder(parameters, on_problem)
+    take = {"dvl/twist": decoder.dvl, "gnss/twist": decoder.reference, "imu/data": decoder.imu}
+    found = []
+    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+        for topic, log_ns, message, why in bag.messages(TOPICS):
+            stream = TOPICS[topic]
+            found.append((stream, plain(decoder.undecodable(stream, why) if why else take[topic](message, log_ns))))
+    return found, decoder
+
+
+def assert_same(paths, parameters):
+    said, expected_said = set(), set()
+    found, decoder = as_columns(paths, parameters, said.add)
+    expected, expected_decoder = one_by_one(paths, parameters, expected_said.add)
+    assert found == expected
+    assert said == expected_said
+    assert decoder.problems.keys() == expected_decoder.problems.keys()
+    for name in ("zero_stamps", "dvl_frame", "frame_of_reference", "turns_dvl"):
+        assert getattr(decoder, name) == getattr(expected_decoder, name), name
+    return found
+
+
+@pytest.mark.parametrize("version", ["first", "covariance", "fixed sizes"])
+@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("reference", [TWIST, TWIST_STAMPED, ODOMETRY])
+def test_every_type_gives_the_same_samples_in_columns(tmp_path, kind, reference, version):
+    changes = {
+        3: lambda message: setattr(message.header.stamp, "sec", 0) or setattr(message.header.stamp, "nanosec", 0)
+    }
+    if kind == MARINE:
+        changes |= {
+            5: lambda m: setattr(m, "velocity_mode", 2), 6: lambda m: setattr(m, "num_good_beams", 2),
+            7: lambda m: setattr(m, "altitude", float("nan")), 8: lambda m: setattr(m, "beam_velocities_valid", False),
+            9: lambda m: m.velocity_covar.__setitem__(0, -1.0), 10: lambda m: setattr(m, "altitude", -1.0),
+            11: lambda m: setattr(m, "altitude", float("inf")), 12: lambda m: setattr(m, "velocity_mode", 0),
+        }  # fmt: skip
+    samples = [s._replace(velocity=(0.0, 0.0, 0.0)) if i == 77 and hasattr(s, "velocity") else s
+               for i, s in enumerate(run(20.0))]  # fmt: skip
+    bag = write_driver_bag(tmp_path / "bag", samples, kind, reference, maker=Maker(version), changes=changes)
+    found = assert_same([bag], Parameters(dvl_type=kind, gnss_type=reference))
+    assert len(found) == len(samples)
+    if kind == MARINE:
+        assert {"water_track", "few_beams", "no_bottom", "flagged_invalid", "unknown_mode"} <= {
+            each for _, each in found if isinstance(each, str)
+        }
+
+
+FRAMES = ["dvl_link", "dvl_frd", "base_link", "map", "ned", "odom", "", "x", "gnss", "größe", "a\0b"]
+FLOATS = st.sampled_from([0.0, -0.0, 1.0, -1.0, 0.25, float("nan"), float("inf"), 1e300])
+
+
+@st.composite
+def recordings(draw: st.DrawFn):
+    """Messages of any frames, stamps, values and covariances, whole or damaged, in either endianness."""
+    rng = random.Random(draw(st.integers(0, 2**32)))
+    types = JAZZY.types
+    frames = draw(st.lists(st.sampled_from(FRAMES), min_size=1, max_size=4))
+    floats = draw(st.lists(FLOATS, min_size=1, max_size=5))
+    messages = []
+    for i in range(draw(st.integers(1, 40))):
+        topic = rng.choice(list(TOPICS))
+        stamp = 0 if rng.random() < 0.1 else 1_700_000_000 * 10**9 + i
+        header = types["std_msgs/msg/Header"](
+            types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), rng.choice(frames)
+        )
+        vector = lambda: types["geometry_msgs/msg/Vector3"](*(rng.choice(floats) for _ in range(3)))  # noqa: E731
+        covariance = lambda size: np.array([rng.choice(floats) for _ in range(size)])  # noqa: E731
+        if topic == "imu/data":
+            quaternion = types["geometry_msgs/msg/Quaternion"](*(rng.choice(floats) for _ in range(4)))
+            message, kind = types[IMU_TYPE](
+                header, quaternion, covariance(9), vector(), covariance(9), vector(), covariance(9)
+            ), IMU_TYPE  # fmt: skip
+        else:
+            twist = types["geometry_msgs/msg/Twist"](vector(), vector())
+            inner = types["geometry_msgs/msg/TwistWithCovariance"](twist, covariance(36))
+            message, kind = types[TWIST_TYPE](header, inner), TWIST_TYPE
+        data = bytes(JAZZY.serialize_cdr(message, kind, little_endian=rng.random() < 0.7))
+        if rng.random() < 0.1:
+            at = rng.randrange(len(data))
+            data = rng.choice([data[:at], data[:at] + b"\xff" + data[at + 1 :], data + b"\0"])
+        messages.append((topic, 10**18 + i, data))
+    return messages
+
+
+@settings(max_examples=120, deadline=None)
+@given(recordings(), st.sampled_from([1, 7, 4096]), st.sampled_from(["", "dvl_link", "base_link"]), st.booleans())
+def test_whatever_is_recorded_gives_the_same_in_columns(tmp_path_factory, messages, window, dvl_frame, is_turned):
+    path = tmp_path_factory.mktemp("bag") / "bag.mcap"
+    path.write_bytes(mcap_bytes(messages))
+    parameters = Parameters(dvl_frame=dvl_frame, imu_rpy=(0.1, 0.0, 0.5) if is_turned else (0.0, 0.0, 0.0))
+    before = bag_columns.WINDOW_MESSAGES, bag_columns.TAKEN
+    bag_columns.WINDOW_MESSAGES, bag_columns.TAKEN = window, min(window, before[1])
+    try:
+        assert_same([path], parameters)
+    finally:
+        bag_columns.WINDOW_MESSAGES, bag_columns.TAKEN = before
+
+
+def test_messages_of_several_bags_arrive_in_order_of_log_time(tmp_path):
+    first = write_bag(tmp_path / "first", run(20.0)[::2])
+    second = write_bag(tmp_path / "second", run(20.0)[1::2], "sqlite3")
+    found = assert_same([second, first], Parameters())
+    whole, _ = as_columns([write_bag(tmp_path / "whole", run(20.0))], Parameters())
+    assert sorted(map(str, found)) == sorted(map(str, whole))  # of two at the same time either may be first
+    stamps = [sample[1] for _, sample in found]
+    assert stamps == sorted(stamps)
+
+
+def test_a_definition_without_what_is_read_is_counted_message_by_message(tmp_path):
+    """A vendor's Twist without covariance, and an Imu that is none."""
+    with_less = {
+        "dvl/twist": (TWIST_TYPE, "std_msgs/Header header\nfloat64 speed\n" + HEADER),
+        "imu/data": (IMU_TYPE, "float64 x\n"),
+    }
+    header = bytes(JAZZY.serialize_cdr(header_message("dvl_link"), "std_msgs/msg/Header"))
+    padding = bytes(-(len(header) - 4) % 8)
+    content = [("dvl/twist", i, header + padding + bytes(8)) for i in range(1, 6)]
+    content += [("imu/data", i, b"\0\1\0\0" + bytes(8)) for i in range(6, 9)]
+    (tmp_path / "less.mcap").write_bytes(mcap_bytes(content, with_less))
+    found = assert_same([tmp_path / "less.mcap"], Parameters())
+    assert [reason for _, reason in found] == ["invalid"] * 8
+
+
+def header_message(frame_id):
+    return JAZZY.types["std_msgs/msg/Header"](JAZZY.types["builtin_interfaces/msg/Time"](5, 0), frame_id)
+
+
+HEADER = (
+    "=" * 80 + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    + "=" * 80 + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)  # fmt: skip
