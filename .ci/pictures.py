@@ -1,4 +1,4 @@
-"""Make the pictures of the README anew, in resource/images: python .ci/pictures.py [NAME...]. Needs chromium."""
+"""Make the pictures of the documentation anew, in docs/images: python .ci/pictures.py [NAME...]. Needs chromium."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.text import Text
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # this tree, whatever is installed
-TARGET = ROOT / "resource" / "images"
+TARGET = ROOT / "docs" / "images"
 HARBOUR_BOX = Path("bags", "harbour_box")  # as it is to stand in a report
 COLOURS = 64
 WIDTH = 1000  # pixels

@@ -1,4 +1,4 @@
-"""List all parameters, models, effects and drivers of the code: the README's tables, and parameter files."""
+"""List all parameters, models, effects, drivers, warnings and commands: the tables of docs/, and parameter files."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
     what.add_argument("--findings", action="store_true", help="every warning with its meaning and remedy")
+    what.add_argument("--commands", action="store_true", help="every command with an example")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
     parser.add_argument(
@@ -41,6 +42,9 @@ def run(arguments: argparse.Namespace) -> None:
 
         print(driver_table(), end="")
         return
+    if arguments.commands:
+        print(command_table(), end="")
+        return
     if arguments.findings:
         from ..calibration.findings import finding_table
 
@@ -56,3 +60,12 @@ def run(arguments: argparse.Namespace) -> None:
 
     make = parameter_file_text if arguments.yaml else model_table if arguments.models else parameter_table
     print(make(), end="")
+
+
+def command_table() -> str:
+    """Every command with an example, in Markdown."""
+    from .main import COMMANDS
+
+    lines = ["| command | does | example |", "|---|---|---|"]
+    lines += [f"| `{module.NAME}` | {module.HELP} | `{module.EXAMPLE}` |" for module in COMMANDS]
+    return "\n".join(lines) + "\n"

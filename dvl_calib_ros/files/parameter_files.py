@@ -160,7 +160,7 @@ def parameter_file_text() -> str:
 
 
 def parameter_table() -> str:
-    """The README's table of parameters, in Markdown."""
+    """The documentation's table of parameters, in Markdown."""
     lines = ["| parameter | default | unit, range | at run time | meaning |", "|---|---|---|---|---|"]
     for name, spec in SCHEMA.items():
         about = " ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
@@ -171,7 +171,7 @@ def parameter_table() -> str:
 
 
 def model_table() -> str:
-    """The README's table of models, in Markdown."""
+    """The documentation's table of models, in Markdown."""
     lines = ["| model | states | assumes | is wrong |", "|---|---|---|---|"]
     for model in MODELS.values():
         lines.append(f"| {model.name} | {' '.join(model.state_names)} | {model.assumes} | {model.wrong_when} |")

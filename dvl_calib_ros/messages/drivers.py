@@ -1,6 +1,6 @@
 """The message types that velocities are read from: what each holds, when it is invalid, and which way its axes point.
 
-A driver is one entry in `VELOCITY_TYPES`; bags, the node, and the README's table go by it. The rules follow the
+A driver is one entry in `VELOCITY_TYPES`; bags, the node, and the documentation's table go by it. The rules follow the
 definitions and what the drivers do with them: the Water Linked driver (waterlinked_dvl, marine_acoustic_msgs/Dvl) and
 dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.waterlinked.com/dvl/dvl-json-protocol).
 """
@@ -296,7 +296,7 @@ def velocity_type(parameter: str, name: str) -> VelocityType:
 
 
 def driver_table() -> str:
-    """The README's table of message types, in Markdown."""
+    """The documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
     for each in VELOCITY_TYPES.values():
         axes = "forward-right-down" if each.points_down else "forward-left-up"

@@ -1,7 +1,7 @@
 """A fixed part of the blind trial, small enough for every run of the tests, with bounds that a regression breaks.
 
-The figures of the whole trial are in the README; these bounds are what the part must keep, with some room for the
-chance that a change of the noise estimate moves a single case.
+The figures of the whole trial are in docs/diagnosis.md; these bounds are what the part must keep, with some room for
+the chance that a change of the noise estimate moves a single case.
 """
 
 from __future__ import annotations

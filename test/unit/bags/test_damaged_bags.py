@@ -18,7 +18,7 @@ from pathlib import Path
 import damage
 import lz4.frame
 import pytest
-from conftest import ROOT
+from documentation import section
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from io_fixtures import estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
@@ -123,10 +123,10 @@ def test_all_that_is_whole_comes_out_and_nothing_else(tmp_path, case):
     assert damage.recover(case, "ours", tmp_path) == (len(case.whole), 0)
 
 
-def test_the_table_in_the_readme_says_what_is_recovered():
-    readme = (ROOT / "README.md").read_text()
+def test_the_table_in_the_documentation_says_what_is_recovered():
+    table = section("damage")
     for case in damage.cases():
-        assert f"| {case.name} | {len(case.whole)} | {len(case.whole)} | " in readme
+        assert f"| {case.name} | {len(case.whole)} | {len(case.whole)} | " in table
 
 
 @pytest.mark.parametrize("case", damage.cases(), ids=lambda case: case.name)
