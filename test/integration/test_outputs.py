@@ -44,7 +44,9 @@ COMMAND = {
     ),
     "evaluate bags": Command("evaluate bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), ("--json",)),
     "apply": Command("apply result.yaml", ("result.yaml",), ("--launch", "--fusion")),
-    "apply to a URDF": Command("apply result.yaml --urdf r.urdf", ("result.yaml", "r.urdf"), ("-o", "--launch", "--fusion")),
+    "apply to a URDF": Command(
+        "apply result.yaml --urdf r.urdf", ("result.yaml", "r.urdf"), ("-o", "--launch", "--fusion")
+    ),
     "apply in place": Command("apply result.yaml", ("result.yaml",), ("--urdf", "--launch")),
     "salvage": Command("salvage bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), (), ("-o",)),
     "import": Command(
