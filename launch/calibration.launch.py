@@ -12,6 +12,8 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from dvl_calib_ros.files.parameter_files import load_parameters
+
 TOPICS = {"dvl_topic": "dvl/twist", "gnss_topic": "gnss/twist", "imu_topic": "imu/data"}
 # Saves and ends in well under a second; a node that cannot start at all need not be tried more often.
 RESPAWN_DELAY_S = 2.0
@@ -45,6 +47,7 @@ def _node(context: LaunchContext) -> list[Node]:
     def said(argument: str) -> str:
         return LaunchConfiguration(argument).perform(context)
 
+    load_parameters(Path(said("params_file")))  # if it is missing, ROS 2 would only warn, and run on the defaults
     parameters: list = [said("params_file")]
     if said("use_sim_time"):
         parameters.append({"use_sim_time": said("use_sim_time") == "true"})

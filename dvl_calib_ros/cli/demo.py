@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import common
 from .reporting import add_report_option, report_writer
+from .watch import node_command
 
 if TYPE_CHECKING:
     from ..calibration.results import Result
@@ -60,16 +59,16 @@ def run(arguments: argparse.Namespace) -> int:
         saved = Path(folder) / "live.yaml"
         log = (Path(folder) / "node.log").open("w+")
         latency = _latency(arguments.speed)
-        command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args"]
-        command += ["-p", f"result_file:={saved}", "-p", latency]
-        with subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True) as process:
+        command = node_command(["--ros-args", "-p", f"result_file:={saved}", "-p", latency])
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+        ) as process:
             rclpy.init()
             try:
                 _show_live(out, bag, arguments.speed)
             finally:
                 rclpy.try_shutdown()
-                process.send_signal(signal.SIGINT)
-                process.wait(30)
+                process.communicate(timeout=30)  # closes its standard input, so that it ends
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")

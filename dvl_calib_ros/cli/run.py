@@ -25,14 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Translate the options for ROS 2 and run the node."""
-    common.load(arguments)  # a bad file or value is said here, in one line, before ROS starts
-    if arguments.watch:
-        from .watch import run_and_watch
+    from ..node.ending import Ending
 
-        return run_and_watch(ros_arguments(arguments))
-    from ..node.main import main
+    with Ending() as ending:  # before anything that takes long
+        common.load(arguments)  # a bad file or value is said here, in one line, before ROS starts
+        if arguments.watch:
+            from .watch import run_and_watch
 
-    return main(ros_arguments(arguments))
+            return run_and_watch(ros_arguments(arguments), ending)
+        from ..node.main import run_until
+
+        return run_until(ending, ros_arguments(arguments))
 
 
 def ros_arguments(arguments: argparse.Namespace) -> list[str]:

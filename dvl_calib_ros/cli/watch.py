@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import IO, TYPE_CHECKING
 
+from ..node.main import ENDS_WITH_STDIN
 from . import common
 
 if TYPE_CHECKING:
+    from ..node.ending import Ending
     from ..node.listener import Listener
 
 NAME = "watch"
@@ -25,8 +25,6 @@ HELP = "watch a node that runs elsewhere, in the terminal"
 EXAMPLE = "dvl-calib watch --node /port/dvl_calibration"
 # How long a node may take to save, s.
 PATIENCE_S = 60.0
-# Signals that ask to save and end: Ctrl-C, kill, a terminal that is closed
-ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,25 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Watch until Ctrl-C."""
     from ..files.parameter_files import NODE_NAME
+    from ..node.ending import Ending
     from .live_view import show
 
-    with _listener(arguments.node or NODE_NAME) as listener, _asked_to_end() as ending:
-        show(common.console(), listener.latest, lambda: not ending.is_set())
-
-
-@contextmanager
-def _asked_to_end() -> Iterator[threading.Event]:
-    """Whether Ctrl-C, SIGTERM or SIGHUP came.
-
-    Not KeyboardInterrupt: it may come up within a callback of the middleware, which swallows it.
-    """
-    ending = threading.Event()
-    before = {number: signal.signal(number, lambda *_: ending.set()) for number in ENDING}
-    try:
-        yield ending
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with Ending() as ending, _listener(arguments.node or NODE_NAME) as listener:
+        show(common.console(), listener.latest, lambda: not ending.requested)
 
 
 def _listener(node: str) -> Listener:
@@ -70,26 +54,25 @@ def _listener(node: str) -> Listener:
     return Listener(node)
 
 
-def run_and_watch(ros_arguments: Sequence[str]) -> int:
+def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
     """Start the node in a process of its own and watch it; its exit code.
 
     Ctrl-C, SIGTERM and SIGHUP end the node as they would without the view: it saves. It is in a session of its own, so
-    that a Ctrl-C reaches it once, through here.
+    that they reach it through here only, by the pipe that closes with this process, however that ends.
     """
     from .live_view import show
 
-    # until the node has ended: a second Ctrl-C must not cut its saving short
-    with _listener(_node_name(ros_arguments)) as listener, _asked_to_end() as ending:
-        command = [sys.executable, "-m", "dvl_calib_ros.node.main", *ros_arguments]
+    with _listener(_node_name(ros_arguments)) as listener:
         environment = os.environ | {"PYTHONUNBUFFERED": "1"}
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment, start_new_session=True
-        )
+            node_command(ros_arguments), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env=environment, start_new_session=True,
+        )  # fmt: skip
         try:
             assert process.stdout is not None  # a pipe
             log = _Log(process.stdout)
-            show(common.console(), listener.latest, lambda: process.poll() is None and not ending.is_set(), log.lines)
-            said = len(log.lines) if ending.is_set() else 0  # lines that are on the screen already
+            show(common.console(), listener.latest, lambda: process.poll() is None and not ending.requested, log.lines)
+            said = len(log.lines) if ending.requested else 0  # lines that are on the screen already
         finally:
             code = _ended(process)
         for text in log.finished()[said:]:
@@ -105,8 +88,14 @@ def _node_name(ros_arguments: Sequence[str]) -> str:
     return f"{rules.get('__ns', '')}/{rules.get('__node', NODE_NAME)}"
 
 
+def node_command(ros_arguments: Sequence[str]) -> list[str]:
+    """What runs a node that ends with this process, or when its standard input is closed before."""
+    return [sys.executable, "-m", "dvl_calib_ros.node.main", ENDS_WITH_STDIN, *ros_arguments]
+
+
 def _ended(process: subprocess.Popen[bytes]) -> int:
-    process.send_signal(signal.SIGINT)
+    assert process.stdin is not None  # a pipe
+    process.stdin.close()
     try:
         return process.wait(PATIENCE_S)
     except subprocess.TimeoutExpired:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import fnmatch
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from .yaml_files import load_yaml, parse_scalar
 NODE_NAME = "dvl_calibration"
 # rclpy's own parameters, which a file for the node may hold as well
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+
+# From this likeness on (1: the same), an unknown name that is set for all nodes is one of ours misspelt
+MISSPELT = 0.8
 
 
 def load_parameters(
@@ -86,22 +90,70 @@ def _number_or_degrees(value: Any) -> Any:
 
 
 def _node_parameters(path: Path) -> dict[str, Any]:
+    sections = _own_sections(path, NODE_NAME, _is_for_node)
+    values: dict[str, Any] = {}
+    for _, body in sections:
+        values.update(body)
+    others = _of_others(sections)
+    return {name: value for name, value in values.items() if not is_ros_parameter(name) and name not in others}
+
+
+def names_of_others(path: Path, node: str) -> set[str]:
+    """What a ROS 2 parameter file sets for all nodes alike, and is no parameter of ours.
+
+    Parameters
+    ----------
+    path: Of the file.
+    node: Full name of the running node, as in /auv/dvl_calibration.
+
+    Raises
+    ------
+    InputError: If nothing in the file is for this node, which would run on its defaults then; if it is no such file.
+
+    """
+    return _of_others(_own_sections(path, node, lambda section: _matches(_tokens(section), _tokens(node))))
+
+
+def _own_sections(path: Path, node: str, is_own: Callable[[str], bool]) -> list[tuple[str, dict[str, Any]]]:
     content = load_yaml(path, "ROS 2 parameter file")
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
-    values: dict[str, Any] = {}
     sections = [found for key, section in content.items() for found in _sections(str(key), section)]
-    own = [(node, body) for node, body in sections if _is_for_node(node)]
-    for node, body in own:
+    own = [(name, body) for name, body in sections if is_own(name)]
+    for name, body in own:
         if not isinstance(body, dict):
-            raise InputError(f"{path}: ros__parameters of {node} is not a list of name: value")
-        values.update(_flat(body))
+            raise InputError(f"{path}: ros__parameters of {name} is not a list of name: value")
     if not sections:
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
     if not own:  # ROS would run with the defaults and say nothing
-        others = ", ".join(node for node, _ in sections)
-        raise InputError(f"{path}: nothing in it is for node {NODE_NAME}, only for {others}; use '/**:' or the name")
-    return {name: value for name, value in values.items() if not is_ros_parameter(name)}
+        others = ", ".join(name for name, _ in sections)
+        raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
+    return [(name, _flat(body)) for name, body in own]
+
+
+def _of_others(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:
+    """Unknown names that are only set for all nodes alike; what looks like one of ours misspelt is not among them."""
+    for_all = {name for section, body in sections if "*" in _tokens(section)[-1] for name in body}
+    ours = {name for section, body in sections if "*" not in _tokens(section)[-1] for name in body}
+    return {
+        name
+        for name in for_all - ours
+        if name not in SCHEMA and not is_ros_parameter(name)
+        and not difflib.get_close_matches(str(name), SCHEMA, n=1, cutoff=MISSPELT)
+    }  # fmt: skip
+
+
+def _tokens(name: str) -> list[str]:
+    return name.strip("/").split("/")
+
+
+def _matches(section: Sequence[str], node: Sequence[str]) -> bool:
+    """Whether a section's name is a node's, as rcl matches them: * is one token, ** any number."""
+    if not section:
+        return not node
+    if section[0] == "**":
+        return any(_matches(section[1:], node[at:]) for at in range(len(node) + 1))
+    return bool(node) and section[0] in ("*", node[0]) and _matches(section[1:], node[1:])
 
 
 def is_ros_parameter(name: str) -> bool:

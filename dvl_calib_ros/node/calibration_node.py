@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..errors import InputError
 from ..files.atomic import check_writable
+from ..files.outputs import check_outputs
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (
     NothingUsedError,
@@ -55,17 +56,20 @@ BLOCK_SIZE = 64
 
 
 class CalibrationNode(Node):
-    """See interfaces.md, "The node". Raises ParameterError or InputError for a configuration that cannot run."""
+    """See interfaces.md, "The node". Raises ParameterError or InputError for a configuration that cannot run.
 
-    def __init__(self, **node_options: Any) -> None:
+    parameter_files: those that the node was started with.
+    """
+
+    def __init__(self, parameter_files: Sequence[Path] = (), **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
-        parameters = declare_parameters(self)
+        parameters = declare_parameters(self, parameter_files)
+        self._parameter_files = parameter_files
         dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         gnss_type = velocity_type("gnss_type", parameters.gnss_type)
         dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
         self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
-        if parameters.result_file:
-            check_writable(Path(parameters.result_file))
+        self._check_result_file(parameters.result_file)
         initial = None
         if parameters.initial_calibration:
             initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
@@ -286,12 +290,17 @@ class CalibrationNode(Node):
         decoder = self._feed.decoder
         return result_document(self._calibrator.result(), decoder.dvl_frame or "dvl_link", decoder.turns_dvl)
 
+    def _check_result_file(self, name: str) -> None:
+        if name:
+            check_writable(Path(name))
+            check_outputs({"result_file": Path(name)}, self._parameter_files)
+
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
             changed = self._changed(parameters)
             if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
                 check_in_folder(Path(changed.result_file), self._result_folder)
-                check_writable(Path(changed.result_file))
+                self._check_result_file(changed.result_file)
         except (ParameterError, InputError) as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

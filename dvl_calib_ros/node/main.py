@@ -1,22 +1,46 @@
-"""Start and stop of the node: arguments, signals, exit codes."""
+"""Start and stop of the node: arguments, signals, exit codes.
+
+What takes long to import is imported below, so that signals are looked after from the first moment on.
+"""
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Sequence
-from types import FrameType
+from typing import TYPE_CHECKING
 
-from ..calibration.parameters import ParameterError
-from ..errors import InputError, printable
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from .ending import Ending
+
+# Says that standard input is a pipe, and that the node is to end with the process that holds its other end.
+ENDS_WITH_STDIN = "--ends-with-stdin"
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; 0, or 2 on a bad configuration, said in one line on standard error."""
     try:
-        import rclpy
-        from rclpy.executors import ExternalShutdownException
+        from .ending import Ending
 
+        given = list(sys.argv[1:] if args is None else args)
+        with_parent = ENDS_WITH_STDIN in given
+        with Ending(closed=sys.stdin.fileno() if with_parent else None) as ending:
+            return run_until(ending, [arg for arg in given if arg != ENDS_WITH_STDIN])
+    except KeyboardInterrupt:  # before there was an `Ending`, so nothing had begun
+        return 0
+
+
+def run_until(ending: Ending, args: Sequence[str]) -> int:
+    """As `main`, with what asks it to stop."""
+    try:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+        from rclpy.task import Future
+
+        from ..calibration.parameters import ParameterError
+        from ..errors import InputError
         from .calibration_node import CalibrationNode
     except ImportError as error:
         print(
@@ -25,26 +49,23 @@ def main(args: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
-
+    if ending.requested:
+        return 0
     try:
-        rclpy.init(args=None if args is None else ["calibration_node", *args])
+        rclpy.init(args=["calibration_node", *args], signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
         return _refused(error)
-    signal.signal(signal.SIGHUP, _stop)  # the operator's terminal is gone: save, like on SIGTERM
     node = None
     try:
-        node = CalibrationNode()
-        rclpy.spin(node)
+        node = CalibrationNode(parameter_files(args))
+        asked_to_end = Future()
+        ending.tell(lambda: asked_to_end.set_result(None))
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin_until_future_complete(asked_to_end)
     except (ParameterError, InputError) as error:
         return _refused(error)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        if rclpy.ok():  # when stopped in the middle of something, rclpy raises whatever that something runs into
-            raise
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not cut the saving short
         if node is not None:
             node.finish()
             node.destroy_node()
@@ -52,13 +73,24 @@ def main(args: Sequence[str] | None = None) -> int:
     return 0
 
 
+def parameter_files(args: Sequence[str]) -> list[Path]:
+    """The files that ROS arguments name, as rcl reads them: between --ros-args and --."""
+    from pathlib import Path
+
+    files, is_ros = [], False
+    for word, following in zip(args, [*args[1:], ""], strict=True):
+        if word in ("--ros-args", "--"):
+            is_ros = word == "--ros-args"
+        elif is_ros and word == "--params-file":
+            files.append(Path(following))
+    return files
+
+
 def _refused(error: Exception) -> int:
+    from ..errors import printable
+
     print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
     return 2
-
-
-def _stop(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
 from ..calibration.parameters import SCHEMA, Parameters, ParameterSpec
-from ..files.parameter_files import is_ros_parameter
+from ..files.parameter_files import is_ros_parameter, names_of_others
 
 _TYPES = {
     "string": ParameterType.PARAMETER_STRING,
@@ -36,18 +38,25 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     return described
 
 
-def declare_parameters(node: Node) -> Parameters:
-    """Declare every parameter, with the values given at the start. Raises ParameterError.
+def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
+    """Declare every parameter, with the values given at the start. Raises ParameterError and InputError.
 
     The node must have declared its overrides by itself; so names that do not exist are seen (ROS 2 would ignore
-    them), and whole numbers are taken where a double is meant.
+    them), and whole numbers are taken where a double is meant. files: the parameter files that the node was started
+    with; what they set for all nodes alike, and is no parameter of ours, is another's.
     """
+    others: set[str] = set()
+    for path in files:
+        others |= names_of_others(path, node.get_fully_qualified_name())
     given: dict[str, Any] = {
         name: node.get_parameter(name).value for name in node.get_parameters_by_prefix("") if not is_ros_parameter(name)
     }
-    parameters = Parameters.from_mapping(given)
     for name in given:
         node.undeclare_parameter(name)
+    foreign = sorted(others & given.keys())
+    if foreign:
+        node.get_logger().info(f"not ours, though set for all nodes: {', '.join(foreign)}")
+    parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in others})
     for name, spec in SCHEMA.items():
         node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)
     return parameters

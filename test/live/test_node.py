@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -165,6 +167,39 @@ def test_a_bad_configuration_is_refused_at_the_start_in_one_line(arguments, said
     assert len(own) == 1 and own[0].startswith("calibration_node: ")
 
 
+PARAMETER_FILES = {
+    "of another node": ("other: {ros__parameters: {min_speed: 0.5}}", "is for node /dvl_calibration, only for other"),
+    "of a node in a namespace": ("/auv/dvl_calibration: {ros__parameters: {min_speed: 0.5}}", "only for /auv/dvl_cal"),
+    "unknown under our name": ("dvl_calibration: {ros__parameters: {rate: 0.5}}", "rate: no such parameter"),
+    "misspelt for all": ("/**: {ros__parameters: {min_spede: 0.5}}", "did you mean 'min_speed'"),
+    "result over it": ("/**: {ros__parameters: {result_file: FILE}}", "would write over the input FILE"),
+}
+
+
+@pytest.mark.parametrize("what", PARAMETER_FILES)
+def test_a_parameter_file_that_would_leave_the_node_on_its_defaults_is_refused(tmp_path, what):
+    text, said = PARAMETER_FILES[what]
+    path = tmp_path / "params.yaml"
+    path.write_text(text.replace("FILE", str(path)))
+    before = path.read_bytes()
+    errors = refused_at_start("--params-file", str(path))
+    assert said.replace("FILE", str(path)) in errors and "Traceback" not in errors
+    assert [line for line in errors.splitlines() if "[rcl]" not in line][-1].startswith("calibration_node: ")
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["params.yaml"]
+
+
+def test_what_a_parameter_file_sets_for_all_nodes_disturbs_ours_not_and_is_said(world, tmp_path):
+    path = tmp_path / "params.yaml"
+    path.write_text("/**: {ros__parameters: {frame_rate: 30, camera: {exposure: 0.1}, min_speed: 0.7}}")
+    with node_here(world, [path], cli_args=["--ros-args", "--params-file", str(path)]) as node:
+        assert node._calibrator.parameters.min_speed == 0.7
+        assert not node.has_parameter("frame_rate") and not node.has_parameter("camera.exposure")
+        (tmp_path / "x.yaml").touch()
+        node._result_folder = tmp_path
+        answer = world.set_parameter("result_file", str(path))
+        assert not answer.successful and "would write over the input" in answer.reason
+
+
 def test_the_node_needs_nothing_that_a_ros_machine_does_not_have():
     """rosbags, mcap and rich are not in ROS: the node, and `dvl-calib run`, must do without."""
     code = (
@@ -180,10 +215,10 @@ def test_the_node_needs_nothing_that_a_ros_machine_does_not_have():
 
 
 @contextmanager
-def stalled_node(world: World, **parameters):
-    """The node, and what lets it run."""
+def stalled_node(world: World, files: Sequence[Path] = (), cli_args: Sequence[str] | None = None, **parameters):
+    """The node, and what lets it run. files: parameter files that cli_args name."""
     overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-    node = CalibrationNode(context=world.context, parameter_overrides=overrides)
+    node = CalibrationNode(files, context=world.context, parameter_overrides=overrides, cli_args=cli_args)
     executor = SingleThreadedExecutor(context=world.context)
     executor.add_node(node)
 
@@ -202,8 +237,8 @@ def stalled_node(world: World, **parameters):
 
 
 @contextmanager
-def node_here(world: World, **parameters):
-    with stalled_node(world, **parameters) as (node, run):
+def node_here(world: World, files: Sequence[Path] = (), cli_args: Sequence[str] | None = None, **parameters):
+    with stalled_node(world, files, cli_args, **parameters) as (node, run):
         run()
         yield node
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.parameter_files import load_parameters, parameter_file_text, parameter_table
+from dvl_calib_ros.files.parameter_files import load_parameters, names_of_others, parameter_file_text, parameter_table
 
 
 def file_with(folder: Path, text: str) -> Path:
@@ -74,8 +74,6 @@ def test_every_double_survives_being_written_as_text(name, part):
 
 WRONG = [
     ("{mim_speed: 1.0}", "mim_speed: no such parameter, did you mean 'min_speed'"),
-    ("{a: {b: 1}}", "a.b: no such parameter"),
-    ("{1: 2}", "1: no such parameter"),
     ("{min_speed: -1.0}", "min_speed: -1 is outside 0 .. 10 m/s"),
     ("{min_speed: .nan}", "min_speed: nan is not finite"),
     ("{min_speed: 1e999}", "min_speed: inf is not finite"),
@@ -129,6 +127,50 @@ def test_a_file_that_is_no_parameter_file_is_refused_by_name(tmp_path, content, 
     with pytest.raises(InputError) as caught:
         load_parameters(tmp_path / "x.yaml")
     assert str(caught.value).startswith(f"{tmp_path / 'x.yaml'}: ") and expected in str(caught.value)
+
+
+@pytest.mark.parametrize("section", ["/**", "/*/*", "/auv/*", "/auv/**"])
+def test_what_a_file_sets_for_all_nodes_and_is_not_ours_is_ignored_as_ros_does(tmp_path, section):
+    names = "{min_speed: 0.5, frame_rate: 30, camera: {exposure: 0.1}, robot_description: '<robot/>'}"
+    path = file_with(tmp_path, f"{section}: {{ros__parameters: {names}}}")
+    assert load_parameters(path) == Parameters(min_speed=0.5)
+    assert names_of_others(path, "/auv/dvl_calibration") == {"frame_rate", "camera.exposure", "robot_description"}
+
+
+@pytest.mark.parametrize("section", ["dvl_calibration", "/auv/dvl_calibration", "/**/dvl_calibration"])
+def test_what_a_file_sets_for_our_node_by_its_name_must_be_ours(tmp_path, section):
+    path = file_with(tmp_path, f"/**: {{ros__parameters: {{rate: 1}}}}\n{section}: {{ros__parameters: {{rate: 2}}}}")
+    with pytest.raises(InputError, match="rate: no such parameter"):
+        load_parameters(path)
+    assert names_of_others(path, "/auv/dvl_calibration") == (set() if "auv" in section or "*" in section else {"rate"})
+
+
+@given(name=st.sampled_from(list(SCHEMA)), data=st.data())
+def test_one_of_ours_with_a_letter_too_few_is_never_taken_for_another_nodes(tmp_path_factory, name, data):
+    at = data.draw(st.integers(0, len(name) - 1))
+    misspelt = name[:at] + name[at + 1 :]
+    if misspelt in SCHEMA:
+        return
+    path = file_with(tmp_path_factory.mktemp("misspelt"), f"/**: {{ros__parameters: {{{misspelt}: 1}}}}")
+    with pytest.raises(InputError, match=f"{misspelt}: no such parameter, did you mean"):
+        load_parameters(path)
+
+
+MATCHES = {
+    "/**": True, "/*": False, "/*/*": True, "**": True, "dvl_calibration": False, "auv/dvl_calibration": True,
+    "/auv/dvl_calibration": True, "/auv/*": True, "/**/dvl_calibration": True, "/port/dvl_calibration": False,
+    "/auv": False, "/auv/dvl": False, "/*/dvl_calibration": True, "/auv/**": True, "/auv/dvl_calibration/**": True,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("section", MATCHES)
+def test_a_file_that_has_nothing_for_the_node_by_its_full_name_is_refused(tmp_path, section):
+    path = file_with(tmp_path, f"'{section}': {{ros__parameters: {{min_speed: 0.5}}}}")
+    if MATCHES[section]:
+        assert names_of_others(path, "/auv/dvl_calibration") == set()
+    else:
+        with pytest.raises(InputError, match="nothing in it is for node /auv/dvl_calibration, only for"):
+            names_of_others(path, "/auv/dvl_calibration")
 
 
 def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
