@@ -15,6 +15,7 @@ import pytest
 from conftest import ROOT
 
 import dvl_calib_ros
+from dvl_calib_ros.errors import InputError
 
 SETUP = (ROOT / "setup.py").read_text()
 PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
@@ -145,8 +146,27 @@ def test_the_launch_file_remaps_the_topics_it_is_given_and_no_other(launched):
     assert launched(dvl_topic="/a50/velocity")["remappings"] == [("dvl/twist", "/a50/velocity")]
 
 
-def test_the_launch_file_leaves_use_sim_time_of_a_parameter_file_alone(launched):
-    assert launched(params_file="mine.yaml")["parameters"] == ["mine.yaml"]
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "no such ROS 2 parameter file"),
+        ("other: {ros__parameters: {min_speed: 0.5}}", "nothing in it is for node dvl_calibration"),
+        ("/**: {ros__parameters: {min_speed: -1.0}}", "min_speed: -1 is outside"),
+    ],
+)
+def test_a_parameter_file_that_is_missing_or_wrong_ends_the_launch(launched, tmp_path, text, said):
+    """ROS 2 would only warn, and start the node on its defaults."""
+    path = tmp_path / "params.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=said):
+        launched(params_file=str(path))
+
+
+def test_the_launch_file_leaves_use_sim_time_of_a_parameter_file_alone(launched, tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("/**: {ros__parameters: {use_sim_time: true}}")
+    assert launched(params_file=str(mine))["parameters"] == [str(mine)]
     assert launched(use_sim_time="true")["parameters"][1] == {"use_sim_time": True}
     assert launched(use_sim_time="false")["parameters"][1] == {"use_sim_time": False}
 
