@@ -210,7 +210,7 @@ def test_no_output_of_a_command_can_be_one_of_its_inputs_by_any_name(scratch, ca
 # Options that name what is read; what is not among these is written, and has to be in `COMMAND`
 READ = {"--params", "--urdf", "--gnss", "--attitude", "--motion-of"}
 # A trial reads nothing, and goes on in its folder; the demo's bag is its own
-APART = {("diagnose", "--out"), ("demo", "--report")}
+APART = {("diagnose", "--out"), ("diagnose", "--page"), ("demo", "--report")}
 
 
 def test_every_option_that_writes_is_tried_here():
