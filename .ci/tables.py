@@ -1,4 +1,4 @@
-"""Write the tables that the code makes into README.md and docs/ anew, and config/calibration.yaml: python .ci/tables.py."""
+"""Make the generated tables of README.md and docs/ and config/calibration.yaml anew: python .ci/tables.py."""
 
 from __future__ import annotations
 
