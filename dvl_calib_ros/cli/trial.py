@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 DEFAULT_CASES = 100
 KIND_CHOICES = ("all", "tuning", "held-out")
+CATEGORY_CHOICES = ("null", "hard_null", "single", "pair", "triple", "unknown", "unidentifiable")
 FAMILY_CHOICES = ("simulated", "half_real", "horizontal", "several")
 
 
@@ -35,6 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="simulated manoeuvres, real motion, the same with a horizontal reference, or several recordings of one "
         "vehicle; may be given again; default: all, in turns",
     )  # fmt: skip
+    group.add_argument(
+        "--category", choices=CATEGORY_CHOICES, action="append", help="of cases; may be given again; default: all"
+    )
     group.add_argument(
         "--out", type=Path, default=Path("dvl_calib_trial"), metavar="FOLDER",
         help="folder of the trial, which goes on where it was stopped; default: %(default)s",
@@ -66,6 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
         kinds = tuple(kind for kind in kinds if kind != RECORDED)
         errors.print(f"[yellow]note:[/] {NO_RECORDINGS}")
     cases = plan(kinds, [Family(name) for name in arguments.family or FAMILY_CHOICES])
+    cases = [case for case in cases if case.category.value in (arguments.category or CATEGORY_CHOICES)]
     if arguments.case:
         cases = _chosen(cases, arguments.case)
     elif not arguments.full:
@@ -106,6 +111,7 @@ def _command(arguments: argparse.Namespace) -> str:
     else:
         words.append("--full" if arguments.full else f"--cases {arguments.cases or DEFAULT_CASES}")
     words += [f"--family {name}" for name in arguments.family or ()]
+    words += [f"--category {name}" for name in arguments.category or ()]
     if arguments.kinds != "all":
         words.append(f"--kinds {arguments.kinds}")
     return " ".join(words)

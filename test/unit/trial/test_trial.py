@@ -16,7 +16,7 @@ import pytest
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.frames import attitude_enu_flu_from_ned_frd, rotation_from_rpy
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.cli.trial import add_arguments, run
+from dvl_calib_ros.cli.trial import CATEGORY_CHOICES, FAMILY_CHOICES, add_arguments, run
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -413,6 +413,11 @@ def test_a_folder_with_another_trial_is_refused(tmp_path):
     (tmp_path / "answers.jsonl").write_text("no json\n")
     with pytest.raises(InputError, match="not the answers of a trial"):
         Trial(tmp_path, seed=1, jobs=1, answerer=count_messages).run([])
+
+
+def test_the_command_offers_every_family_and_category():
+    assert set(CATEGORY_CHOICES) == {each.value for each in Category}
+    assert set(FAMILY_CHOICES) == {each.value for each in Family}
 
 
 @pytest.mark.parametrize(
