@@ -31,8 +31,12 @@ class Drawn:
     noise: np.random.Generator
 
 
+class NotDrawnError(InputError):
+    """No draw of a case is what it is meant to be: a seed lacks this case."""
+
+
 def draw(case: Case, seed: int) -> Drawn:
-    """Draw until the case is what it is meant to be. Raises InputError if it never is."""
+    """Draw until the case is what it is meant to be. Raises NotDrawnError if it never is."""
     rng, noise = case.seeds(seed)
     source = simulated if case.family is Family.SIMULATED else half_real
     for _ in range(MAX_DRAWS):
@@ -42,7 +46,7 @@ def draw(case: Case, seed: int) -> Drawn:
             faults, rest = known
             scene = half_real.as_recorded(case, scene)
             return Drawn(scene, faults, _truth(case, scene, faults, rest), noise)
-    raise InputError(f"case {case.id} ({case.key}): none of {MAX_DRAWS} draws is as it should be; use another --seed")
+    raise NotDrawnError(f"{case.key}: none of {MAX_DRAWS} draws is as it should be; use another --seed")
 
 
 def _truth(case: Case, scene: Scene, faults: Faults, rest: dict[str, Any]) -> Truth:

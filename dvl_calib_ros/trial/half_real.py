@@ -13,9 +13,9 @@ import numpy as np
 
 from .plan import Case, Family
 from .recorded import WITH_INS, WITHOUT_INS, recorded
-from .simulated import MIN_OUTSIDE_SHARE, Known, vehicle
+from .simulated import Known, known_of_unknown, vehicle
 from .sizes import as_at_sea, direction, either, log_uniform, oddity, sized
-from .strength import OF_THE_DAY, Scene, Yardstick, outside_share
+from .strength import OF_THE_DAY, Scene, Yardstick
 from .truth import Category
 from .vehicle import Values, of_one_recording
 
@@ -141,9 +141,4 @@ def _unknown(case: Case, drawn: Scene, rng: np.random.Generator) -> Known | None
     values = sized(yardstick, case.name, case.q, oddity(case.name, rng), beside)
     if not values:
         return None
-    together = {**beside, case.name: values}
-    vector = yardstick.vector(together) - yardstick.vector(beside)
-    share = outside_share(vector, yardstick.spans(beside))
-    if share < MIN_OUTSIDE_SHARE:
-        return None
-    return together, {"q": {case.name: yardstick.q_beside(case.name, together)}, "outside_share": share}
+    return known_of_unknown(yardstick, case.name, {**beside, case.name: values})

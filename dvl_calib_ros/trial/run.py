@@ -22,6 +22,7 @@ from ..calibration.parameters import Parameters
 from ..errors import InputError
 from ..files.atomic import save_text
 from ..parallel import outcomes_on_cores
+from .cases import NotDrawnError
 from .generator import record
 from .plan import Case
 from .strength import Yardstick
@@ -39,7 +40,7 @@ AT_ANY_TIME = {
     "mounting_moved": {"from_recording": 1.0},
 }
 # The draws or the physics of the generator have changed: answers to older cases are answers to others
-GENERATOR_VERSION = 4
+GENERATOR_VERSION = 5
 
 
 def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
@@ -117,7 +118,10 @@ def _answer(case: Case, trial: Trial) -> Document:
     """Record a case, seal its truth, and ask."""
     bags = trial.folder / "bags" / case.id
     shutil.rmtree(bags, ignore_errors=True)  # half written when the trial was stopped
-    recorded = record(case, trial.seed, bags)
+    try:
+        recorded = record(case, trial.seed, bags)
+    except NotDrawnError as error:
+        return {"id": case.id, "document": {"verdict": "not_drawn", "message": str(error)}, "cpu_s": 0.0}
     drawn = recorded.drawn
     seal(drawn.truth, trial.sealed)
     began = time.process_time()

@@ -17,8 +17,8 @@ from .truth import Category
 from .vehicle import FAULTS, Faults, Vehicle, of_one_recording
 
 MAX_PAIR_CORRELATION = 0.8
-# An unknown fault that the library together explains by more than this is none
-MIN_OUTSIDE_SHARE = 0.5
+# What one fault of the library, or two, must leave of the square of an unknown one, or it would be taken for them
+MIN_OUTSIDE_SHARES = (0.45, 0.35)
 # A fault that is to be hidden must not be stronger than this
 MAX_HIDDEN_Q = 1.0
 
@@ -108,11 +108,18 @@ def _unknown(case: Case, drawn: Scene, rng: np.random.Generator) -> Known | None
     values = sized(yardstick, case.name, case.q, oddity(case.name, rng))
     if not values:
         return None
-    vector = yardstick.vector({case.name: values})
-    share = outside_share(vector, yardstick.spans())
-    if share < MIN_OUTSIDE_SHARE:
+    return known_of_unknown(yardstick, case.name, {case.name: values})
+
+
+def known_of_unknown(yardstick: Yardstick, name: str, together: Faults) -> Known | None:
+    """Of a fault outside the library, with others beside it or alone; None if the library would explain it."""
+    beside = {other: values for other, values in together.items() if other != name}
+    vector = yardstick.vector(together) - yardstick.vector(beside)
+    spans = yardstick.spans(beside)
+    shares = [outside_share(vector, spans, n) for n in (1, 2)]
+    if any(share < least for share, least in zip(shares, MIN_OUTSIDE_SHARES, strict=True)):
         return None
-    return {case.name: values}, {"q": {case.name: float(np.linalg.norm(vector))}, "outside_share": share}
+    return together, {"q": {name: yardstick.q_beside(name, together)}, "outside_share": shares[-1]}
 
 
 def _unidentifiable(case: Case, drawn: Scene, rng: np.random.Generator) -> Known | None:

@@ -292,6 +292,12 @@ def largest_correlation(vector_a: Floats, span_a: Floats, vector_b: Floats, span
     return float(np.sqrt(max(0.0, *explained)))
 
 
-def outside_share(vector: Floats, spans: Mapping[str, Floats]) -> float:
-    """Share of a vector's square that nothing in the library explains, not even all of it together."""
-    return (distance(vector, np.column_stack(list(spans.values()))) / float(np.linalg.norm(vector))) ** 2
+def outside_share(vector: Floats, spans: Mapping[str, Floats], n: int) -> float:
+    """Share of a vector's square that is left by n faults of the library, each the best beside those before it."""
+    columns = np.zeros((len(vector), 0))
+    left, rivals = np.inf, dict(spans)
+    for _ in range(n):
+        lefts = {name: distance(vector, np.hstack([columns, span])) for name, span in rivals.items()}
+        best = min(lefts, key=lambda name: lefts[name])
+        columns, left = np.hstack([columns, rivals.pop(best)]), lefts[best]
+    return float(left / np.linalg.norm(vector)) ** 2

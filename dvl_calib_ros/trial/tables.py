@@ -27,7 +27,7 @@ Written by a command; do not edit. Measured by version {version} with
 {command}
 ```
 
-over {cases} cases, which are a fair part of the trial. Its generator shares no code with the effects, the simulator and
+over {cases} cases. The generator shares no code with the effects, the simulator and
 the diagnosis, and the truth stays sealed until the answers are there.
 
 Families: *simulated* manoeuvres with effects of a strength q wanted; *half_real*: motion recorded at sea, a DVL

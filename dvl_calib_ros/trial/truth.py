@@ -32,7 +32,7 @@ class Truth:
     id: as in the name of the bag, says nothing. key: says everything, and draws it again. family: as in `plan`. faults:
     name -> parameters, "seconds@1" being that of recording 1. q: of each fault, others beside it. distances: name of
     another fault of the library -> norm of what it leaves at best of the trace of that fault which it is nearest to.
-    correlation: of a pair, at most. outside_share: of an unknown fault, what the library together does not explain.
+    correlation: of a pair, at most. outside_share: of an unknown fault, what two of the library leave.
     hardness: of a hard null. twin: id of the same case with all axes. before_mps: error (rms) that the faults make
     beyond the calibration. noise_mps: error that the noise makes.
     """

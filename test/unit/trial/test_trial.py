@@ -258,7 +258,7 @@ def test_the_two_of_a_pair_can_be_told_apart_and_what_is_unknown_is_not_in_the_l
     assert len(pair.faults) == 2 and pair.correlation < 0.8
     assert list(pair.q.values()) == pytest.approx([12.0, 12.0], rel=0.01)
     unknown = draw(Case(Category.UNKNOWN, "zigzag", "slow_heave", 20.0), 3).truth
-    assert unknown.outside_share >= 0.5 and unknown.q["slow_heave"] == pytest.approx(20.0, rel=0.01)
+    assert unknown.outside_share >= 0.35 and unknown.q["slow_heave"] == pytest.approx(20.0, rel=0.01)
     assert "slow_heave" not in EFFECTS
 
 
