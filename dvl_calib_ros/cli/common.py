@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ..calibration.parameters import Parameters
     from ..calibration.results import Estimate, Result
-    from ..discovery.discover import Discovery
+    from ..discovery.discover import Discovery, Given
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
@@ -55,12 +55,18 @@ def discovered(arguments: argparse.Namespace, bags: Sequence[Path], parameters: 
 
     parameters: as `load` made them of the same options.
     """
-    from ..discovery.discover import Given, discover
+    from ..discovery.discover import discover
+
+    return discover(bags, parameters, given(arguments))
+
+
+def given(arguments: argparse.Namespace) -> Given:
+    """What the options of a command name, which is not looked for. Raises InputError."""
+    from ..discovery.discover import Given
     from ..files.parameter_files import given_parameters
 
     named = given_parameters(arguments.params, arguments.overrides)
-    given = Given(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic, named)
-    return discover(bags, parameters, given)
+    return Given(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic, named)
 
 
 def print_found(discovery: Discovery, bags: Sequence[Path]) -> None:

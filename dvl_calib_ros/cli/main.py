@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from .. import __version__
-from . import apply, demo, diagnose, evaluate, import_, parameters, replay, run, salvage, simulate, watch
+from . import apply, demo, diagnose, doctor, evaluate, import_, parameters, replay, run, salvage, simulate, watch
 
-COMMANDS = (run, watch, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo)
+COMMANDS = (run, watch, doctor, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo)
 
 
 class _Parser(argparse.ArgumentParser):

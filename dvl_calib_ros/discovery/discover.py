@@ -50,16 +50,25 @@ class Given:
 class Discovery:
     """What to calibrate with.
 
-    found: what was found and where; doubts: what the user should not overlook; sentences. values: the parameters that
-    were found, which are in `parameters`.
+    found: what was found and where; notes: what was passed over; contradictions: where the recording's data do not
+    bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`. fit: how
+    well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
     """
 
     topics: Topics
     parameters: Parameters
     found: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
+    fit: Fit | None = None
+    reference_frame: VelocityFrame | None = None
     survey: Survey | None = field(default=None, repr=False)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the user should not overlook."""
+        return (*self.contradictions, *self.notes)
 
     def document(self) -> dict[str, Any]:
         """Plain data, for JSON: topics, what was found, doubts."""
@@ -85,7 +94,9 @@ class _Search:
         self._tree = FrameTree.of(seen.transforms, seen.descriptions)
         self._values: dict[str, Any] = {}
         self._found: list[str] = []
-        self._doubts: list[str] = list(self._tree.problems)
+        self._notes: list[str] = list(self._tree.problems)
+        self._contradictions: list[str] = []
+        self._chosen: Fit | None = None
 
     def run(self) -> Discovery:
         topics = self._topics()
@@ -98,8 +109,11 @@ class _Search:
             topics,
             self._parameters.replace(**self._values),
             tuple(self._found),
-            tuple(self._doubts),
+            tuple(self._notes),
+            tuple(self._contradictions),
             dict(self._values),
+            self._chosen,
+            self._reference_frame(reference),
             self._seen,
         )
 
@@ -112,7 +126,7 @@ class _Search:
         if given.gnss_topic is None:
             chosen, said = choose.choose_reference(self._seen, default.gnss, dvl, _difference)
             gnss = chosen or default.gnss
-            self._doubts += said
+            self._notes += said
         elif given.gnss_topic != choose.NONE:
             gnss = self._named("gnss", given.gnss_topic) or gnss
         else:
@@ -160,7 +174,7 @@ class _Search:
         imu_frames = self._imu_frames(imu)
         chosen = None
         if reference is not None:
-            chosen = self._fit(dvl, reference, imu, known, turned, imu_frames, placed)
+            chosen = self._chosen = self._fit(dvl, reference, imu, known, turned, imu_frames, placed)
         elif known is None:
             self._mounting_from_motion(dvl, turned)
         if chosen is not None:
@@ -187,7 +201,7 @@ class _Search:
         frame = self._parameters.dvl_frame or dvl.frame_id
         if self._is_body_or_earth(dvl.frame_id) and not self._parameters.dvl_frame:
             self._values["dvl_frame"] = dvl.frame_id
-            self._doubts.append(
+            self._contradictions.append(
                 f"{dvl.topic}: the DVL's messages carry frame {dvl.frame_id!r} and not one of its own; they are taken "
                 "as they are"
             )
@@ -196,7 +210,7 @@ class _Search:
             like = self._tree.likely(choose.DVL_WORDS)
             placed = None if like is None else self._tree.placed(like, base_frame)
             if placed is not None:
-                self._doubts.append(
+                self._notes.append(
                     f"no transform has the DVL's frame {frame!r}; that of {placed.frame!r} is taken for it"
                 )
         if placed is not None and placed.base != base_frame.strip("/") and not self._gives("base_frame"):
@@ -230,6 +244,13 @@ class _Search:
         if name in (base, self._parameters.base_frame.strip("/")):
             return VelocityFrame.BODY
         return EARTH_FRAMES.get(name.lower())
+
+    def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
+        """The frame that the reference is taken in; None without one, or if nothing tells."""
+        if reference is None:
+            return None
+        taken = self._values.get("gnss_frame")
+        return self._declared_reference(reference) if taken is None else VelocityFrame(taken)
 
     def _imu_frames(self, imu: Look | None) -> list[ImuFrame]:
         """How the IMU's data may be meant, the likeliest first."""
@@ -293,7 +314,7 @@ class _Search:
                     f"gnss_frame:={name})"
                 )
             else:
-                self._doubts.append(
+                self._contradictions.append(
                     f"{reference.topic}: frame {reference.frame_id!r} says {declared.value}, but DVL and reference "
                     f"agree only as {name}; taken so. To insist: -p gnss_frame:={declared.value}"
                 )
@@ -306,7 +327,7 @@ class _Search:
             if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
                 self._mounting_found(nominal_rpy(found), "where DVL and reference agree best")
         elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
-            self._doubts.append(
+            self._contradictions.append(
                 f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "
                 f"{_degrees(nominal_rpy(found))}: try -p mounting_rpy:={_option(nominal_rpy(found))}"
             )
@@ -324,9 +345,11 @@ class _Search:
         if not any(rpy):
             return
         self._values["mounting_rpy"] = rpy
+        # of a level vehicle, a heading that counts from elsewhere looks the same
+        quarter = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
         self._found.append(
             f"mounting {_degrees(rpy)}, {why}: nothing in the bag says how the DVL is mounted (-p "
-            f"mounting_rpy:={_option(rpy)})"
+            f"mounting_rpy:={_option(rpy)}){quarter}"
         )
 
     def _mounting_from_motion(self, dvl: Look, turned: bool) -> None:

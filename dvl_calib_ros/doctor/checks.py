@@ -1,0 +1,202 @@
+"""What can be seen of a single topic: stamps, gaps, zeros, repetitions, covariances, axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..calibration.findings import Finding
+from ..calibration.frames import Array
+from ..messages.drivers import VELOCITY_TYPES
+from .columns import Recorded
+from .kinds import named
+
+SECOND_NS = 1_000_000_000
+# Fewer messages say nothing about rates and jitter.
+ENOUGH = 20
+# Shares of messages that are worth a word: a single outlier is not.
+SOME, MANY = 0.005, 0.05
+# Stamps that jitter by more than this share of their interval ...
+JITTER = 0.05
+# ... against the rhythm of the sensor: an interval too long is followed by one too short (white jitter gives -0.5)
+AGAINST_RHYTHM = -0.3
+# Two clocks that agree to this are one; more than transport and processing make (s)
+SAME_CLOCK = 1.0
+# A silence is a gap from this on, and from so many intervals (s, 1)
+GAP, GAP_INTERVALS = 2.0, 5.0
+# A claimed noise is wrong if it is so many times what the data show, or so small a share of it
+CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE = 5.0, 0.1
+# A reference's noise is slow and does not show from message to message; only what no receiver claims is told (m/s)
+NO_RECEIVER = (1e-3, 1.0)
+# Standard deviation of a normal distribution over its median absolute deviation
+NORMAL_FROM_MEDIAN = 1.4826
+# A noise below this is none to speak of (m/s)
+QUIET = 0.02
+
+
+def interval_s(topic: Recorded) -> float:
+    """Median interval of the messages, s; 0 of fewer than two."""
+    return float(np.median(np.diff(topic.log_ns))) * 1e-9 if len(topic) > 1 else 0.0
+
+
+def stamp_findings(topic: Recorded) -> list[Finding]:
+    """Zero stamps, stamps of reception, stamps that go back, jump or repeat."""
+    n = len(topic)
+    if n < ENOUGH:
+        return []
+    found = []
+    zero = topic.stamps_ns == 0
+    if zero.any():
+        found.append(named("DOCTOR_STAMP_ZERO", topic=topic.topic, share=zero.mean()))
+    stamps, log = topic.stamps_ns[~zero], topic.log_ns[~zero]
+    if len(stamps) < ENOUGH:
+        return found
+    steps, log_steps = np.diff(stamps) * 1e-9, np.diff(log) * 1e-9
+    back = steps < 0.0
+    if back.any():
+        seconds = float(-steps[back].min())
+        found.append(named("DOCTOR_STAMP_BACK", topic=topic.topic, count=int(back.sum()), seconds=seconds))
+    ahead = steps - log_steps
+    if ahead.max() > SAME_CLOCK:
+        found.append(named("DOCTOR_STAMP_JUMP", topic=topic.topic, seconds=float(ahead.max())))
+    repeated = float((steps == 0.0).mean())
+    if repeated > SOME:
+        found.append(named("DOCTOR_REPEATED_STAMP", topic=topic.topic, share=repeated))
+    return found + _reception(topic.topic, steps, log_steps)
+
+
+def _reception(name: str, steps: Array, log_steps: Array) -> list[Finding]:
+    """Whether stamps jitter as the reception does, about a sensor's steady rhythm."""
+    period = float(np.median(steps))
+    steady = (steps > 0.3 * period) & (steps < 1.7 * period)
+    if period <= 0.0 or steady.sum() < ENOUGH:
+        return []
+    jitter = float(steps[steady].std())
+    if jitter < JITTER * period:
+        return []
+    e = steps - period
+    pairs = steady[1:] & steady[:-1]
+    if pairs.sum() < ENOUGH:
+        return []
+    rhythm = float(np.corrcoef(e[1:][pairs], e[:-1][pairs])[0, 1])
+    together = float(np.corrcoef(steps[steady], log_steps[steady])[0, 1]) if log_steps[steady].std() > 0.0 else 0.0
+    if rhythm > AGAINST_RHYTHM or together < 0.9:
+        return []
+    return [named("DOCTOR_STAMP_RECEPTION", topic=name, jitter_ms=1e3 * jitter, period_ms=1e3 * period)]
+
+
+def clock_offset_s(topic: Recorded) -> float | None:
+    """How far the stamps are ahead of the log, s; None without stamps."""
+    stamped = topic.stamps_ns != 0
+    return float(np.median(topic.stamps_ns[stamped] - topic.log_ns[stamped])) * 1e-9 if stamped.any() else None
+
+
+def clock_findings(topics: Mapping[str, Recorded]) -> list[Finding]:
+    """Streams (by dvl, reference, imu) that stamp by another clock than the rest."""
+    offsets = {role: clock_offset_s(topic) for role, topic in topics.items()}
+    known = {role: offset for role, offset in offsets.items() if offset is not None}
+    if len(known) < 2:
+        return []
+    # of three the one that is alone; of two the one that is not the DVL
+    middle = float(np.median(list(known.values()))) if len(known) > 2 else known.get("dvl", 0.0)
+    other = min(known, key=lambda role: abs(known[role] - middle))
+    found = []
+    for role, offset in known.items():
+        if role != other and abs(offset - middle) > SAME_CLOCK:
+            late = offset - middle
+            parameter = {"dvl": "dvl", "reference": "reference", "imu": "imu"}[role] + "_time_offset"
+            fields = {"seconds": abs(late), "side": "after" if late > 0.0 else "before", "offset": late}
+            found.append(
+                named(
+                    "DOCTOR_CLOCKS",
+                    topic=topics[role].topic,
+                    other=topics[other].topic,
+                    parameter=parameter,
+                    **fields,
+                )
+            )
+    return found
+
+
+def gap_findings(topic: Recorded) -> list[Finding]:
+    """Silences, by log time."""
+    if len(topic) < ENOUGH:
+        return []
+    steps = np.diff(topic.log_ns) * 1e-9
+    gaps = steps > max(GAP, GAP_INTERVALS * float(np.median(steps)))
+    if not gaps.any():
+        return []
+    at_s = float(topic.log_ns[int(np.argmax(steps))] - topic.log_ns[0]) * 1e-9
+    fields = {"seconds": float(steps[gaps].sum()), "count": int(gaps.sum()), "at_s": at_s}
+    return [named("DOCTOR_GAPS", topic=topic.topic, **fields)]
+
+
+def velocity_findings(topic: Recorded, is_dvl: bool) -> list[Finding]:
+    """Zeros, repetitions, what is not finite, refusals, axes and covariances of velocities."""
+    if not len(topic):
+        return []
+    found = []
+    values = topic.values
+    finite = np.isfinite(values).all(axis=1)
+    if not finite.all():
+        found.append(named("DOCTOR_NOT_FINITE", topic=topic.topic, share=1.0 - finite.mean()))
+    zero = (values == 0.0).all(axis=1)
+    if zero.mean() > SOME:
+        found.append(named("DOCTOR_ZEROS", topic=topic.topic, share=zero.mean()))
+    if is_dvl:
+        for rule in VELOCITY_TYPES[topic.msgtype].rules:
+            share = topic.refused.get(rule.counter, 0) / len(topic)
+            if share > SOME and rule.counter != "zero_velocity":
+                reason = {"reason": rule.in_words, "remedy": rule.remedy}
+                found.append(named("DOCTOR_REFUSED", topic=topic.topic, share=share, **reason))
+    measured = values[finite & ~zero]
+    if len(measured) < ENOUGH:
+        return found
+    repeats = float((measured[1:] == measured[:-1]).all(axis=1).mean())
+    if repeats > MANY:
+        found.append(named("DOCTOR_FROZEN", topic=topic.topic, share=repeats))
+    silent = [name for name, axis in zip("xyz", measured.T, strict=True) if not axis.any()]
+    if silent:
+        found.append(named("DOCTOR_AXIS", topic=topic.topic, axes=" and ".join(silent)))
+    return found + _covariance(topic, finite & ~zero, is_dvl)
+
+
+def shown_noise(values: Array) -> float:
+    """Noise per axis (m/s) by what changes from message to message, which holds a little of the motion as well."""
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < ENOUGH:
+        return 0.0
+    changes = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0) * NORMAL_FROM_MEDIAN
+    return float(np.sqrt((changes**2).mean() / 6.0))  # of white noise a second difference has six times the variance
+
+
+def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Finding]:
+    """A constant covariance that the data contradict."""
+    variances = topic.variances[used]
+    if np.isnan(variances).any() or np.ptp(variances, axis=0).max() > 0.0:
+        return []
+    claimed = float(np.sqrt(variances[0].mean()))
+    shown = shown_noise(topic.values[used])
+    if is_dvl:
+        wrong = claimed > CLAIMS_TOO_MUCH * max(shown, 1e-4) or (
+            claimed < CLAIMS_TOO_LITTLE * shown and shown > QUIET and interval_s(topic) <= 0.25
+        )
+    else:
+        wrong = not NO_RECEIVER[0] <= claimed <= NO_RECEIVER[1]
+    return [named("DOCTOR_COVARIANCE", topic=topic.topic, claimed=claimed, shown=shown)] if wrong else []
+
+
+def orientation_findings(imu: Recorded) -> list[Finding]:
+    """Whether an IMU gives an orientation at all."""
+    q = imu.values
+    given = q[np.isfinite(q).all(axis=1)]
+    if not len(given):
+        why = "orientation_covariance[0] is -1"
+    elif not np.abs(np.linalg.norm(given, axis=1) - 1.0).min() < 0.1:
+        why = "its quaternions have no length"
+    elif len(given) > ENOUGH and np.ptp(given, axis=0).max() == 0.0:
+        why = "the same in every message"
+    else:
+        return []
+    return [named("DOCTOR_NO_ORIENTATION", topic=imu.topic, why=why)]

@@ -1,0 +1,259 @@
+"""The whole examination of a recording: what is in it, what is wrong with it, what its motion can show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bags.reader import BagReader
+from ..calibration.findings import Finding, Severity
+from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
+from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
+from ..calibration.samples import VelocityFrame
+from ..discovery.discover import Discovery, Given, discover
+from ..discovery.fit import FITS
+from ..messages.drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES
+from . import checks
+from .columns import Recorded, recorded
+from .kinds import named
+
+# A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
+SLOW_REFERENCE = 0.8
+# Speeds that differ by more are not in one unit
+UNIT_FACTORS = (0.7, 1.4)
+UNITS = {1000.0: "mm/s", 100.0: "cm/s", 1.0 / 0.514444: "knots", 3.6: "km/h", 1.0 / 0.3048: "feet/s"}
+# A vehicle is taken to move if so many of its samples are faster than min_speed
+MOVES_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Content:
+    """A topic that the calibration needs. role: DVL, reference or IMU; frame_id: of its first message."""
+
+    role: str
+    topic: str
+    msgtype: str
+    messages: int
+    rate_hz: float
+    frame_id: str
+    covariance: str
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the motion shows of one error.
+
+    std: standard deviation to expect, degrees or per cent. share: of the way from knowing nothing (0) to fine (1).
+    needs: the manoeuvre that shows more, '' if it is shown.
+    """
+
+    name: str
+    unit: str
+    std: float
+    share: float
+    needs: str
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What the doctor says of a recording."""
+
+    paths: tuple[Path, ...]
+    seconds: float
+    contents: tuple[Content, ...]
+    discovery: Discovery
+    findings: tuple[Finding, ...]
+    speed_mps: float
+    shown: tuple[Shown, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether there is a reference velocity."""
+        return any(content.role == "reference" for content in self.contents)
+
+    @property
+    def verdict(self) -> str:
+        """Whether it can calibrate: yes, partly, or no."""
+        if any(found.severity is Severity.ERROR for found in self.findings):
+            return "no"
+        needed = [each for each in self.shown if each.name in ("pitch", "yaw")]  # what turns a track and lifts it
+        return "yes" if needed and not any(each.needs for each in needed) else "partly"
+
+    def document(self) -> dict[str, Any]:
+        """Plain data, for JSON."""
+        return {
+            "verdict": self.verdict,
+            "seconds": self.seconds,
+            "topics": {
+                content.role.lower(): {
+                    "topic": content.topic,
+                    "type": content.msgtype,
+                    "messages": content.messages,
+                    "rate_hz": content.rate_hz,
+                    "frame_id": content.frame_id,
+                    "covariance": content.covariance,
+                }
+                for content in self.contents
+            },
+            "discovery": self.discovery.document(),
+            "findings": [found.as_dict() for found in self.findings],
+            "speed_mps": self.speed_mps,
+            "shown": {
+                each.name: {"std": each.std, "unit": each.unit, "share": each.share, "needs": each.needs}
+                for each in self.shown
+            },
+            "notes": list(self.notes),
+        }
+
+
+def examine(paths: Sequence[Path], parameters: Parameters, given: Given | None = None) -> Examination:
+    """Look at everything. Raises InputError for what is no recording or has no DVL."""
+    discovery = discover(paths, parameters, given)
+    topics = discovery.topics
+    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+        types = bag.topics
+        wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
+        there = {role: name for role, name in wanted.items() if name in types}
+        columns = recorded(bag, sorted(there.values()), discovery.parameters)
+        start_ns, end_ns = bag.span_ns
+        counts = bag.message_counts
+        notes = tuple(bag.notes)
+    streams = {role: columns[name] for role, name in there.items()}
+    seconds = max(1e-9 * (end_ns - start_ns), 1e-9)
+    velocity = _body_velocity(streams["dvl"], discovery)
+    findings = _findings(streams, discovery, velocity)
+    usable = not any(found.code == "DOCTOR_NO_ORIENTATION" for found in findings)
+    return Examination(
+        tuple(paths),
+        seconds,
+        tuple(_content(role, topic, discovery, counts[topic.topic] / seconds) for role, topic in streams.items()),
+        discovery,
+        tuple(findings),
+        float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
+        tuple(_shown(velocity, streams, discovery.parameters)) if usable else (),
+        notes,
+    )
+
+
+def _content(role: str, topic: Recorded, discovery: Discovery, rate_hz: float) -> Content:
+    look = discovery.survey.looks.get(topic.topic) if discovery.survey else None
+    variances = topic.variances[np.isfinite(topic.variances).all(axis=1)]
+    if role == "imu":
+        covariance = ""
+    elif not len(variances):
+        covariance = "no covariance"
+    else:
+        constant = " always" if np.ptp(variances, axis=0).max() == 0.0 else ""
+        covariance = f"±{math.sqrt(float(np.median(variances.mean(axis=1)))):.2g} m/s{constant}"
+    name = {"dvl": "DVL", "reference": "reference", "imu": "IMU"}[role]
+    frame_id = "" if look is None else look.frame_id
+    return Content(name, topic.topic, topic.msgtype, len(topic), rate_hz, frame_id, covariance)
+
+
+def _body_velocity(dvl: Recorded, discovery: Discovery) -> Array:
+    """The DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
+    parameters = discovery.parameters
+    values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
+    values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
+    look = discovery.survey.looks.get(dvl.topic) if discovery.survey else None
+    suffix = "" if look is None else look.frame_id.lower().rpartition("_")[2]
+    by_message = suffix == "frd" or (VELOCITY_TYPES[dvl.msgtype].points_down and suffix != "flu")
+    turned = by_message if parameters.dvl_axes == FROM_MESSAGE else parameters.dvl_axes == FRD
+    flu = values @ FLU_FROM_FRD if turned else values
+    return flu @ rotation_from_rpy(parameters.mounting_rpy).T
+
+
+def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Finding]:
+    dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
+    found: list[Finding] = []
+    for topic in streams.values():
+        found += checks.stamp_findings(topic) + checks.gap_findings(topic)
+    found += checks.clock_findings(streams)
+    found += checks.velocity_findings(dvl, True)
+    if reference is not None:
+        found += checks.velocity_findings(reference, False)
+        if len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
+            rate_hz = 1.0 / checks.interval_s(reference)
+            found.append(named("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
+    if imu is not None and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
+        found += checks.orientation_findings(imu)
+    found += [named("DOCTOR_FRAMES", said=doubt) for doubt in discovery.contradictions]
+    parameters = discovery.parameters
+    speed = np.linalg.norm(velocity, axis=1)
+    units = [] if reference is None else _units(dvl, reference)
+    if units:
+        found += units
+    elif not len(speed) or (speed > parameters.min_speed).mean() < MOVES_SHARE:
+        found.append(named("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
+    elif reference is not None:
+        found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
+    return sorted(found, key=lambda each: each.severity is not Severity.ERROR)
+
+
+def _units(dvl: Recorded, reference: Recorded) -> list[Finding]:
+    """DVL and reference whose speeds differ by the factor between two units."""
+    speeds = []
+    for topic in (dvl, reference):
+        norms = np.linalg.norm(topic.values, axis=1)
+        norms = norms[np.isfinite(norms) & (norms > 0.0)]
+        speeds.append(float(np.median(norms)) if len(norms) else 0.0)
+    if not min(speeds) > 0.0:
+        return []
+    factor = speeds[0] / speeds[1]
+    if UNIT_FACTORS[0] < factor < UNIT_FACTORS[1]:
+        return []
+    guess = ""
+    for of_unit, unit in UNITS.items():
+        for which, value in (("the DVL", factor), ("the reference", 1.0 / factor)):
+            if abs(value / of_unit - 1.0) < 0.1:
+                guess = f" ({which} in {unit}?)"
+    return [named("DOCTOR_UNITS", factor=factor, guess=guess)]
+
+
+def _disagreement(discovery: Discovery, noise: float) -> list[Finding]:
+    """DVL and reference that no frames bring together.
+
+    noise: of the reference per axis, as a share of the speed.
+    """
+    if discovery.fit is None or discovery.fit.best_left**2 - 3.0 * noise**2 < FITS**2:
+        return []
+    return [named("DOCTOR_DISAGREE", left=discovery.fit.best_left)]
+
+
+_NEEDS = {
+    "roll": "motion across the bow: turns, a box or a figure eight",
+    "pitch": "longer legs, faster",
+    "yaw": "longer legs, faster",
+    "scale": "longer legs, faster",
+}
+
+
+def _shown(velocity: Array, streams: dict[str, Recorded], parameters: Parameters) -> list[Shown]:
+    """Standard deviations to expect with the reference there is, from the sums of squares of the motion."""
+    reference = streams.get("reference")
+    if reference is None or not len(reference) or not len(velocity):
+        return []
+    variance = parameters.gnss_aided_std**2
+    given = reference.variances[np.isfinite(reference.variances).all(axis=1)]
+    if parameters.use_message_covariance and len(given):
+        variance = float(np.median(given.mean(axis=1)))
+    x, y, z = (velocity**2).mean(axis=0) * min(len(velocity), len(reference)) / variance
+    prior, fine = parameters.initial_std_misalignment, parameters.fine_std_misalignment
+    rows = []
+    for name, information in (("roll", y + z), ("pitch", x + z), ("yaw", x + y)):
+        rows.append(_row(name, "°", information, prior, fine, math.degrees(1.0)))
+    rows.append(_row("scale", "%", x + y + z, parameters.initial_std_scale, parameters.fine_std_scale, 100.0))
+    return rows
+
+
+def _row(name: str, unit: str, information: float, prior: float, fine: float, shown_as: float) -> Shown:
+    std = 1.0 / math.sqrt(information + prior**-2)
+    share = min(1.0, max(0.0, math.log(prior / std) / math.log(prior / fine)))
+    # half the prior's standard deviation: the data then holds three times what was known before
+    return Shown(name, unit, std * shown_as, share, "" if std <= 0.5 * prior else _NEEDS[name])

@@ -1,0 +1,135 @@
+"""What the doctor can find wrong with a recording: every finding with its code, meaning and remedy, in one table."""
+
+from __future__ import annotations
+
+from ..calibration.findings import Finding, FindingKind, Severity
+
+_KINDS = (
+    FindingKind(
+        "DOCTOR_STAMP_ZERO",
+        "{topic}: {share:.0%} of the messages have no stamp",
+        "header.stamp is zero; the time of reception stands in, which is late by the transport.",
+        "let the driver fill header.stamp with the time of measurement",
+    ),
+    FindingKind(
+        "DOCTOR_STAMP_RECEPTION",
+        "{topic}: stamps jitter with the reception ({jitter_ms:.0f} ms about {period_ms:.0f} ms), not with the sensor",
+        "The driver stamps when a message arrives, not when the sensor measured: late by transport, worse in turns.",
+        "let the driver take the sensor's own time; then dvl-calib diagnose BAG shows what delay is left",
+    ),
+    FindingKind(
+        "DOCTOR_STAMP_BACK",
+        "{topic}: stamps go back {count} times, by up to {seconds:.1f} s",
+        "A clock was set, two publishers share the topic, or the bag looped.",
+        "set clocks before the recording; one publisher per topic",
+    ),
+    FindingKind(
+        "DOCTOR_STAMP_JUMP",
+        "{topic}: stamps jump ahead by {seconds:.1f} s while recording went on",
+        "The clock of the driver was set during the recording; what comes after does not pair with the rest.",
+        "set clocks before the recording, or cut the recording there",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_CLOCKS",
+        "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
+        "Two drivers stamp by different clocks, so that velocities of different times are compared.",
+        "synchronise clocks (PTP, NTP or GNSS); for this bag: -p {parameter}:={offset:.2f}",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_REPEATED_STAMP",
+        "{topic}: {share:.0%} of the stamps repeat the one before",
+        "Two publishers, or a driver that sends everything twice.",
+        "stop the second publisher (ros2 topic info -v {topic})",
+    ),
+    FindingKind(
+        "DOCTOR_GAPS",
+        "{topic}: silent for {seconds:.1f} s in {count} gaps, the longest at {at_s:.0f} s",
+        "The sensor, its cable, its fix or its driver dropped out.",
+        "check power, cable, bottom lock and fix at that time",
+    ),
+    FindingKind(
+        "DOCTOR_ZEROS",
+        "{topic}: {share:.0%} of the velocities are exactly zero",
+        "No sensor measures exactly nothing on three axes: the driver sends zeros without bottom lock.",
+        "let the driver send nothing, or mark it invalid; these are not used",
+    ),
+    FindingKind(
+        "DOCTOR_REFUSED",
+        "{topic}: {share:.0%} of the messages are refused: {reason}",
+        "The message itself says that it is not to be believed.",
+        "{remedy}",
+    ),
+    FindingKind(
+        "DOCTOR_FROZEN",
+        "{topic}: {share:.0%} of the velocities repeat the one before exactly",
+        "The driver sends its last value again while the sensor is silent or slower.",
+        "let the driver send new measurements only; -p max_repeats:=1 leaves the others out",
+    ),
+    FindingKind(
+        "DOCTOR_COVARIANCE",
+        "{topic}: claims a noise of {claimed:.3g} m/s in every message, the data show {shown:.3g} m/s",
+        "A constant of the driver, not the sensor's own figure: weights and standard deviations follow it.",
+        "let the driver send the sensor's figure; for this bag: -p use_message_covariance:=false",
+    ),
+    FindingKind(
+        "DOCTOR_AXIS",
+        "{topic}: {axes} is exactly zero in every message: not measured",
+        "Course and speed over ground have no vertical. It is no error, but that axis proves nothing.",
+        "use a receiver's own velocity (three axes) if pitch matters",
+    ),
+    FindingKind(
+        "DOCTOR_NOT_FINITE",
+        "{topic}: {share:.0%} of the velocities are not finite",
+        "The driver sends nan or infinity for want of a measurement.",
+        "check lock or fix at that time; these are not used",
+    ),
+    FindingKind(
+        "DOCTOR_NO_ORIENTATION",
+        "{topic}: no orientation ({why})",
+        "A reference in ENU or NED cannot be turned into the body, so the models with GNSS learn nothing.",
+        "record the IMU's or INS's filtered topic, or a reference in the body frame",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_UNITS",
+        "DVL and reference differ by a factor of {factor:.4g}{guess}",
+        "One of them is not in m/s.",
+        "let its driver convert to m/s",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_DISAGREE",
+        "DVL and reference do not agree under any frames: {left:.0%} of the speed is left",
+        "A wrong heading, clocks that differ by seconds, another vehicle's data, or a current in a water track.",
+        "check the IMU's heading (yaw 0 is east and counts to the left), the stamps, and the DVL's bottom lock",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_FRAMES",
+        "{said}",
+        "What the recording declares and what its data show are not the same.",
+        "check frames and transforms; the option named insists",
+    ),
+    FindingKind(
+        "DOCTOR_SLOW_REFERENCE",
+        "{topic}: {rate_hz:.2g} Hz is too slow for turns",
+        "Between two reference samples the velocity is taken as a straight line.",
+        "set the receiver to 1 Hz or more, better 5 Hz",
+    ),
+    FindingKind(
+        "DOCTOR_NOT_MOVING",
+        "{topic}: the vehicle does not move faster than min_speed ({min_speed:g} m/s)",
+        "Nothing can be learnt at rest.",
+        "record a run at 0.5 m/s or more",
+        Severity.ERROR,
+    ),
+)  # fmt: skip
+KINDS = {kind.code: kind for kind in _KINDS}
+
+
+def named(code: str, **fields: object) -> Finding:
+    """The doctor's finding of this code, filled in. Raises KeyError for an unknown code or a missing field."""
+    kind = KINDS[code]
+    return Finding(code, kind.severity, kind.says.format(**fields), kind.remedy.format(**fields))

@@ -1,0 +1,237 @@
+"""The doctor: every fault that is put into a sound recording is named, and a sound one is left in peace."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import fail, succeed
+from io_fixtures import TOPICS, write_bag
+
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.doctor.examine import Examination, examine
+from dvl_calib_ros.doctor.kinds import KINDS
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+SECOND = 1_000_000_000
+Row = tuple[str, int, Any]
+SOUND = DvlErrors((0.02, -0.03, 0.05), (0.004,) * 3, beam_std=0.01)
+
+
+def scenario(**changes: Any) -> Scenario:
+    return Scenario(**{"seconds": 120.0, "errors": SOUND, "imu_rate": 10.0, **changes})
+
+
+def simulated(path: Path, **changes: Any) -> Path:
+    run = simulate(scenario(**changes))
+    return write_bag(path, sorted([*run.imu, *run.gnss, *run.dvl], key=lambda sample: sample.stamp_ns))
+
+
+@cache
+def rows(folder: Path) -> tuple[Row, ...]:
+    folder.mkdir(parents=True, exist_ok=True)
+    with BagReader([simulated(folder / "source")]) as bag:
+        return tuple((topic, log_ns, message) for topic, log_ns, message, _ in bag.messages(TOPICS))
+
+
+def stamp_of(message: Any) -> int:
+    return message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+
+
+def stamp(message: Any, nanoseconds: int) -> None:
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, SECOND)
+
+
+def faulty(folder: Path, change: Callable[[str, int, Any, int], int | None]) -> Path:
+    """A bag with a fault. change(topic, log time, message, number) -> the log time, None to leave the message out."""
+    import copy
+
+    changed, numbers = [], dict.fromkeys(TOPICS, 0)
+    for topic, log_ns, message in rows(folder.parents[1] / "sound"):
+        message = copy.deepcopy(message)
+        at = change(topic, log_ns, message, numbers[topic])
+        numbers[topic] += 1
+        if at is not None:
+            changed.append((topic, at, message))
+    with BagWriter(folder) as bag:
+        for topic, at, message in sorted(changed, key=lambda row: row[1]):
+            bag.message(topic, TOPICS[topic], at, message)
+    return folder
+
+
+def dvl_only(act: Callable[[int, Any, int], int | None]) -> Callable[[str, int, Any, int], int | None]:
+    return lambda topic, log, message, i: act(log, message, i) if topic == "dvl/twist" else log
+
+
+def reference_only(act: Callable[[int, Any, int], int | None]) -> Callable[[str, int, Any, int], int | None]:
+    return lambda topic, log, message, i: act(log, message, i) if topic == "gnss/twist" else log
+
+
+def reception(log: int, message: Any, i: int) -> int:
+    late = int(np.random.default_rng(i).exponential(0.03) * SECOND)
+    stamp(message, log + late)
+    return log + late + 200_000
+
+
+def zero_stamps(log: int, message: Any, _: int) -> int:
+    stamp(message, 0)
+    return log
+
+
+def clock_set_back(log: int, message: Any, i: int) -> int:
+    stamp(message, stamp_of(message) - (5 * SECOND if i > 300 else 0))
+    return log
+
+
+def other_clock(log: int, message: Any, _: int) -> int:
+    stamp(message, stamp_of(message) - 7 * SECOND)
+    return log
+
+
+def dropout(log: int, message: Any, i: int) -> int | None:
+    return None if 200 <= i < 260 else log
+
+
+def zeros_without_lock(log: int, message: Any, i: int) -> int:
+    if 100 <= i < 180:
+        linear = message.twist.twist.linear
+        linear.x = linear.y = linear.z = 0.0
+    return log
+
+
+def frozen(kept: list[Any]) -> Callable[[int, Any, int], int]:
+    def act(log: int, message: Any, i: int) -> int:
+        if i % 3 == 0:
+            kept[:] = [message.twist.twist.linear]
+        message.twist.twist.linear = kept[0]
+        return log
+
+    return act
+
+
+def constant_covariance(log: int, message: Any, _: int) -> int:
+    message.twist.covariance[[0, 7, 14]] = 1.0
+    return log
+
+
+def no_vertical(log: int, message: Any, _: int) -> int:
+    message.twist.twist.linear.z = 0.0
+    return log
+
+
+def millimetres(log: int, message: Any, _: int) -> int:
+    linear = message.twist.twist.linear
+    linear.x, linear.y, linear.z = 1000.0 * linear.x, 1000.0 * linear.y, 1000.0 * linear.z
+    return log
+
+
+def drifting_heading(topic: str, log: int, message: Any, i: int) -> int:
+    if topic == "imu/data":  # 0.3 degrees at each of 10 Hz about the vertical
+        q, half = message.orientation, 0.5 * np.deg2rad(0.3 * i)
+        c, s = np.cos(half), np.sin(half)
+        q.x, q.y, q.z, q.w = c * q.x - s * q.y, c * q.y + s * q.x, c * q.z + s * q.w, c * q.w - s * q.z
+    return log
+
+
+def no_orientation(topic: str, log: int, message: Any, _: int) -> int:
+    if topic == "imu/data":
+        message.orientation_covariance[0] = -1.0
+    return log
+
+
+def body_called_enu(log: int, message: Any, _: int) -> int:
+    message.header.frame_id = "base_link"
+    return log
+
+
+FAULTS: dict[str, tuple[str, Callable[[str, int, Any, int], int | None]]] = {
+    "stamps of reception": ("DOCTOR_STAMP_RECEPTION", dvl_only(reception)),
+    "stamps of zero": ("DOCTOR_STAMP_ZERO", reference_only(zero_stamps)),
+    "a clock set back": ("DOCTOR_STAMP_BACK", dvl_only(clock_set_back)),
+    "another clock": ("DOCTOR_CLOCKS", dvl_only(other_clock)),
+    "a dropout": ("DOCTOR_GAPS", dvl_only(dropout)),
+    "zeros without bottom lock": ("DOCTOR_ZEROS", dvl_only(zeros_without_lock)),
+    "a driver that repeats itself": ("DOCTOR_FROZEN", dvl_only(frozen([]))),
+    "a made-up covariance": ("DOCTOR_COVARIANCE", dvl_only(constant_covariance)),
+    "an axis that is not measured": ("DOCTOR_AXIS", reference_only(no_vertical)),
+    "another unit": ("DOCTOR_UNITS", dvl_only(millimetres)),
+    "a heading that drifts": ("DOCTOR_DISAGREE", drifting_heading),
+    "an IMU without orientation": ("DOCTOR_NO_ORIENTATION", no_orientation),
+    "a reference in another frame than it says": ("DOCTOR_FRAMES", reference_only(body_called_enu)),
+}
+
+SOUND_RUNS: dict[str, dict[str, Any]] = {
+    "as it comes": {},
+    "a figure eight": {"trajectory": "figure8", "seed": 1},
+    "free": {"trajectory": "free", "seed": 2},
+    "straight": {"trajectory": "straight", "seed": 3},
+    "a body reference": {"gnss_frame": VelocityFrame.BODY, "seed": 4},
+    "a receiver of 1 Hz": {"gnss_rate": 1.0, "seed": 5},
+    "a fast DVL": {"dvl_rate": 10.0, "seed": 6},
+    "a slow DVL": {"dvl_rate": 1.0, "seed": 7, "seconds": 240.0},
+    "a DVL at 45 degrees": {"mounting_rpy": (0.0, 0.0, np.pi / 4), "seed": 8},
+    "a noisy reference": {"gnss_std": 0.3, "seed": 9},
+    "no reference": {"gnss_rate": 0.0, "seed": 10},
+}
+
+
+def codes(examined: Examination) -> set[str]:
+    return {found.code for found in examined.findings}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
+    code, change = FAULTS[fault]
+    examined = examine([faulty(tmp_path / "bag", change)], Parameters(max_speed=100.0))
+    assert code in codes(examined), [str(found) for found in examined.findings]
+    also = {"DOCTOR_UNITS": {"DOCTOR_COVARIANCE"}, "DOCTOR_DISAGREE": {"DOCTOR_FRAMES"}}.get(code, set())
+    assert codes(examined) <= {code, *also}
+
+
+@pytest.mark.parametrize("sound", SOUND_RUNS)
+def test_nothing_is_found_wrong_with_a_sound_recording(sound, tmp_path):
+    examined = examine([simulated(tmp_path / "bag", **SOUND_RUNS[sound])], Parameters())
+    assert [str(found) for found in examined.findings] == []
+    assert examined.verdict == ("partly" if sound == "no reference" else "yes")
+
+
+def test_the_page_says_whether_it_can_calibrate_and_what_to_type_next(tmp_path, capsys):
+    bag = simulated(tmp_path / "bag")
+    out, errors = succeed(capsys, "doctor", bag, "--json", tmp_path / "o.json")
+    assert errors == "" and out.startswith("yes: This recording can calibrate the DVL.")
+    assert f"next  dvl-calib replay {bag} --save calibration.yaml" in out
+    document = json.loads((tmp_path / "o.json").read_text())
+    assert document["verdict"] == "yes" and document["findings"] == []
+    assert document["topics"]["dvl"]["messages"] == 600
+    assert set(document["shown"]) == {"roll", "pitch", "yaw", "scale"}
+    assert "█" in out
+
+
+def test_the_standard_deviations_to_expect_are_those_that_the_replay_gives(tmp_path):
+    from dvl_calib_ros.calibration.observability import body_angle_std
+    from dvl_calib_ros.replay.replay import replay
+
+    bag = simulated(tmp_path / "bag")
+    expected = {each.name: each.std for each in examine([bag], Parameters()).shown}
+    result = replay([bag], Parameters()).result
+    given = np.degrees(body_angle_std(result.estimate.covariance, Parameters()))
+    assert [expected[name] for name in ("roll", "pitch", "yaw")] == pytest.approx(given.tolist(), rel=0.5)
+
+
+def test_a_bag_without_a_dvl_is_refused_in_one_line(tmp_path, capsys):
+    run = simulate(scenario(seconds=10.0))
+    assert "no topic looks like a DVL's" in fail(capsys, "doctor", write_bag(tmp_path / "bag", run.gnss))
+
+
+def test_every_finding_of_the_doctor_can_be_put_in_words():
+    for kind in KINDS.values():
+        assert kind.code.startswith("DOCTOR_") and kind.means.endswith(".")
