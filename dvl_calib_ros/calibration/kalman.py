@@ -107,7 +107,7 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
         innovation = data.z[:, i, :, None] - h @ x[:, :, None]
         nis_i = (innovation.transpose(0, 2, 1) @ s_inverse @ innovation)[:, 0, 0]
         used_i = data.usable[:, i] & (nis_i <= data.gate)
-        if (weight != 1.0).any():  # the gate asks whether this sample fits; the update, how much news is in it
+        if (weight != 1.0).any():  # the gate asks whether this sample fits; the update, how much it may weigh
             r_i = r_i / weight[:, None, None]
             s_inverse = np.linalg.inv(hpht + r_i)
         gain = (pht @ s_inverse) * used_i[:, None, None]  # a gain of zero leaves x and P exactly as they are

@@ -263,10 +263,10 @@ _SHOWN_WITH_GNSS = {
     "scale across": "motion across the bow: turns, a box or a figure eight",
 }
 _SHOWN_WITHOUT = {
-    "roll": "nothing this model knows: it takes a reference velocity (GNSS)",
+    "roll": "a reference velocity (GNSS): without one this cannot be seen",
     "pitch": "motion ahead without heave: a straight, level leg",
     "yaw": "motion ahead without sway: a straight leg, no current across",
-    "scale": "nothing this model knows: it takes a reference velocity (GNSS)",
+    "scale": "a reference velocity (GNSS): without one this cannot be seen",
 }
 _NOISY_REGRESSOR = "slow, or with a noisy receiver: noise in the reference pulls the scale down by about"
 

@@ -284,7 +284,7 @@ class Parameters:
     )
     motion_correlation_time: float = _parameter(
         ASSUMPTIONS.motion_correlation_time,
-        "How long sway and heave stay alike: samples closer together share their news (G1, A1, F1). 0: not at all.",
+        "Correlation time of sway and heave: samples closer together weigh less (G1, A1, F1). 0: all weigh the same.",
         unit="s",
         low=0.0,
         high=600.0,
