@@ -51,22 +51,29 @@ class _RawFile(io.RawIOBase):
 
     def _read(self, size: int, at: int) -> bytes:
         """What is there; after an error once more in halves, for a bad sector to cost no more than itself."""
+        data = self._attempt(size, at)
+        if data is not None:
+            return data
+        size = min(size, os.fstat(self._descriptor).st_size - at)
+        next_sector = (at // SECTOR + 1) * SECTOR
+        if at + size <= next_sector:
+            data = self._attempt(size, at)  # what fails once may be anything
+            if data is None:
+                self._note(at, at + size)
+                return bytes(size)
+            return data
+        middle = max((at + size // 2) // SECTOR * SECTOR, next_sector)
+        return self._read(middle - at, at) + self._read(at + size - middle, middle)
+
+    def _attempt(self, size: int, at: int) -> bytes | None:
         try:
             return os.pread(self._descriptor, size, at)
         except OSError as error:
-            length = os.fstat(self._descriptor).st_size
-            if at >= length:  # a damaged index leads to places that no file has
+            if at >= os.fstat(self._descriptor).st_size:  # a damaged index leads to places that no file has
                 return b""
             if error.errno != errno.EIO:
                 raise
-        size = min(size, length - at)
-        if at // SECTOR == (at + size - 1) // SECTOR:
-            self._note(at, at + size)
-            return bytes(size)
-        middle = (at + max(size // 2, 1) + SECTOR - 1) // SECTOR * SECTOR
-        middle = middle if middle < at + size else (at // SECTOR + 1) * SECTOR
-        first = self._read(middle - at, at)
-        return first + self._read(at + size - middle, middle)
+            return None
 
     def _note(self, start: int, end: int) -> None:
         touching = [hole for hole in self.holes if hole[0] <= end and start <= hole[1]]

@@ -9,7 +9,9 @@ the records that it is in.
 from __future__ import annotations
 
 import heapq
+import os
 import re
+import struct
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from itertools import chain
@@ -22,7 +24,7 @@ from mcap.reader import SeekingReader
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
-from ..raw_file import holes_in, open_recording, unreadable
+from ..raw_file import holes_in, open_recording
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 from .mcap_chunks import RECORD_HEAD, is_chunk, open_chunk
 from .mcap_records import (
@@ -43,6 +45,8 @@ FIRST_PRIVATE = 0x80
 # How a chunk begins: its opcode, a length below 4 GB, 28 bytes of times, size and checksum, the compression, a length
 _CHUNK_BEGIN = re.compile(rb"(?=\x06.{4}\0{4}.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd).{4}\0{4})", re.DOTALL)
 _CHUNK_BEGIN_SIZE = 64
+# At the very end: where the summary begins, where its offsets do, CRC, magic
+_FOOTER = struct.Struct("<QQI8s")
 
 
 def read_summary(path: Path) -> Summary | None:
@@ -54,11 +58,21 @@ def read_summary(path: Path) -> Summary | None:
 
 
 def _summary(file: BinaryIO) -> Summary | None:
+    size = file.seek(0, os.SEEK_END)
+    if size < _FOOTER.size:
+        raise DamagedError("it is cut off")
+    file.seek(size - _FOOTER.size)
+    start, _, _, magic = _FOOTER.unpack(file.read(_FOOTER.size))
+    if magic != MCAP_MAGIC:
+        raise DamagedError("it does not end as a finished recording does")
+    # The library looks for the magic bytes wherever the file stands; those at the beginning may be unreadable.
+    file.seek(size - len(MCAP_MAGIC))
     try:
         summary = SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
     except PARSING as error:
         raise DamagedError(f"{type(error).__name__}: {error}") from error
-    if lost := unreadable(file):
+    if holes := holes_in(file, start, size):
+        lost = sum(last - first for first, last in holes)
         raise DamagedError(f"{lost} bytes of its index cannot be read from the disk")
     return summary
 

@@ -1,0 +1,353 @@
+"""Recordings as they lie about: any name, links, folders with other things in them, types in two definitions."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from driver_fixtures import A50, Maker, write_driver_bag
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from io_fixtures import JAZZY, TOPICS, estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from dvl_calib_ros.bags import channels, definitions, sources
+from dvl_calib_ros.bags.channels import Channel, DecodingError
+from dvl_calib_ros.bags.definitions import Definition
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter, Storage
+from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS, TWIST_TYPE
+
+# ---------------------------------------------------------------------- names
+
+HOSTILE = [
+    "run#1",
+    "run%31",
+    "run?mode=memory",
+    "run²_1",
+    "run%",
+    "a b",
+    "日本",
+    "-x",
+    "~",
+    "'",
+    '"',
+    ";",
+    "..a",
+    "$HOME",
+    "#",
+]
+names = st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="/\0"), min_size=1, max_size=30).filter(
+    lambda name: name not in (".", "..") and len(name.encode()) < 90
+)
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("bags")
+    return {kind: write_bag(folder / kind, run(6.0), kind) for kind in ("mcap", "sqlite3")}
+
+
+def copy(bag: Path, target: Path) -> Path:
+    """The bag under another name, its file as well."""
+    target.mkdir(parents=True)
+    file = storage_file(bag)
+    shutil.copy(file, target / f"{target.name}{file.suffix}")
+    return target
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_names_are_names_to_reading_salvage_and_writing(tmp_path, bags, kind, name):
+    check_name(tmp_path, bags, kind, name)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(name=names, kind=st.sampled_from(["mcap", "sqlite3"]))
+def test_any_name_is_a_name_to_reading_salvage_and_writing(tmp_path_factory, bags, kind, name):
+    check_name(tmp_path_factory.mktemp("any"), bags, kind, name)
+
+
+def check_name(folder: Path, bags: dict[str, Path], kind: str, name: str) -> None:
+    bag = copy(bags[kind], folder / "in" / name)
+    other = copy(bags[kind], folder / "in" / "run1")  # what run%31 is read as where names are taken for URIs
+    (other / f"run1{storage_file(bag).suffix}").write_bytes(b"another bag")
+    for path in (bag, storage_file(bag)):
+        assert raw(path) == raw(bags[kind])
+    (folder / "out").mkdir()
+    assert main(["salvage", "-o", str(folder / "out" / name), "--storage", kind, "--", str(bag)]) == 0
+    assert [path.name for path in (folder / "out").iterdir()] == [name]
+    assert raw(folder / "out" / name) == raw(bags[kind])
+    assert {path.name for path in folder.iterdir()} == {"in", "out"}
+
+
+# ---------------------------------------------------------------------- links and folders
+
+
+@pytest.mark.parametrize("journal", ["beside the target", "linked as well"])
+def test_a_linked_database_is_read_with_its_journal(tmp_path, journal):
+    file = storage_file(write_bag(tmp_path / "bag", run(), "sqlite3"))
+    expected, store = raw(file), tmp_path / "store"
+    store.mkdir()
+    target = store / ("crashed.db3" if journal == "beside the target" else "0a1b2c")
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA wal_autocheckpoint=0")
+        connection.execute("DELETE FROM messages WHERE id > 700")
+        connection.commit()
+        shutil.copy(file, target)
+        shutil.copy(f"{file}-wal", f"{target}-wal" if journal == "beside the target" else store / "3d4e5f")
+    link = tmp_path / "crashed.db3"
+    link.symlink_to(target)
+    if journal != "beside the target":
+        (tmp_path / "crashed.db3-wal").symlink_to(store / "3d4e5f")
+    assert raw(link) == expected[:700]
+
+
+def hinder(bag: Path, name: str, what: str) -> None:
+    path = bag / name
+    if what == "a dangling link":
+        path.symlink_to(bag / "nowhere.mcap")
+    elif what == "a folder":
+        path.mkdir()
+    elif what == "a pipe":
+        os.mkfifo(path)
+    elif what == "a link to itself":
+        path.symlink_to(path)
+    else:
+        path.write_bytes(b"no bag")
+
+
+@pytest.mark.parametrize("what", ["a dangling link", "a folder", "a pipe", "a link to itself", "something else"])
+@pytest.mark.parametrize("is_listed", [False, True])
+def test_of_a_folder_with_something_that_cannot_be_read_the_rest_is_read_and_it_is_said(tmp_path, what, is_listed):
+    bag = write_bag(tmp_path / "bag", run(6.0))
+    expected = raw(bag)
+    for name in ("a.mcap", "z.mcap"):
+        hinder(bag, name, what)
+    if is_listed:
+        text = (bag / "metadata.yaml").read_text()
+        (bag / "metadata.yaml").write_text(text.replace("[bag.mcap]", "[a.mcap, bag.mcap, z.mcap]"))
+        assert "z.mcap" in (bag / "metadata.yaml").read_text()
+    else:
+        (bag / "metadata.yaml").unlink()
+    found, notes = raw_and_notes(bag)
+    assert found == expected
+    for name in ("a.mcap", "z.mcap"):
+        assert sum(name in note and "the rest is read" in note for note in notes) == 1
+    assert main(["replay", str(bag)]) == 0
+
+
+def test_a_file_in_a_folder_that_may_not_be_read_costs_a_note(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / "bag", run(6.0))
+    expected = raw(bag)
+    shutil.copy(storage_file(bag), bag / "secret.mcap")
+    (bag / "metadata.yaml").unlink()
+    opened = os.open
+
+    def denied(path, *arguments, **options):
+        if str(path).endswith("secret.mcap"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "open", denied)
+    found, notes = raw_and_notes(bag)
+    assert found == expected
+    assert any("secret.mcap" in note and "Permission denied" in note for note in notes)
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_rows_of_topics_that_a_database_does_not_name_are_counted(tmp_path, is_damaged):
+    file = storage_file(write_bag(tmp_path / "bag", run(6.0), "sqlite3"))
+    n_dvl = sum(topic == "dvl/twist" for topic, _, _ in raw(file))
+    with closing(sqlite3.connect(file)) as connection, connection:
+        connection.execute("DELETE FROM topics WHERE name = 'dvl/twist'")
+    if is_damaged:  # SQLite gives up at the table of the tables
+        content = bytearray(file.read_bytes())
+        content[100:105] = bytes(5)
+        file.write_bytes(content)
+    found, notes = raw_and_notes(file)
+    assert {topic for topic, _, _ in found} == {"gnss/twist", "imu/data"}
+    assert len(notes) == 1 and f"{n_dvl} messages are of topics that it does not name" in notes[0]
+
+
+# ---------------------------------------------------------------------- two definitions of one type
+
+STANDARD, _ = JAZZY.generate_msgdef(TWIST_TYPE, ros_version=2)
+UPGRADED = "float64 temperature\n" + STANDARD
+
+
+def two_definitions(one_topic: bool) -> bytes:
+    """A hundred messages of a type, and a hundred of its next version, on one topic or on two."""
+    upgraded = get_typestore(Stores.EMPTY)
+    upgraded.register(get_types_from_msg(UPGRADED, TWIST_TYPE))
+    import io
+
+    output = io.BytesIO()
+    writer = McapWriter(output, compression=CompressionType.NONE, chunk_size=5000)
+    writer.start("ros2")
+    topics = ["dvl/twist", "dvl/twist" if one_topic else "gnss/twist"]
+    for number, (topic, store, text) in enumerate(zip(topics, (JAZZY, upgraded), (STANDARD, UPGRADED), strict=True)):
+        schema = writer.register_schema(TWIST_TYPE, "ros2msg", text.encode())
+        channel = writer.register_channel(topic, "cdr", schema)
+        for i in range(100):
+            stamp = 10**18 + (i if not one_topic else 100 * number + i) * 10**8 + number
+            data = bytes(
+                store.serialize_cdr(twist(store, stamp, "dvl_link" if one_topic or not number else "map"), TWIST_TYPE)
+            )
+            writer.add_message(channel, stamp, data, stamp)
+    writer.finish()
+    return output.getvalue()
+
+
+def twist(store, stamp_ns: int, frame_id: str):
+    import numpy as np
+
+    types = store.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9)), frame_id)
+    inner = types["geometry_msgs/msg/TwistWithCovariance"](
+        types["geometry_msgs/msg/Twist"](vector(1.5, 0.1, 0.05), vector(0.0, 0.0, 0.0)), np.zeros(36)
+    )
+    return types[TWIST_TYPE](*([20.0] if store is not JAZZY else []), header, inner)
+
+
+def velocities(path: Path) -> list[tuple[float, float, float]]:
+    with BagReader([path]) as bag:
+        assert not bag.notes
+        linear = [message.twist.twist.linear for _, _, message, why in bag.messages(bag.topics) if not why]
+    return [(each.x, each.y, each.z) for each in linear]
+
+
+@pytest.mark.parametrize("one_topic", [True, False])
+def test_a_type_in_two_definitions_is_read_by_the_one_of_its_channel(tmp_path, one_topic):
+    (tmp_path / "two.mcap").write_bytes(two_definitions(one_topic))
+    assert velocities(tmp_path / "two.mcap") == [(1.5, 0.1, 0.05)] * 200
+    counts = replayed(tmp_path / "two.mcap").result.counts
+    assert counts["dvl"]["received"] == counts["dvl"]["accepted"] == (200 if one_topic else 100)
+    assert not counts["reference"]["invalid"]
+
+
+@pytest.mark.parametrize("one_topic", [True, False])
+@pytest.mark.parametrize(
+    "options", [[], ["--storage", "sqlite3"], ["--compression", "file"], ["--compression", "chunk"]]
+)
+def test_salvage_of_a_type_in_two_definitions_gives_messages_that_can_be_decoded(tmp_path, one_topic, options):
+    (tmp_path / "two.mcap").write_bytes(two_definitions(one_topic))
+    assert main(["salvage", str(tmp_path / "two.mcap"), "-o", str(tmp_path / "new"), *options]) == 0
+    assert velocities(tmp_path / "new") == [(1.5, 0.1, 0.05)] * 200
+    assert raw(tmp_path / "new") == raw(tmp_path / "two.mcap")
+    files = [path for path in (tmp_path / "new").iterdir() if path.name != "metadata.yaml"]
+    assert len(files) == 2 and all(path.is_file() for path in files)
+    with Reader(tmp_path / "new") as reader:  # as others see it
+        assert reader.message_count == 200
+        assert reader.duration == max(t for _, t, _ in raw(tmp_path / "new")) - 10**18 + 1
+
+
+def test_a_driver_that_was_upgraded_between_two_bags_is_read_by_the_definitions_of_each(tmp_path):
+    samples = [sample for sample in run(20.0) if isinstance(sample, DvlSample)]
+    old = write_driver_bag(tmp_path / "old", samples[:50], A50, maker=Maker("first"))
+    new = write_driver_bag(tmp_path / "new", samples[50:], A50, maker=Maker("fixed sizes"))
+    assert replayed(old, new).result.counts["dvl"]["accepted"] == len(samples)
+    assert main(["salvage", str(new), str(old), "-o", str(tmp_path / "both")]) == 0
+    assert replayed(tmp_path / "both").result.counts["dvl"]["accepted"] == len(samples)
+    assert estimates(tmp_path / "both") == estimates(old, new)
+
+
+def test_a_database_with_two_definitions_of_a_type_tells_them_by_their_hash(tmp_path, monkeypatch):
+    """As rosbag2 writes it since ROS 2 Iron: the topic's hash says which."""
+    upgraded = get_typestore(Stores.EMPTY)
+    upgraded.register(get_types_from_msg(UPGRADED, TWIST_TYPE))
+    with BagWriter(tmp_path / "bag", Storage.SQLITE3) as bag:
+        for i in range(10):
+            bag.message("dvl/twist", TWIST_TYPE, i, twist(JAZZY, i, "dvl_link"))
+    file = storage_file(tmp_path / "bag")
+    with closing(sqlite3.connect(file)) as connection, connection:
+        digest = upgraded.hash_rihs01(TWIST_TYPE)
+        row = (TWIST_TYPE, "ros2msg", UPGRADED, digest)
+        connection.execute(
+            "INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) "
+            "VALUES (?, ?, ?, ?)", row,
+        )  # fmt: skip
+        connection.execute("INSERT INTO topics VALUES (7, 'gnss/twist', ?, 'cdr', '', ?)", (TWIST_TYPE, digest))
+        data = bytes(upgraded.serialize_cdr(twist(upgraded, 5, "map"), TWIST_TYPE))
+        connection.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (7, 5, ?)", (data,))
+    assert velocities(file) == [(1.5, 0.1, 0.05)] * 11
+
+    def broken(*_):
+        raise sqlite3.DatabaseError("malformed")
+
+    monkeypatch.setattr(sources, "Database", broken)
+    with BagReader([file]) as bag:
+        found = [(message.twist.twist.linear.x, why) for _, _, message, why in bag.messages(TOPICS)]
+    assert found == [(1.5, "")] * 11
+
+
+# ---------------------------------------------------------------------- what is no damage
+
+
+@pytest.mark.parametrize(
+    "error", [AttributeError, TypeError, ImportError, NotImplementedError, AssertionError, NameError]
+)
+@pytest.mark.parametrize(
+    ("kind", "module", "name"),
+    [
+        ("mcap", sources, "read_summary"), ("mcap", sources, "indexed_messages"), ("mcap", sources, "salvage_mcap"),
+        ("sqlite3", sources, "Database"), ("mcap", definitions, "get_types_from_msg"),
+        ("mcap", channels, "typestore"),
+    ],
+)  # fmt: skip
+def test_a_library_that_does_not_fit_is_never_reported_as_damage(
+    bags, tmp_path, monkeypatch, kind, module, name, error
+):
+    def unfit(*_, **__):
+        raise error("no such thing in this version")
+
+    bag = bags[kind]
+    if name == "salvage_mcap":
+        file = tmp_path / "cut.mcap"
+        file.write_bytes(storage_file(bag).read_bytes()[:-37])
+        bag = file
+    monkeypatch.setattr(module, name, unfit)
+    with pytest.raises(error, match="no such thing"), BagReader([bag]) as reader:
+        list(reader.messages(reader.topics))
+
+
+def test_what_a_damaged_definition_makes_of_messages_is_told_of_each(tmp_path):
+    bad = [
+        "float64 a\nfloat64 a\n", "geometry_msgs/Nowhere a\n", "float64[99999999] a\n", "float128 a\n", "x y z\n",
+        "a/B self\n", "float64 class\n", "float64[] a\nstring<=3 b\n",
+    ]  # fmt: skip
+    for text in bad:
+        decoder = channels.Decoder(KNOWN_DEFINITIONS)
+        channel = Channel("a", "a/msg/B", Definition(channels.FORMATS["ros2msg"], text))
+        for data in (b"", b"\0\1\0\0", b"\0\1\0\0" + bytes(range(64)), b"\0\0\0\0" + b"\xff" * 64):
+            try:
+                decoder(channel, data)
+            except DecodingError as error:
+                assert str(error)
+
+
+def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path):
+    messages = [
+        ("dvl/twist", log_ns, data)
+        for log_ns, (_, _, data) in zip((5, 2**64 - 1, 2**63, 7), raw_twists(), strict=False)
+    ]
+    for name, options in (("index", {}), ("flat", {"use_chunking": False})):
+        (tmp_path / f"{name}.mcap").write_bytes(mcap_bytes(messages, **options))
+        assert sorted(raw(tmp_path / f"{name}.mcap")) == sorted(messages)
+
+
+def raw_twists():
+    return [
+        ("dvl/twist", i, bytes(JAZZY.serialize_cdr(twist(JAZZY, 10**9 + i, "dvl_link"), TWIST_TYPE))) for i in range(4)
+    ]
