@@ -85,7 +85,10 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
 
 def _rows(connection: sqlite3.Connection, query: str, types: tuple[type, ...]) -> list[Any]:
     """All rows of a query, whose columns are of these types; damaged pages can hold anything."""
-    rows = connection.execute(query).fetchall()
+    try:
+        rows = connection.execute(query).fetchall()
+    except UnicodeDecodeError as error:  # what SQLite says of damaged names holds them
+        raise DamagedError("its tables are damaged") from error
     if any(type(value) is not expected for row in rows for value, expected in zip(row, types, strict=True)):
         raise DamagedError("a table holds what recordings do not")
     return rows

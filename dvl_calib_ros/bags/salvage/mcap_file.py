@@ -52,6 +52,8 @@ _FOOTER = struct.Struct("<QQI8s")
 def read_summary(path: Path) -> Summary | None:
     """The index at the end of the file if there is one that leads to messages; DamagedError if it is damaged."""
     with open_recording(path) as file:
+        if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+            raise DamagedError("its beginning is damaged")
         summary = _summary(file)
     usable = summary is not None and summary.statistics and summary.chunk_indexes and summary.channels
     return summary if usable else None

@@ -25,6 +25,8 @@ SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.M
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _RECORD_BEGIN = re.compile(rb"(?=[\x03-\x05].{4}\0{4})", re.DOTALL)
 _WINDOW, _OVERLAP = 1 << 20, 64
+# Damaged offsets lead beyond what can be sought in a file
+_LARGEST_FILE = 1 << 62
 # What damaged bytes make the mcap library raise when it parses records
 PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
 
@@ -69,6 +71,8 @@ class Tables:
 
 def record_head(file: BinaryIO, at: int) -> tuple[int, int]:
     """Opcode and length of a record."""
+    if at > _LARGEST_FILE:
+        raise DamagedError(f"cut off before byte {at}")
     file.seek(at)
     head = file.read(RECORD_HEAD.size)
     if len(head) < RECORD_HEAD.size:

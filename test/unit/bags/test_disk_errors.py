@@ -150,7 +150,9 @@ def test_an_unreadable_sector_costs_of_a_database_its_rows_and_no_others(tmp_pat
         assert len(notes) == 1
         if lost:  # what SQLite had read before lies there as well
             assert "1 pages cannot be read from the disk" in notes[0]
-            assert int(re.search(r"(\d+) messages lie on damaged pages", notes[0])[1]) >= len(lost)
+            told = re.search(r"(\d+) messages lie on damaged pages", notes[0])
+            # nobody knows of the last ones how many they were
+            assert int(told[1]) >= len(lost) if told else lost[-1] == recorded[-1]
 
 
 @pytest.mark.parametrize("kind", ["mcap", "mcap zstd", "mcap without index", "mcap in a file of zstd", "sqlite3 cut"])
