@@ -16,6 +16,7 @@ from ..messages.encode import SampleWriter
 from .cases import Drawn, draw
 from .motion import Floats, Motion
 from .plan import Case
+from .scored import RECORDING
 from .strength import Scene
 from .vehicle import (
     Faults,
@@ -51,7 +52,7 @@ def record(case: Case, seed: int, folder: Path) -> Recorded:
     folder.mkdir(parents=True)
     bags = []
     for number in range(len(drawn.scene.motions)):
-        bags.append(folder / f"recording{number}")
+        bags.append(folder / f"{RECORDING}{number}")
         start_ns = START_NS + number * BETWEEN_RECORDINGS_NS
         _write(bags[-1], _samples(drawn, number, Noise.of(case.hardness, drawn.scene, drawn.noise), start_ns))
     return Recorded(tuple(bags), drawn)

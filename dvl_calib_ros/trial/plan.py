@@ -198,13 +198,14 @@ def _unknowns_at_sea() -> list[Case]:
 
 
 def _groups() -> list[list[Case]]:
-    """Nulls; a delay a day; a mounting that moved; these and what belongs to the vehicle, together."""
+    """Nulls; a delay a day; what moved between days; these and what belongs to the vehicle, together."""
     moved, delays = "mounting_moved", "dvl_time_offset"
     return [
         _at_sea(Category.NULL, 30, family=Family.SEVERAL),
         _at_sea(Category.SINGLE, 15, delays, family=Family.SEVERAL),
         _at_sea(Category.SINGLE, 30, moved, family=Family.SEVERAL),
         _at_sea(Category.SINGLE, 15, "lever_arm", family=Family.SEVERAL),
+        _at_sea(Category.SINGLE, 10, "sound_speed_moved", family=Family.SEVERAL),
         _at_sea(Category.PAIR, 50, delays, family=Family.SEVERAL),
         _at_sea(Category.PAIR, 20, moved, family=Family.SEVERAL),
         _at_sea(Category.TRIPLE, 40, moved, family=Family.SEVERAL),

@@ -25,6 +25,7 @@ from ..parallel import outcomes_on_cores
 from .cases import NotDrawnError
 from .generator import record
 from .plan import Case
+from .scored import parameters_of
 from .strength import Yardstick
 from .truth import seal
 from .vehicle import FAULTS, Faults
@@ -38,9 +39,10 @@ AT_ANY_TIME = {
     "water_lock": {"from_s": 0.0, "to_s": math.inf},
     "time_offset_jump": {"at_s": 0.0},
     "mounting_moved": {"from_recording": 1.0},
+    "sound_speed_moved": {"from_recording": 1.0},
 }
 # The draws or the physics of the generator have changed: answers to older cases are answers to others
-GENERATOR_VERSION = 5
+GENERATOR_VERSION = 6
 
 
 def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
@@ -138,7 +140,7 @@ def said(document: Document) -> Faults:
     faults: dict[str, dict[str, float]] = {}
     for effect in document.get("effects", []):
         if known := FAULTS.get(effect["name"]):
-            given = {name: each["value"] for name, each in effect["parameters"].items()}
+            given = {name: each["value"] for name, each in parameters_of(effect).items()}
             usable = {name: value for name, value in given.items() if value is not None and not math.isnan(value)}
             faults[effect["name"]] = dict.fromkeys(known.typical, 0.0) | AT_ANY_TIME.get(effect["name"], {}) | usable
     return faults

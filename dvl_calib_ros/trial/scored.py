@@ -15,6 +15,8 @@ from scipy import stats
 from .truth import Category, Truth
 from .vehicle import FAULTS
 
+# Bags are named so, and by that in an answer
+RECORDING = "recording"
 CLAIMS = ("known", "ambiguous", "unknown")
 EXPLAINED = ("known", "ambiguous")
 FAMILY_LEVEL = 0.01
@@ -163,9 +165,32 @@ def _scored(truth: Truth, answer: Mapping[str, Any]) -> Scored:
 
 def _intervals(truth: Truth, effects: Iterable[Mapping[str, Any]]) -> Iterable[Interval]:
     """Those of the faults that were named."""
+    n_recordings = len(truth.scene.get("seconds", [None]))
     for effect in effects:
-        for name, true in truth.faults.get(effect["name"], {}).items():
-            given = effect.get("parameters", {}).get(name)
+        parameters = parameters_of(effect)
+        for name, true in _in_each(truth.faults.get(effect["name"], {}), n_recordings).items():
+            given = parameters.get(name)
             if given is not None and given.get("ci95") is not None and name not in NOT_SCORED_PARAMETERS:
                 low, high = given["ci95"]
                 yield Interval(effect["name"], name, low, true, high)
+
+
+def parameters_of(effect: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """What an answer says of an effect's parameters, by name, "seconds@1" being that of recording 1."""
+    parameters = dict(effect.get("parameters", {}))
+    for recording, values in effect.get("by_recording", {}).items():
+        number = recording.removeprefix(RECORDING)
+        parameters |= {f"{name}@{number}": value for name, value in values.items()}
+    return parameters
+
+
+def _in_each(values: Mapping[str, float], n_recordings: int) -> dict[str, float]:
+    """Parameters of a fault; of one that came between recordings, what it is in each against the first."""
+    if "from_recording" not in values:
+        return dict(values)
+    return {
+        f"{name}@{number}": value if number >= values["from_recording"] else 0.0
+        for name, value in values.items()
+        for number in range(1, n_recordings)
+        if name not in NOT_SCORED_PARAMETERS
+    }

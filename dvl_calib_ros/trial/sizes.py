@@ -40,7 +40,7 @@ def _times(name: str, scene: Scene, rng: np.random.Generator) -> dict[str, float
     seconds = min(motion.seconds for motion in scene.motions)
     if name == "time_offset_jump":
         return {"at_s": float(rng.uniform(0.25, 0.75) * seconds)}
-    if name == "mounting_moved":
+    if FAULTS[name].between:
         return {"from_recording": float(rng.integers(1, len(scene.motions)))}
     if name == "water_lock":
         start, length = rng.uniform(0.1, 0.4) * seconds, rng.uniform(0.3, 0.6) * seconds

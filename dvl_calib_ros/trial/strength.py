@@ -181,7 +181,8 @@ class Yardstick:
 
     def _library(self) -> list[str]:
         several = len(self.scene.motions) > 1 and self.scene.days
-        return [*of_one_recording(self.scene.in_body), *(["mounting_moved"] if several else [])]
+        between = [name for name, fault in FAULTS.items() if fault.between]
+        return [*of_one_recording(self.scene.in_body), *(between if several else [])]
 
     def _small(self, name: str, beside: Faults) -> Iterator[Faults]:
         """The faults beside, with each parameter of one more (or of one of them) changed by a little."""
@@ -194,7 +195,7 @@ class Yardstick:
             times = [{"from_s": a * seconds, "to_s": (a + 0.5) * seconds} for a in (0.0, 0.25, 0.5)]
         elif name == "time_offset_jump":
             times = [{"at_s": a * seconds} for a in (0.2, 0.35, 0.5, 0.65, 0.8)]
-        elif name == "mounting_moved":
+        elif FAULTS[name].between:
             times = [{"from_recording": number} for number in recordings[1:]]
         for parameter, size in FAULTS[name].typical.items():
             named = [f"{parameter}@{k}" for k in recordings] if self.scene.days and name in OF_THE_DAY else [parameter]

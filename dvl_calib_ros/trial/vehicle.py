@@ -59,7 +59,8 @@ FAULTS: Mapping[str, Fault] = {
     "attitude_time_offset": Fault({"seconds": 0.1}, 8.0),
     "time_offset_jump": Fault({"seconds": 0.2}, 8.0),
     "clock_drift": Fault({"seconds_per_hour": 1.0}, 36.0),
-    "mounting_moved": Fault({"roll_rad": 0.02, "pitch_rad": 0.02, "yaw_rad": 0.02}, 5.0, between=True),
+    "mounting_moved": Fault(_axes("rad", 0.02), 5.0, between=True),
+    "sound_speed_moved": Fault({"ratio": 0.005}, 5.0, between=True),
 }
 # What a reference in the body's frame cannot show
 NEED_ATTITUDE = frozenset({"heading_error", "attitude_time_offset"})
@@ -221,6 +222,7 @@ def dvl_velocity(motion: Motion, vehicle: Vehicle, faults: Faults, times: Floats
     turned = _mounting(state, vehicle, faults).apply(nominal.apply(moved))
     radial = turned @ _beams_as_they_are(vehicle, faults).T
     factor = np.full(len(times), 1.0 + vehicle.sound_speed_error)
+    factor += faults.get("sound_speed_moved", {}).get("ratio", 0.0)
     factor += faults.get("quadratic_scale", {}).get("coefficient_s_per_m", 0.0) * state.speed
     factor += faults.get("scale_drift", {}).get("rate_per_hour", 0.0) / HOUR_S * state.time
     added = nominal.apply(_tilt_leak(state, faults)) + _constant(faults, "velocity_bias", "mps")
@@ -250,9 +252,7 @@ def _velocity_at_dvl(state: State, faults: Faults) -> Floats:
 
 
 def _mounting(state: State, vehicle: Vehicle, faults: Faults) -> Rotation:
-    moved = faults.get("mounting_moved", {})
-    turn = np.tile(vehicle.misalignment, (len(state.time), 1))
-    turn += [moved.get(f"{angle}_rad", 0.0) for angle in ("roll", "pitch", "yaw")]
+    turn = np.tile(vehicle.misalignment, (len(state.time), 1)) + _constant(faults, "mounting_moved", "rad")
     turn += np.outer(state.time / HOUR_S, _constant(faults, "misalignment_drift", "rad_per_hour"))
     turn += np.outer(state.speed, _constant(faults, "mount_flexure", "rad_per_mps"))
     return Rotation.from_rotvec(turn)

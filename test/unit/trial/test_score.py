@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -111,9 +112,9 @@ def test_bounds_are_clopper_and_pearsons(hand_made):
 
 def test_theory_is_the_power_of_the_test_and_the_likelihood_of_telling_apart(hand_made):
     bounds = {figure.name: figure.bound for figure in hand_made.figures["simulated"]}
-    # chi-square test with 3 degrees of freedom at 0.01 / 18, by simulation
+    # chi-square test with 3 degrees of freedom at 0.01 / 19, by simulation
     draws = np.random.default_rng(0).normal([5.0, 0.0, 0.0], 1.0, (400000, 3))
-    null = 17.50  # the quantile 1 - 0.01 / 18 of the central distribution
+    null = 17.62  # the quantile 1 - 0.01 / 19 of the central distribution
     assert bounds["detected, q = 5"] == pytest.approx(np.mean((draws**2).sum(axis=1) > null), abs=0.003)
     # 1 σ apart: right in Φ(1/2) of the cases; 10 σ apart: always
     assert bounds["right effect first, q >= 12"] == pytest.approx((0.6915 + 1.0) / 2, abs=1e-3)
@@ -169,6 +170,12 @@ def at_sea(number: int, category: Category, faults=(), family="half_real", **res
 def says(verdict, left_mps, **parameters):
     """parameters: name of an effect -> of its parameters low and high."""
     given = answer(verdict, *((name, (), ends) for name, ends in parameters.items()))
+    for effect in given["document"]["effects"]:
+        of_each = {name: value for name, value in effect["parameters"].items() if "@" in name}
+        for name, value in of_each.items():
+            parameter, number = name.split("@")
+            effect.setdefault("by_recording", {}).setdefault(f"recording{number}", {})[parameter] = value
+            del effect["parameters"][name]
     return given | {"left_mps": left_mps}
 
 
@@ -193,6 +200,17 @@ AT_SEA = [
     ),
     (at_sea(7, Category.PAIR, BOTH, "several"), says("unknown", 0.0, lever_arm={}, dvl_time_offset={})),
 ]
+
+
+def test_a_mounting_that_moved_is_held_against_what_each_recording_has_of_it():
+    moved = {"mounting_moved": {"x_rad": 0.1, "from_recording": 2.0}}
+    truth = replace(at_sea(0, Category.SINGLE, moved, "several"), scene={"seconds": [400.0] * 3, "sources": []})
+    given = says("known", 0.0, mounting_moved={"x_rad@1": (-0.1, 0.05), "x_rad@2": (0.2, 0.3)})
+    (case,) = join({truth.id: truth}, {truth.id: given})
+    assert [(each.parameter, each.true, each.holds) for each in case.intervals] == [
+        ("x_rad@1", 0.0, True),
+        ("x_rad@2", 0.1, False),
+    ]
 
 
 @pytest.fixture
