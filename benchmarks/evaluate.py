@@ -16,7 +16,7 @@ from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.estimation import SensorData, observations, prior_sway_heave, usable_samples
+from dvl_calib_ros.evaluation.estimation import SensorData, aligned
 from dvl_calib_ros.evaluation.evaluate import DEFAULTS
 from dvl_calib_ros.evaluation.procedure import Procedure, corrections, run_seed, sensor_data
 from dvl_calib_ros.evaluation.trajectories import load_folder, own_trajectories
@@ -102,10 +102,10 @@ def _calibrate(model: Model, data: SensorData, parameters: Parameters, ends: Seq
 
     n, m = model.n_state, model.n_measurement
     assembler = Assembler([model], parameters)
-    usable = usable_samples(data, parameters)
-    sway_heave, prior_known = prior_sway_heave(data, usable, parameters)
-    seen = observations(data, model.needs, sway_heave, parameters)
-    given = assembler.measurements(seen, np.ones(usable.size), prior_known[0])
+    variants = aligned(data, parameters)
+    usable = variants.has[model.needs]
+    seen = variants.observations(model.needs, parameters)
+    given = assembler.measurements(seen, variants.rows.share(model.aided), variants.rows.prior_known)
     used = given.usable[0] & usable[0]
     r = np.broadcast_to(given.r[0], (usable.size, 3, 3))[:, :m, :m] / given.weight[0][:, None, None]
     peer = KalmanFilter(dim_x=n, dim_z=m)

@@ -10,16 +10,21 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtr, gammaincinv, ndtri
 
 from . import kalman
 from .correction_parameters import PriorOnErrors, to_correction, to_errors
 from .folds import FOLDS, FoldInformation, folds_of
 from .frames import Array
+from .history import Standing
 from .kalman import GaussianState
-from .models import N_MEASUREMENT, Model
+from .models import N_MEASUREMENT, Model, Needs
 from .observations import Observations
 from .parameters import Parameters
+from .samples import Index, Mask, Stamps
+
+Ends = Index
 
 # From here on the vectorised batch is faster than the recursion.
 BATCH_FROM = 24
@@ -122,7 +127,7 @@ class Assembler:
 
 
 class ModelBank:
-    """K models updated together."""
+    """All models, updated together as far as they need the same."""
 
     def __init__(
         self,
@@ -135,62 +140,137 @@ class ModelBank:
 
         verified: keep what `states_without_folds` needs.
         """
+        by_needs = {needs: [model for model in models if model.needs is needs] for needs in Needs}
+        self._groups = {
+            needs: _Group(group, parameters, initial, verified) for needs, group in by_needs.items() if group
+        }
+        self._group_of = {model.name: self._groups[model.needs] for model in models}
+
+    @property
+    def n_given(self) -> Mapping[Needs, int]:
+        """Number of rows that the models with these needs have had."""
+        return {needs: group.n_given for needs, group in self._groups.items()}
+
+    def update(
+        self,
+        needs: Needs,
+        stamps_ns: Stamps,
+        seen: Observations,
+        weight: Array,
+        prior_known: Mask,
+        ends: Ends | None = None,
+    ) -> Standing | None:
+        """Update the models with these needs by a block of N samples that have them.
+
+        weight, prior_known: (N,) as in `Assembler.measurements`. The states after `ends` samples (E), if given.
+        """
+        return self._groups[needs].update(stamps_ns, seen, weight, prior_known, ends)
+
+    def standing(self, needs: Needs, n: int) -> Standing:
+        """The states as they are now, n times."""
+        return self._groups[needs].standing(n)
+
+    def state(self, name: str) -> GaussianState:
+        """State and covariance of one model; not to be written to."""
+        return self._group_of[name].state(name)
+
+    def states_at(self, name: str, standing: Standing) -> GaussianState:
+        """States x (E, n) and covariances P (E, n, n) of one model, from those of all that need the same."""
+        return self._group_of[name].states_at(name, standing)
+
+    def counts_at(self, name: str, standing: Standing) -> tuple[NDArray[np.int64], Array]:
+        """Samples used so far (E,) and the sum of νᵀS⁻¹ν over them (E,), likewise."""
+        index = self._group_of[name].index[name]
+        return standing.used[:, index], standing.nis_sum[:, index]
+
+    def states_without_folds(self, name: str) -> list[GaussianState]:
+        """For every fold the state and covariance of one model had it not seen that fold."""
+        return self._group_of[name].states_without_folds(name)
+
+    def counts(self, name: str) -> ModelCounts:
+        """Samples used and gated by one model, and its mean normalised innovation squared."""
+        return self._group_of[name].counts(name)
+
+
+class _Group:
+    """K models that need the same."""
+
+    def __init__(
+        self,
+        models: Sequence[Model],
+        parameters: Parameters,
+        initial: Mapping[str, GaussianState] | None,
+        verified: bool,
+    ) -> None:
         self._parameters = parameters
         self._assembler = Assembler(models, parameters, initial)
         self._folds = FoldInformation(self._assembler.start) if verified else None
-        self.models = self._assembler.models
-        self._index = {model.name: k for k, model in enumerate(self.models)}
+        self.index = {model.name: k for k, model in enumerate(models)}
         self.x, self.p = self._assembler.start
         self._states: dict[str, GaussianState] = {}
         self._last_stamp_ns: int | None = None
         self.n_given = 0
-        k = len(self.models)
+        k = len(models)
         self._used = np.zeros(k, dtype=np.int64)
         self._gated = np.zeros(k, dtype=np.int64)
         self._nis_sum = np.zeros(k)
 
-    def update(self, stamps_ns: Sequence[int], seen: Observations, weight: Array, prior_known: kalman.Mask) -> None:
-        """Update every model with a block of N samples; weight and prior_known as in `Assembler.measurements`."""
-        self.n_given += len(stamps_ns)
+    def update(
+        self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None
+    ) -> Standing | None:
+        n_samples = len(stamps_ns)
+        self.n_given += n_samples
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
-        if process is None and len(stamps_ns) >= BATCH_FROM:
-            after = kalman.batch(self.x, self.p, data)
+        if process is None and n_samples >= BATCH_FROM:
+            after = kalman.batch(self.x, self.p, data, ends)
         else:
-            after = kalman.recursion(self.x, self.p, data, process)
+            after = kalman.recursion(self.x, self.p, data, process, ends)
         self.x, self.p = after.x, after.p
         self._states.clear()
         if self._folds is not None:
             self._folds.add(folds_of(stamps_ns, self._parameters), data, after.used)
+        standing = None if ends is None else self._standing_at(after, ends)
         self._used += after.used.sum(axis=1)
         self._gated += (data.usable & ~after.used).sum(axis=1)
         self._nis_sum += np.where(after.used, after.nis, 0.0).sum(axis=1)
+        return standing
 
-    def _process_noise(self, stamps_ns: Sequence[int]) -> Array | None:
+    def _standing_at(self, after: kalman.Updated, ends: Ends) -> Standing:
+        assert after.at is not None
+        used = np.cumsum(np.pad(after.used, ((0, 0), (1, 0))), axis=1)[:, ends].T
+        nis = np.cumsum(np.pad(np.where(after.used, after.nis, 0.0), ((0, 0), (1, 0))), axis=1)[:, ends].T
+        return Standing(after.at.x, after.at.p, self._used + used, self._nis_sum + nis)
+
+    def standing(self, n: int) -> Standing:
+        return Standing.joined([Standing(self.x[None], self.p[None], self._used[None], self._nis_sum[None])] * n)
+
+    def _process_noise(self, stamps_ns: Stamps) -> Array | None:
         rate = self._assembler.process_rate
         if rate is None:
             return None
-        stamps = np.array([stamps_ns[0] if self._last_stamp_ns is None else self._last_stamp_ns, *stamps_ns])
-        self._last_stamp_ns = stamps_ns[-1]
-        return np.diff(stamps)[:, None, None, None] * 1e-9 * rate
+        before_ns = stamps_ns[0] if self._last_stamp_ns is None else self._last_stamp_ns
+        self._last_stamp_ns = int(stamps_ns[-1])
+        return np.diff(stamps_ns, prepend=before_ns)[:, None, None, None] * 1e-9 * rate
 
     def state(self, name: str) -> GaussianState:
-        """State and covariance of one model; not to be written to."""
         if name not in self._states:  # asked for more than once per sample, live
-            index = self._index[name]
+            index = self.index[name]
             self._states[name] = self._assembler.state(index, self.x[index], self.p[index])
         return self._states[name]
 
+    def states_at(self, name: str, standing: Standing) -> GaussianState:
+        index = self.index[name]
+        return self._assembler.state(index, standing.x[:, index], standing.p[:, index])
+
     def states_without_folds(self, name: str) -> list[GaussianState]:
-        """For every fold the state and covariance of one model had it not seen that fold."""
         assert self._folds is not None  # asked for when the bank was made
-        index = self._index[name]
+        index = self.index[name]
         held = (self._folds.without(fold, index) for fold in range(FOLDS))
         return [self._assembler.state(index, x, p) for x, p in held]
 
     def counts(self, name: str) -> ModelCounts:
-        """Samples used and gated by one model, and its mean normalised innovation squared."""
-        index = self._index[name]
+        index = self.index[name]
         used = int(self._used[index])
         return ModelCounts(used, int(self._gated[index]), float(self._nis_sum[index] / used) if used else float("nan"))
 

@@ -8,8 +8,6 @@ second pass, constant memory.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,13 +15,14 @@ from .frames import Array
 from .kalman import GaussianState, Measurements
 from .observations import Observations
 from .parameters import Parameters
+from .samples import Stamps
 
 FOLDS = 5
 
 
-def folds_of(stamps_ns: Sequence[int], parameters: Parameters) -> NDArray[np.int64]:
+def folds_of(stamps_ns: Stamps, parameters: Parameters) -> NDArray[np.int64]:
     """Fold (N,) of each sample, by its stamp alone."""
-    return np.asarray(stamps_ns, dtype=np.int64) // round(parameters.verification_block * 1e9) % FOLDS
+    return stamps_ns // round(parameters.verification_block * 1e9) % FOLDS
 
 
 class FoldInformation:

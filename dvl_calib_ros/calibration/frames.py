@@ -93,12 +93,16 @@ def rotation_from_quaternion(q: ArrayLike) -> Array:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
+# Cosine of half the angle of a short arc: below 2 mrad the chord is exact to 1e-10 and keeps clear of 0/0.
+_SHORT_ARC = 0.9999995
+
+
 def slerp(q0: Quaternion, q1: Quaternion, fraction: float) -> Quaternion:
     """Spherical linear interpolation between unit quaternions along the shorter arc, fraction in 0..1."""
     dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
     sign = 1.0 if dot >= 0.0 else -1.0
     dot = min(abs(dot), 1.0)
-    if dot > 0.9999995:  # arcs below 2 mrad: the chord is exact to 1e-10 and keeps clear of 0/0
+    if dot > _SHORT_ARC:
         w0, w1 = 1.0 - fraction, fraction * sign
     else:
         angle = math.acos(dot)
@@ -107,6 +111,21 @@ def slerp(q0: Quaternion, q1: Quaternion, fraction: float) -> Quaternion:
     x, y, z, w = w0 * q0[0] + w1 * q1[0], w0 * q0[1] + w1 * q1[1], w0 * q0[2] + w1 * q1[2], w0 * q0[3] + w1 * q1[3]
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     return x / norm, y / norm, z / norm, w / norm
+
+
+def slerps(q0: Array, q1: Array, fraction: Array) -> Array:
+    """`slerp` of N pairs (N, 4), fraction (N,); nan where either is nan."""
+    a, b = q0.T, q1.T
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]  # in the order of `slerp`, to take its branches
+    sign = np.where(dot >= 0.0, 1.0, -1.0)
+    dot = np.minimum(np.abs(dot), 1.0)
+    angle = np.arccos(np.where(dot > _SHORT_ARC, 0.0, dot))
+    whole = np.sin(angle)
+    w0 = np.where(dot > _SHORT_ARC, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / whole)
+    w1 = sign * np.where(dot > _SHORT_ARC, fraction, np.sin(fraction * angle) / whole)
+    mixed = q0 * w0[:, None] + q1 * w1[:, None]
+    unit: Array = mixed / np.sqrt((mixed * mixed).sum(axis=1))[:, None]
+    return unit
 
 
 def attitude_enu_flu_from_ned_frd(rpy: ArrayLike) -> Array:

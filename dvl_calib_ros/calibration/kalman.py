@@ -8,8 +8,8 @@ Two ways to the same numbers (equal to 1e-10, proved in test_kalman.py):
 
 `recursion` is the filter: one predict and update per sample, covariance in Joseph form.
 `batch` uses that with Φ = I and Q = 0 the filter is prior-regularised weighted least squares for every k at once: the
-information of the first k samples is a running sum. Vectorised over time it is about a hundred times faster, and it
-holds the whole history.
+information of the first k samples is a running sum. Vectorised over time it is about a hundred times faster, and the
+state after any sample comes with it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,6 @@ Mask = NDArray[np.bool_]
 # Gate decisions of a block are found by repetition (see `batch`); a block that needs more than this goes to the
 # recursion instead. Data with ordinary outliers settles in two or three.
 MAX_GATE_PASSES = 12
-# Samples of a history that are worked on at once.
-HISTORY_PIECE = 4096
 
 
 class GaussianState(NamedTuple):
@@ -68,28 +66,24 @@ class Updated:
     """What a block of measurements made of the state.
 
     x: (K, n), p: (K, n, n) after the last sample. used: (K, N). nis: (K, N) normalised innovation squared νᵀS⁻¹ν of
-    every sample against the state before it, of usable samples only (0 elsewhere).
+    every sample against the state before it, of usable samples only (0 elsewhere). at: x (E, K, n), P (E, K, n, n)
+    after the numbers of samples that were asked for, if any.
     """
 
     x: Array
     p: Array
     used: Mask
     nis: Array
+    at: GaussianState | None = None
 
 
-@dataclass(frozen=True)
-class History:
-    """State after every sample: x (K, N, n), p (K, N, n, n); used as in `Updated`."""
-
-    x: Array
-    p: Array
-    used: Mask
-
-
-def recursion(x: Array, p: Array, data: Measurements, process: Array | None = None) -> Updated:
+def recursion(
+    x: Array, p: Array, data: Measurements, process: Array | None = None, ends: NDArray[np.intp] | None = None
+) -> Updated:
     """Filter N samples one after the other.
 
     x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q that the state gains before each sample, or None.
+    ends: (E,) ascending numbers of samples (0..N) after which the state is wanted, too.
     """
     k, n_samples = data.z.shape[:2]
     x, p = x.copy(), p.copy()
@@ -97,6 +91,7 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
     one_r = data.r.shape[1] == 1
     used = np.zeros((k, n_samples), dtype=bool)
     nis = np.zeros((k, n_samples))
+    on_the_way = [(x.copy(), p)]
     for i in range(n_samples):
         if process is not None:
             p += process[i]
@@ -118,18 +113,23 @@ def recursion(x: Array, p: Array, data: Measurements, process: Array | None = No
         p = 0.5 * (p + p.transpose(0, 2, 1))
         used[:, i] = used_i
         nis[:, i] = nis_i
-    return Updated(x, p, used, np.where(data.usable, nis, 0.0))
+        if ends is not None:
+            on_the_way.append((x.copy(), p))
+    at = None
+    if ends is not None:
+        wanted = [on_the_way[end] for end in ends.tolist()]
+        at = GaussianState(np.array([x for x, _ in wanted]), np.array([p for _, p in wanted]))
+    return Updated(x, p, used, np.where(data.usable, nis, 0.0), at)
 
 
-def batch(x: Array, p: Array, data: Measurements) -> Updated:
+def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None = None) -> Updated:
     """Filter N samples at once, without process noise; the same result as `recursion`."""
-    solved = _solve(x, p, data, want_nis=True)
+    solved = _solve(x, p, data)
     if solved is None:
-        return recursion(x, p, data)
-    p_after = np.linalg.inv(_full([[column[:, -1] for column in row] for row in solved.information]))
-    p_after = 0.5 * (p_after + p_after.transpose(0, 2, 1))
-    state = np.stack([column[:, -1] for column in solved.information_state], axis=-1)
-    return Updated((p_after @ state[:, :, None])[:, :, 0], p_after, solved.used, solved.nis)
+        return recursion(x, p, data, None, ends)
+    after = solved.after(np.append([] if ends is None else ends, data.z.shape[1]).astype(np.intp))
+    at = None if ends is None else GaussianState(after.x[:-1], after.p[:-1])
+    return Updated(after.x[-1], after.p[-1], solved.used, solved.nis, at)
 
 
 def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -> GaussianState:
@@ -154,46 +154,6 @@ def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -
     return GaussianState((p_after @ state)[..., 0], p_after)
 
 
-def history(x: Array, p: Array, data: Measurements) -> History:
-    """Filter N samples at once, without process noise, and keep the state after each of them.
-
-    Long runs go in pieces whose arrays stay in the processor's cache.
-    """
-    k, n_samples = data.z.shape[:2]
-    n = x.shape[1]
-    # element by element in memory, as they are computed; seen from outside with the elements last
-    x_all, p_all = np.empty((n, k, n_samples)), np.empty((n, n, k, n_samples))
-    used = np.empty((k, n_samples), dtype=bool)
-    for start in range(0, n_samples, HISTORY_PIECE):
-        at = slice(start, start + HISTORY_PIECE)
-        x, p = _history_piece(x, p, data.part(at), x_all[..., at], p_all[..., at], used[:, at])
-    return History(np.moveaxis(x_all, 0, -1), np.moveaxis(p_all, (0, 1), (-2, -1)), used)
-
-
-def _history_piece(
-    x: Array, p: Array, data: Measurements, x_out: Array, p_out: Array, used_out: Mask
-) -> tuple[Array, Array]:
-    """Fill in a piece of the history, x_out (n, K, N), p_out (n, n, K, N), used_out (K, N); the state after it."""
-    solved = _solve(x, p, data, want_nis=False)
-    if solved is None:
-        for i in range(data.z.shape[1]):
-            after = recursion(x, p, data.part(slice(i, i + 1)))
-            x, p = after.x, after.p
-            x_out[..., i], p_out[..., i], used_out[:, i] = x.T, np.moveaxis(p, 0, -1), after.used[:, 0]
-        return x, p
-    inverse = _invert_lower(*_cholesky([[column[:, 1:] for column in row] for row in solved.information]))
-    n = x.shape[1]
-    for i in range(n):
-        for j in range(i + 1):  # P = L⁻ᵀ L⁻¹
-            _dot([inverse[row][i] for row in range(i, n)], [inverse[row][j] for row in range(i, n)], p_out[i, j])
-            p_out[j, i] = p_out[i, j]
-    state = [column[:, 1:] for column in solved.information_state]
-    for i in range(n):
-        _dot(p_out[i], state, x_out[i])
-    used_out[:] = solved.used
-    return x_out[..., -1].T.copy(), np.moveaxis(p_out[..., -1], -1, 0).copy()
-
-
 # Small dense algebra, element by element, each element an array over models and time: for 3x3 and 4x4 matrices this
 # is ten times faster than a LAPACK call per matrix. Symmetric matrices and lower triangles are lists of rows [i][j<=i].
 
@@ -208,8 +168,15 @@ class _Solved(NamedTuple):
     used: Mask
     nis: Array
 
+    def after(self, ends: NDArray[np.intp]) -> GaussianState:
+        """x (E, K, n) and P (E, K, n, n) after so many samples."""
+        p = np.linalg.inv(_full([[column[:, ends].T for column in row] for row in self.information]))
+        p = 0.5 * (p + p.swapaxes(-1, -2))
+        state = np.stack([column[:, ends].T for column in self.information_state], axis=-1)
+        return GaussianState((p @ state[..., None])[..., 0], p)
 
-def _solve(x: Array, p: Array, data: Measurements, want_nis: bool) -> _Solved | None:
+
+def _solve(x: Array, p: Array, data: Measurements) -> _Solved | None:
     """The information after every sample.
 
     Whether a sample passes the gate depends on the samples before it. So: assume all pass, compute every state at
@@ -229,13 +196,11 @@ def _solve(x: Array, p: Array, data: Measurements, want_nis: bool) -> _Solved | 
     gained_state = [_gain(wh[:, i], z, room) for i in range(n)]
     gated = bool(np.isfinite(data.gate).any())
     used, all_used = data.usable, bool(data.usable.all())
-    nis: Array = np.zeros(data.usable.shape)
     for _ in range(MAX_GATE_PASSES):
         mask = None if all_used else used
         information = [[_running_sum(prior[:, i, j], gained[i][j], mask) for j in range(i + 1)] for i in range(n)]
         information_state = [_running_sum(prior_state[:, i], gained_state[i], mask) for i in range(n)]
-        if gated or want_nis:
-            nis = _normalised_innovation_squared(information, information_state, h, z, data.r, m)
+        nis = _normalised_innovation_squared(information, information_state, h, z, data.r, m)
         passed = data.usable & (nis <= data.gate[:, None])
         if not gated or np.array_equal(passed, used):
             return _Solved(information, information_state, used, np.where(data.usable, nis, 0.0))

@@ -1,4 +1,4 @@
-"""What models are made of: a block of synchronised samples, and what several models derive from it."""
+"""What models see of aligned samples, and what several of them derive from it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .frames import Array, skew
+from .samples import Mask
 
 _HORIZONTAL = np.array([1.0, 1.0, 0.0])
 _UNIT_NOISE: Array = np.eye(3)[None]
@@ -29,6 +30,16 @@ class Assumptions(NamedTuple):
 ASSUMPTIONS = Assumptions()
 
 
+class Unmeasured(NamedTuple):
+    """Axes that a reference velocity does not measure.
+
+    axes: (N, 3) of the reference's own frame. rotation_reference_from_body: (N, 3, 3) into that frame.
+    """
+
+    axes: Mask
+    rotation_reference_from_body: Array
+
+
 class Reference(NamedTuple):
     """r = T (g + ω×l) (N, 3) m/s in the DVL frame, and [r×] (N, 3, 3)."""
 
@@ -46,7 +57,9 @@ class Observations:
     heave, body frame. noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body:
     (N, 3, 3), and angular_velocity: (N, 3) rad/s in the body frame, None where the block has no attitude. interval:
     (N,) s since the DVL sample before. reference_around: (N, 2) s since the reference sample before and until the one
-    after, between which reference_body lies on a straight line; zeros where it is one sample's own.
+    after, between which reference_body lies on a straight line; zeros where it is one sample's own. unmeasured: axes of
+    the reference that hold what the DVL measures, by the nominal mounting, for want of a measurement; None if it
+    measures all.
 
     What several models derive from these is computed once.
     """
@@ -62,6 +75,7 @@ class Observations:
     interval: Array | None = None
     reference_around: Array | None = None
     assumptions: Assumptions = ASSUMPTIONS
+    unmeasured: Unmeasured | None = None
 
     @cached_property
     def reference(self) -> Reference:

@@ -25,6 +25,7 @@ AUTO = "auto"
 FROM_FRAME_ID = "from_frame_id"
 FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
 IMU_ENU, IMU_NED = "enu", "ned"
+XYZ, XY = "xyz", "xy"
 
 
 class ParameterError(ValueError):
@@ -137,6 +138,12 @@ class Parameters:
         "Frame of the reference velocity. from_frame_id: base_frame is body; enu, map, odom, world are "
         "ENU; ned is NED; anything else is refused.",
         choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame)),
+    )
+    gnss_axes: str = _parameter(
+        AUTO,
+        "Axes of its frame that the reference measures: xyz, xy (no vertical velocity), or auto: xy as long as its "
+        "vertical velocity has been exactly 0. An axis whose variance is -1, or 1000 (m/s)² and more, never counts.",
+        choices=(AUTO, XYZ, XY),
     )
     base_frame: str = _parameter(
         "base_link",

@@ -8,10 +8,10 @@ integer nanoseconds; a float second would lose the nanoseconds of 2026.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,10 +295,13 @@ class Streams(NamedTuple):
 
 
 class Verdict:
-    """Why a DVL sample in order is not used by any model; `USED` if it is. Codes of `AlignedBlock.verdict`."""
+    """Why a DVL sample in order is not used by any model; `USED` if it is. Codes of `AlignedBlock.verdict`.
 
-    USED, SLOW, FROZEN, TURNING, NO_TURN_RATE = range(5)
-    NAMES = ("used", "slow", "frozen", "turning", "no_turn_rate")
+    AWAITING: not known until it has, or can no longer have, an angular velocity.
+    """
+
+    USED, SLOW, FROZEN, TURNING, NO_TURN_RATE, AWAITING = range(6)
+    NAMES = ("used", "slow", "frozen", "turning", "no_turn_rate", "awaiting_imu")
 
 
 class Pairing:
@@ -313,34 +316,46 @@ class AlignedBlock:
     """N DVL samples in order of stamps, with what the other streams say at their times.
 
     stamps_ns: (N,) compensated for dvl_time_offset. row: (N,) number of the DVL's message since the start, from 0.
-    velocity_dvl: (N, 3) m/s, DVL frame. covariances: of it. interval_ns: (N,) since the sample before, 0 for the
-    first. verdict: (N,) see `Verdict`. orientation: (N, 4) quaternion (x, y, z, w) of ``rotation_enu_from_body``, and
-    angular_velocity: (N, 3) rad/s, body frame, interpolated; nan where not known. pairing: (N,) see `Pairing`.
-    reference: (N, 3) m/s interpolated, in the frame of frames: (N,) places in `FRAMES`; nan where unpaired.
-    reference_covariance: (N, 3, 3) (m/s)² in that frame, nan where not given; None where no row has one. weight: (N,)
-    share of its own information that a sample's reference brings: below 1 where neighbours share it. around_s: (N, 2) s
-    since the reference sample before and until the one after, between which `reference` lies on a straight line; zeros
-    where it is one sample's own. prior_known: (N,) whether prior sway and heave were known by then.
+    velocity_dvl: (N, 3) m/s, DVL frame. covariance: (N, 3, 3) (m/s)² of it, nan where not given. interval_ns: (N,)
+    since the sample before, 0 for the first. verdict: (N,) see `Verdict`. prior_known: (N,) whether prior sway and
+    heave were known by then. attitude: (N, 7) interpolated quaternion (x, y, z, w) of ``rotation_enu_from_body`` and
+    angular velocity, rad/s, body frame; nan where not known. pairing: (N,) see `Pairing`. reference: (N, 12)
+    interpolated velocity (3), m/s, and covariance (9, nan where not given), in the frame of frames: (N,) places in
+    `FRAMES`; nan where unpaired. unmeasured: (N,) a bit (1, 2, 4) for each axis of that frame that the reference does
+    not measure. weight: (N,) share of its own information that a sample's reference brings: below 1 where neighbours
+    share it. around_s: (N, 2) s since the reference sample before and until the one after, between which `reference`
+    lies on a straight line; zeros where it is one sample's own.
     """
 
     stamps_ns: Stamps
     row: Stamps
     velocity_dvl: Array
-    covariances: Covariances
+    covariance: Array
     interval_ns: Stamps
     verdict: Codes
-    orientation: Array
-    angular_velocity: Array
+    prior_known: Mask
+    attitude: Array
     pairing: Codes
     reference: Array
     frames: Codes
+    unmeasured: Codes
     weight: Array
     around_s: Array
-    reference_covariance: Array | None = None
-    prior_known: Mask = field(default_factory=lambda: np.ones(0, dtype=bool))
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def share(self, with_reference: bool) -> Array:
+        """(N,) share of its own information that a row brings: all of it to models that need no reference."""
+        return self.weight if with_reference else np.ones(len(self))
+
+    def part(self, at: slice | Index | Mask) -> AlignedBlock:
+        """The rows of a slice, of indices or of a mask."""
+        return AlignedBlock(*(column[at] for column in self.columns()))
+
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        """All columns, in the order of the fields."""
+        return tuple(getattr(self, each.name) for each in fields(self))
 
     @cached_property
     def usable(self) -> Mask:
@@ -350,7 +365,7 @@ class AlignedBlock:
     @cached_property
     def oriented(self) -> Mask:
         """(N,) rows for models that need attitude and angular velocity."""
-        return self.usable & ~np.isnan(self.orientation[:, 0]) & ~np.isnan(self.angular_velocity[:, 0])
+        return self.usable & ~np.isnan(self.attitude[:, 0]) & ~np.isnan(self.attitude[:, 4])
 
     @cached_property
     def paired(self) -> Mask:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from .parameters import AUTO, Parameters
+from .samples import Mask, Stamps
 
 
 class Segment(NamedTuple):
@@ -44,6 +45,15 @@ class GnssAvailability:
             self.available = fresh
             self._changing_since_ns = None
 
+    def stays_with(self, stamps_ns: Stamps, paired: Mask) -> bool:
+        """Take note of samples (N,) that change nothing, and say True: of a receiver that is steadily there, or not."""
+        if self._changing_since_ns is not None or self._fresh != self.available:
+            return False
+        if self.available and paired.all():
+            self._last_paired_ns = int(stamps_ns[-1])
+            return True
+        return not self.available and not paired.any()
+
     @property
     def reason(self) -> str:
         """In words, for the operator."""
@@ -61,11 +71,14 @@ class Selection:
         self.gnss = GnssAvailability()
         self.segments: list[Segment] = []
 
-    def update(self, stamp_ns: int, paired: bool, parameters: Parameters) -> None:
-        """Take note of one DVL sample, in order of stamps."""
+    def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
+        """Take note of DVL samples (N,), in order of stamps, and of whether they were paired."""
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
-        self.gnss.update(stamp_ns, paired, timeout_ns, hysteresis_ns)
-        self.record(stamp_ns, parameters)
+        if self.segments and self.gnss.stays_with(stamps_ns, paired):
+            return
+        for stamp_ns, is_paired in zip(stamps_ns.tolist(), paired.tolist(), strict=True):
+            self.gnss.update(stamp_ns, is_paired, timeout_ns, hysteresis_ns)
+            self.record(stamp_ns, parameters)
 
     def record(self, stamp_ns: int, parameters: Parameters) -> None:
         """Start a new segment if another model is selected now; one that had no time is replaced."""

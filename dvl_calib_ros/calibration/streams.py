@@ -1,14 +1,23 @@
-"""Order and pairing of the three streams, decided by header stamps alone.
+"""Order of each stream, and what it says at another's times, decided by header stamps alone.
 
 Nothing here looks at a clock, nor at the order in which *different* topics arrive, as long as one topic does not lag
-another by more than a bounded time in stamps. So a live run and a replay of its recording decide alike.
+another by more than a bounded time in stamps. So a live run and a replay of its recording decide alike. What stands
+here twice, for one sample and for columns of them, is the same rule (test_alignment.py).
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from enum import Enum
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import ClassVar, Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from .frames import Array
+from .samples import Codes, Index, Mask, Stamps
+from .tables import Table
+
+# Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
+LONG_AGO_NS = -(2**62)
 
 
 class Stamped(Protocol):
@@ -31,6 +40,14 @@ class Order(Enum):
     HELD = "held"
     CONFIRMED_GAP = "confirmed_gap"
     CONFIRMED_RESTART = "confirmed_restart"
+
+
+class Admitted(NamedTuple):
+    """Of N rows of a stream those that are let through (N,), and how many others there are of each kind."""
+
+    rows: Mask
+    duplicate: int
+    out_of_order: int
 
 
 class Sequencer(Generic[S]):
@@ -84,50 +101,90 @@ class Sequencer(Generic[S]):
             self.stray += 1
             self.held = None
 
+    def admit_columns(self, stamps_ns: Stamps) -> Admitted | None:
+        """`admit` for a column of stamps (N,), without taking note of it; None if there is a jump among them.
 
-class Bracket(NamedTuple, Generic[S]):
-    """The samples before and at or after a time, and where between them it lies (0..1; 1 is exactly the later)."""
+        Jumps are rare and change everything: such a column goes through `admit` row by row.
+        """
+        if self.held is not None:
+            return None
+        if not len(stamps_ns):
+            return Admitted(np.zeros(0, dtype=bool), 0, 0)
+        first_ns = int(stamps_ns[0]) - 1 if self.last_ns is None else self.last_ns
+        step = stamps_ns - np.maximum.accumulate(np.concatenate([[first_ns], stamps_ns[:-1]]))
+        if step.max() > self._max_jump_ns or step.min() < -self._max_jump_ns:
+            return None
+        rows = step > 0
+        duplicate = int(np.count_nonzero(step == 0))
+        return Admitted(rows, duplicate, len(step) - int(np.count_nonzero(rows)) - duplicate)
 
-    before: S | None
-    after: S
+
+class Bracket(NamedTuple):
+    """Slots of the samples before (-1: none near enough) and at or after a time, and where between them it lies.
+
+    fraction: 0..1; 1 is exactly the later.
+    """
+
+    before: int
+    after: int
     fraction: float
 
 
-class Track(Generic[S]):
+class Brackets(NamedTuple):
+    """`Bracket` for N times. found: (N,) where there is one; the rest means nothing elsewhere."""
+
+    before: Index
+    after: Index
+    fraction: Array
+    found: Mask
+
+
+class Track(Table):
     """The recent past of one stream, to be interpolated but never extrapolated.
 
-    max_gap_ns: longest gap that is interpolated across. max_latency_ns: by how much other streams may run ahead of
-    this one before it is given up waiting for. retention_ns: how much past is kept.
+    values: what interpolates linearly or, of an IMU, the quaternion and the angular velocity, see samples.py; of a
+    reference velocity (3), covariance (9, nan where not given). frames, unmeasured: of a reference, its frame (a place
+    in `FRAMES`) and a bit for every axis that it does not measure.
     """
 
+    LAYOUT: ClassVar = {
+        "stamps_ns": (np.int64, ()),
+        "values": (np.float64, (12,)),
+        "frames": (np.uint8, ()),
+        "unmeasured": (np.uint8, ()),
+    }
+    stamps_ns: Stamps
+    values: Array
+    frames: Codes
+    unmeasured: Codes
+
     def __init__(self, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
-        self._max_gap_ns = max_gap_ns
-        self._max_latency_ns = max_latency_ns
-        self._retention_ns = retention_ns
-        self._stamps: list[int] = []
-        self._samples: list[S] = []
+        """Make an empty one.
+
+        max_gap_ns: longest gap that is interpolated across. max_latency_ns: by how much other streams may run ahead
+        of this one before it is given up waiting for. retention_ns: how far behind the newest sample a time may lie.
+        """
+        super().__init__()
+        self.max_gap_ns = max_gap_ns
+        self.max_latency_ns = max_latency_ns
+        self.retention_ns = retention_ns
 
     @property
     def newest_ns(self) -> int | None:
         """Stamp of the newest sample."""
-        return self._stamps[-1] if self._stamps else None
+        return int(self.stamps_ns[self.size - 1]) if self.size > self.begin else None
 
-    @property
-    def newest(self) -> S | None:
-        """The newest sample."""
-        return self._samples[-1] if self._samples else None
+    def append(self, stamp_ns: int) -> int:
+        """The slot of the next sample (stamps strictly increasing), with its stamp filled in."""
+        slot = self.extend(1).start
+        self.stamps_ns[slot] = stamp_ns
+        return slot
 
-    def append(self, sample: S) -> None:
-        """Add the next sample (stamps strictly increasing)."""
-        self._stamps.append(sample.stamp_ns)
-        self._samples.append(sample)
-        if len(self._stamps) >= 512 and self._stamps[256] < sample.stamp_ns - self._retention_ns:
-            del self._stamps[:256], self._samples[:256]
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._stamps.clear()
-        self._samples.clear()
+    def forget_old(self) -> None:
+        """Forget what no time that may still be asked for needs."""
+        if self.size > self.begin:
+            oldest_ns = self.stamps_ns[self.size - 1] - self.retention_ns - self.max_gap_ns
+            self.begin += int(np.searchsorted(self.stamps_ns[self.begin : self.size], oldest_ns))
 
     def decided(self, stamp_ns: int, horizon_ns: int) -> bool:
         """Whether `bracket(stamp_ns)` can no longer change, with horizon_ns the newest stamp of any stream.
@@ -141,20 +198,62 @@ class Track(Generic[S]):
     def deadline_ns(self, stamp_ns: int) -> int:
         """The horizon from which a time that this stream has not reached is decided all the same."""
         newest = self.newest_ns
-        last_chance_ns = stamp_ns if newest is None else max(stamp_ns, newest + self._max_gap_ns)
-        return last_chance_ns + self._max_latency_ns
+        last_chance_ns = stamp_ns if newest is None else max(stamp_ns, newest + self.max_gap_ns)
+        return last_chance_ns + self.max_latency_ns
 
-    def bracket(self, stamp_ns: int) -> Bracket[S] | None:
-        """The samples around a time; None without one at or after it, or across too long a gap."""
-        stamps = self._stamps
-        at = bisect_left(stamps, stamp_ns)
-        if at == len(stamps):
+    def decided_in(
+        self, stamps_ns: Stamps, since: Index, new_ns: Stamps, arrived: Index, newest_ns: Stamps, horizon_ns: Stamps
+    ) -> Index:
+        """`decided` for columns: the event (0..T-1, T: none of them) at which each of N times is.
+
+        stamps_ns: (N,) increasing. since: (N,) event from which a time is asked for. new_ns: stamps of the samples
+        that this stream gains, and arrived: at which events. newest_ns, horizon_ns: (T,) after every event.
+        """
+        n_events = len(horizon_ns)
+        before_ns = LONG_AGO_NS if self.newest_ns is None else self.newest_ns
+        reached_at = np.append(arrived, n_events)[np.searchsorted(new_ns, stamps_ns)]
+        decided = np.where(stamps_ns <= before_ns, since, np.maximum(since, reached_at))
+        # up to which time this stream is given up after an event; while it stands still that only grows
+        overdue = newest_ns + self.max_gap_ns + self.max_latency_ns <= horizon_ns
+        if not overdue.any():
+            return decided
+        given_up_ns = np.where(overdue, horizon_ns - self.max_latency_ns, LONG_AGO_NS)
+        bounds = np.concatenate([[0], np.flatnonzero(np.diff(newest_ns)) + 1, [n_events]])
+        of_interest = np.flatnonzero(given_up_ns[bounds[1:] - 1] != LONG_AGO_NS)
+        for start, stop in zip(bounds[of_interest].tolist(), bounds[of_interest + 1].tolist(), strict=True):
+            low = int(np.searchsorted(stamps_ns, newest_ns[start], side="right"))
+            high = int(np.searchsorted(stamps_ns, given_up_ns[stop - 1], side="right"))
+            given_up = np.searchsorted(given_up_ns[start:stop], stamps_ns[low:high]) + start
+            given_up = np.maximum(given_up, since[low:high])
+            decided[low:high] = np.where(given_up < stop, np.minimum(decided[low:high], given_up), decided[low:high])
+        return decided
+
+    def bracket(self, stamp_ns: int) -> Bracket | None:
+        """The samples around a time; None without one at or after it, across too long a gap, or too long ago."""
+        stamps = self.stamps_ns[self.begin : self.size]
+        at = int(np.searchsorted(stamps, stamp_ns))
+        if at == len(stamps) or stamp_ns < stamps[-1] - self.retention_ns:
             return None
-        after_ns = stamps[at]
-        before_ns = stamps[at - 1] if at and after_ns - stamps[at - 1] <= self._max_gap_ns else None
+        after_ns = int(stamps[at])
+        before_ns = int(stamps[at - 1]) if at else LONG_AGO_NS
+        after = self.begin + at
+        before = after - 1 if after_ns - before_ns <= self.max_gap_ns else -1
         if after_ns == stamp_ns:
-            return Bracket(None if before_ns is None else self._samples[at - 1], self._samples[at], 1.0)
-        if before_ns is None:
-            return None
-        fraction = (stamp_ns - before_ns) / (after_ns - before_ns)
-        return Bracket(self._samples[at - 1], self._samples[at], fraction)
+            return Bracket(before, after, 1.0)
+        return None if before < 0 else Bracket(before, after, (stamp_ns - before_ns) / (after_ns - before_ns))
+
+    def brackets(self, stamps_ns: Stamps, newest_ns: Stamps) -> Brackets:
+        """`bracket` for columns; newest_ns: (N,) stamp of this stream's newest sample when each was decided."""
+        stamps = self.stamps_ns[self.begin : self.size]
+        if not len(stamps):
+            nowhere = np.zeros(len(stamps_ns), dtype=np.intp)
+            return Brackets(nowhere, nowhere, nowhere.astype(float), np.zeros(len(stamps_ns), dtype=bool))
+        at = np.minimum(np.searchsorted(stamps, stamps_ns), len(stamps) - 1)
+        after_ns = stamps[at]
+        gap_ns = np.where(at > 0, after_ns - stamps[np.maximum(at - 1, 0)], self.max_gap_ns + 1)
+        near = gap_ns <= self.max_gap_ns
+        exact = after_ns == stamps_ns
+        found = (stamps_ns <= newest_ns) & (stamps_ns >= newest_ns - self.retention_ns) & (exact | near)
+        fraction = np.where(exact, 1.0, (stamps_ns - (after_ns - gap_ns)) / gap_ns)
+        after = at + self.begin
+        return Brackets(np.where(near, after - 1, -1), after, fraction, found)

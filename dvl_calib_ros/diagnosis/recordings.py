@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..calibration.calibrator import SECOND_NS
-from ..calibration.frames import Array
-from ..calibration.observations import Observations
+from ..calibration.clocks import SECOND_NS
+from ..calibration.frames import Array, rotation_from_quaternion
+from ..calibration.models import Needs as Partners
+from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
-from ..calibration.samples import VelocityFrame
+from ..calibration.samples import AlignedBlock, VelocityFrame
 from ..effects.base import Needs
 from ..errors import InputError
 from ..replay.replay import Topics, replay
@@ -195,39 +196,50 @@ def _bins(time: Array, interval: float, rate: float) -> NDArray[np.intp]:
 
 
 class _Collector:
-    """Keeps what `Calibrator.on_block` tells: paired blocks, and oriented blocks to be joined to them by stamp."""
+    """Keeps the paired rows that a calibrator aligns."""
 
-    def __init__(self) -> None:
+    def __init__(self, parameters: Parameters) -> None:
+        self._observer = Observer(parameters)
         self._paired: list[tuple[NDArray[Any], ...]] = []
-        self._oriented: list[tuple[NDArray[Any], ...]] = []
 
     @property
     def has_paired(self) -> bool:
         """Whether any sample had a reference."""
         return bool(self._paired)
 
-    def take(self, stamps_ns: Sequence[int], seen: Observations) -> None:
-        """A block, as the models get it."""
-        stamps = np.array(stamps_ns, dtype=np.int64)
-        if seen.reference_body is not None:
-            variance = np.diagonal(seen.noise, axis1=1, axis2=2)
-            variance = np.broadcast_to(variance, (len(stamps), 3))
-            around = np.zeros((len(stamps), 2)) if seen.reference_around is None else seen.reference_around
-            self._paired.append((stamps, seen.velocity_at_reference, seen.reference_body, variance, around))
-        elif seen.rotation_enu_from_body is not None and seen.angular_velocity is not None:
-            self._oriented.append((stamps, seen.rotation_enu_from_body, seen.angular_velocity))
+    def forget(self) -> None:
+        """The calibration starts anew."""
+        self._paired.clear()
+
+    def take(self, block: AlignedBlock) -> None:
+        """Aligned rows, in order."""
+        block = block.part(block.paired)
+        if not len(block):
+            return
+        seen = self._observer.observe(block, Partners.REFERENCE, np.zeros(2))
+        assert seen.reference_body is not None
+        variance = np.broadcast_to(np.diagonal(seen.noise, axis1=1, axis2=2), (len(block), 3))
+        self._paired.append(
+            (
+                block.stamps_ns,
+                seen.velocity_at_reference,
+                seen.reference_body,
+                variance,
+                block.around_s,
+                block.oriented,
+                rotation_from_quaternion(block.attitude[:, :4]),
+                block.attitude[:, 4:],
+            )
+        )
 
     def recording(self, name: str, parameters: Parameters, reference_rate: float, frame: VelocityFrame) -> Recording:
         """What was collected."""
         columns = [np.concatenate(parts) for parts in zip(*self._paired, strict=True)]
-        rotation = rate = None
-        if self._oriented:
-            oriented_stamps, rotations, rates = (np.concatenate(parts) for parts in zip(*self._oriented, strict=True))
-            _, at_paired, at_oriented = np.intersect1d(columns[0], oriented_stamps, True, return_indices=True)
-            if len(at_paired) >= MIN_ORIENTED_SHARE * len(columns[0]):
-                columns = [values[at_paired] for values in columns]
-                rotation, rate = rotations[at_oriented], rates[at_oriented]
-        stamps, velocity, reference, variance, around = columns
+        oriented = columns[5]
+        has_attitude = np.count_nonzero(oriented) >= MIN_ORIENTED_SHARE * len(oriented)
+        if has_attitude:
+            columns = [values[oriented] for values in columns]
+        stamps, velocity, reference, variance, around, _, rotation, rate = columns
         assumed = np.allclose(variance, parameters.gnss_aided_std**2, rtol=1e-12)
         return make_recording(
             name,
@@ -235,8 +247,8 @@ class _Collector:
             velocity,
             reference,
             None if assumed else variance,
-            rotation,
-            rate,
+            rotation if has_attitude else None,
+            rate if has_attitude else None,
             around,
             frame,
             reference_rate,
@@ -273,8 +285,8 @@ def load_recordings(
 def _load(
     path: Path, parameters: Parameters, topics: Topics, on_progress: Callable[[float], None]
 ) -> tuple[Recording, tuple[str, ...]]:
-    collector = _Collector()
-    replayed = replay([path], parameters, topics, on_progress, on_block=collector.take)
+    collector = _Collector(parameters)
+    replayed = replay([path], parameters, topics, on_progress, on_rows=collector.take, on_restart=collector.forget)
     result = replayed.result
     received, paired = result.counts["reference"]["received"], result.counts["pairing"]["paired"]
     if not received:

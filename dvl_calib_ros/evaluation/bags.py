@@ -13,8 +13,10 @@ import numpy as np
 from .. import __version__
 from ..calibration.error_model import correction_matrix
 from ..calibration.frames import Array
-from ..calibration.observations import Observations
+from ..calibration.models import Needs
+from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
+from ..calibration.samples import AlignedBlock
 from ..errors import InputError
 from ..parallel import Workers, run_all
 from ..replay.replay import Topics, replay
@@ -84,23 +86,30 @@ def cross_check(
 
 
 def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:
+    observer = Observer(parameters)
     measured: list[Array] = []
     reference: list[Array] = []
 
-    def keep_paired(_: Sequence[int], seen: Observations) -> None:
-        if seen.reference_body is not None:
-            measured.append(seen.velocity_at_reference)
-            reference.append(seen.reference_body)
+    def keep_paired(block: AlignedBlock) -> None:
+        seen = observer.observe(block.part(block.paired), Needs.REFERENCE, np.zeros(2))
+        assert seen.reference_body is not None
+        measured.append(seen.velocity_at_reference)
+        reference.append(seen.reference_body)
 
-    replayed = replay([bag], parameters, topics, on_block=keep_paired)
+    def forget() -> None:
+        measured.clear()
+        reference.clear()
+
+    replayed = replay([bag], parameters, topics, on_rows=keep_paired, on_restart=forget)
     corrections = np.full((len(models), 3, 3), np.nan)
     for index, name in enumerate(models):
         estimate = replayed.result.estimates[name]
         if estimate.used:
             rotation = parameters.rotation_dvl_from_body
             corrections[index] = correction_matrix(estimate.misalignment, estimate.scale, rotation)
-    moments = Moments.of(np.concatenate(measured), np.concatenate(reference)) if measured else None
-    return _Replayed(corrections, moments, sum(map(len, measured)), replayed.notes)
+    n_paired = sum(map(len, measured))
+    moments = Moments.of(np.concatenate(measured), np.concatenate(reference)) if n_paired else None
+    return _Replayed(corrections, moments, n_paired, replayed.notes)
 
 
 def cross_check_document(check: CrossCheck) -> dict[str, Any]:

@@ -1,14 +1,14 @@
 """Many calibrations of one run at once: the same models, priors and filter as live and in replay.
 
-What differs is the layout. Runs here are complete and synchronous, so nothing waits for a partner, and B variants of a
-run (combinations of errors) go through the models and the filter as one array. That this gives the state that replaying
-a bag of the same data gives is proved in test_evaluation.py.
+What differs is the layout: B variants of a run (combinations of errors), each aligned and gated as a recording of it
+would be, go through the models and the filter as one array. That this gives the state that replaying a bag of the same
+data gives is proved in test_evaluation.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -16,16 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration import kalman
+from ..calibration.alignment import align
 from ..calibration.bank import Assembler
 from ..calibration.frames import Array
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model, Needs
-from ..calibration.observations import Assumptions, Observations
+from ..calibration.observations import Observations
+from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
+from ..calibration.samples import AlignedBlock, Mask, Stream, Streams, no_samples, sample_block
 from .trajectories import Trajectory
 
-Mask = NDArray[np.bool_]
 T = TypeVar("T", bound=np.generic)
+# stamp of a run's time 0, s since 1970
+_START_S = 1_600_000_000
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,75 @@ class SensorData:
     reference: Array
 
 
+@dataclass(frozen=True)
+class AlignedVariants:
+    """What the calibrator's own alignment and gates make of B variants of a run of N samples.
+
+    rows: of all variants, one after the other (B N). A sample that is not let through (too fast to be valid, say) is
+    a row that no model uses. has: for each need the rows (B, N) that have it. sway_heave: (B, 2) m/s, the priors.
+    """
+
+    rows: AlignedBlock
+    has: Mapping[Needs, Mask]
+    sway_heave: Array
+
+    def observations(self, needs: Needs, parameters: Parameters) -> Observations:
+        """What models with these needs see of all rows; of those without, anything finite."""
+        n_samples = self.has[needs].shape[1]
+        return Observer(parameters).observe(self.rows, needs, np.repeat(self.sway_heave, n_samples, axis=0))
+
+
+def streams_of(data: SensorData, variant: int) -> Streams:
+    """One variant as a recording of it would give it."""
+    run = data.run
+    stamps_ns = np.rint((_START_S + run.time) * 1e9).astype(np.int64)
+    imu = no_samples(Stream.IMU)
+    if run.rotation_enu_from_body is not None and run.angular_velocity is not None:
+        imu = sample_block(Stream.IMU, stamps_ns, np.concatenate([run.quaternions, run.angular_velocity], axis=1))
+    return Streams(
+        sample_block(Stream.DVL, stamps_ns, data.velocity_dvl[variant]),
+        sample_block(Stream.REFERENCE, stamps_ns, data.reference[variant]),
+        imu,
+    ).arriving_by_stamp()
+
+
+def true_prior(data: SensorData, parameters: Parameters) -> tuple[float, float] | None:
+    """Sway and heave of ``prior_source: reference``: here the truth's, over the prior's window."""
+    if parameters.prior_source != "reference":
+        return None
+    _, sway, heave = data.run.velocity[: data.run.first(parameters.prior_window)].mean(axis=0).tolist()
+    return sway, heave
+
+
+def aligned(data: SensorData, parameters: Parameters) -> AlignedVariants:
+    """All variants of a run, by the rules of a calibration."""
+    prior, n_samples = true_prior(data, parameters), len(data.run.time)
+    found = [align(streams_of(data, variant), parameters, prior) for variant in range(len(data.velocity_dvl))]
+    # a row for every sample, also for those that are not let through
+    at = np.zeros((len(found), n_samples), dtype=np.intp)
+    present = np.zeros(at.shape, dtype=bool)
+    first = 0
+    for index, (block, _) in enumerate(found):
+        at[index, block.row] = first + np.arange(len(block))
+        present[index, block.row] = True
+        first += len(block)
+    columns = (np.concatenate(column) for column in zip(*(block.columns() for block, _ in found), strict=True))
+    rows = AlignedBlock(*columns).part(at.ravel())
+    has = {
+        needs: present & mask.reshape(at.shape)
+        for needs, mask in (
+            (Needs.NOTHING, rows.usable), (Needs.ATTITUDE, rows.oriented), (Needs.REFERENCE, rows.paired)
+        )
+    }  # fmt: skip
+    rows = replace(rows, attitude=np.nan_to_num(rows.attitude), reference=_finite(rows.reference))
+    return AlignedVariants(rows, has, np.array([sway_heave for _, sway_heave in found]))
+
+
+def _finite(reference: Array) -> Array:
+    """Velocities 0 where there are none; covariances stay as they are."""
+    return np.concatenate([np.nan_to_num(reference[:, :3]), reference[:, 3:]], axis=1)
+
+
 def estimate(
     models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
 ) -> Mapping[str, GaussianState]:
@@ -48,82 +121,27 @@ def estimate(
     Returns x (E, B, n) and P (E, B, n, n) by the model's name. parameters: without process noise, lever arm or
     mounting.
     """
-    usable = usable_samples(data, parameters)
-    sway_heave, prior_known = prior_sway_heave(data, usable, parameters)
+    variants = aligned(data, parameters)
     found: dict[str, GaussianState] = {}
     for needs in Needs:
         group = [MODELS[name] for name in models if MODELS[name].needs is needs]
         if not group or (needs is Needs.ATTITUDE and data.run.rotation_enu_from_body is None):
             continue
-        seen = observations(data, needs, sway_heave, parameters)
+        seen = variants.observations(needs, parameters)
         for model in group:  # each on its own, in its own size: here it is the variants that fill the arrays
-            found[model.name] = _estimate_one(model, seen, usable, prior_known, parameters, ends)
+            found[model.name] = _estimate_one(model, seen, variants, parameters, ends)
     return {name: found[name] for name in models if name in found}
 
 
 def _estimate_one(
-    model: Model, seen: Observations, usable: Mask, prior_known: Mask, parameters: Parameters, ends: Sequence[int]
+    model: Model, seen: Observations, variants: AlignedVariants, parameters: Parameters, ends: Sequence[int]
 ) -> GaussianState:
     assembler = Assembler([model], parameters)
-    flat = assembler.measurements(seen, np.ones(usable.size), prior_known.ravel())
+    flat = assembler.measurements(seen, variants.rows.share(model.aided), variants.rows.prior_known)
+    usable = variants.has[model.needs]
     x, p = (np.repeat(each, len(usable), axis=0) for each in assembler.start)
     after = _states_after(x, p, _by_variant(flat, usable), ends)
     return assembler.state(0, after.x, after.p)
-
-
-def observations(data: SensorData, needs: Needs, sway_heave: Array, parameters: Parameters) -> Observations:
-    """All variants in a row (B N samples)."""
-    run, (n_variants, n_samples, _) = data.run, data.velocity_dvl.shape
-    attitude = needs is Needs.ATTITUDE
-    aided = needs is Needs.REFERENCE
-    std = parameters.gnss_aided_std if aided else parameters.gnss_free_std
-
-    def repeated(values: Array | None) -> Array | None:
-        return None if values is None else np.tile(values, (n_variants,) + (1,) * (values.ndim - 1))
-
-    return Observations(
-        velocity_dvl=data.velocity_dvl.reshape(-1, 3),
-        reference_body=data.reference.reshape(-1, 3) if aided else None,
-        lever_velocity=None,
-        rotation_dvl_from_body=np.eye(3),
-        sway_heave=np.repeat(sway_heave, n_samples, axis=0),
-        noise=std**2 * np.eye(3)[None],
-        rotation_enu_from_body=repeated(run.rotation_enu_from_body) if attitude else None,
-        angular_velocity=repeated(run.angular_velocity) if attitude else None,
-        interval=repeated(np.diff(run.time, prepend=run.time[0])),
-        assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
-    )
-
-
-def usable_samples(data: SensorData, parameters: Parameters) -> Mask:
-    """Samples (B, N) that are neither too slow nor in too sharp a turn, as the calibrator has it."""
-    usable: Mask = np.sum(data.velocity_dvl**2, axis=-1) >= parameters.min_speed**2
-    if parameters.max_turn_rate > 0.0:
-        rates = data.run.angular_velocity
-        calm = np.zeros(usable.shape[1], bool) if rates is None else _squared(rates) <= parameters.max_turn_rate**2
-        usable = usable & calm
-    return usable
-
-
-def _squared(vectors: Array) -> Array:
-    return np.asarray(np.sum(vectors**2, axis=-1))
-
-
-def prior_sway_heave(data: SensorData, usable: Mask, parameters: Parameters) -> tuple[Array, Mask]:
-    """Prior sway and heave (B, 2) m/s, and at which samples (B, N) it is known."""
-    n_variants = len(usable)
-    known: Mask = np.ones(usable.shape, dtype=bool)
-    time = data.run.time
-    if parameters.prior_source == "fixed":
-        return np.tile(parameters.prior_sway_heave, (n_variants, 1)), known
-    if parameters.prior_source == "reference":
-        window = data.run.velocity[: data.run.first(parameters.prior_window)]
-        return np.tile(window[:, 1:].mean(axis=0), (n_variants, 1)), known
-    started = time[np.argmax(usable, axis=1)]
-    known = time[None] - started[:, None] >= parameters.prior_window
-    in_window = (usable & ~known)[..., None]
-    mean = np.sum(data.velocity_dvl[..., 1:] * in_window, axis=1) / np.maximum(in_window.sum(axis=1), 1)
-    return mean, known
 
 
 def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:

@@ -34,8 +34,8 @@ from .results import CalibrationRun, Coverage, EachStudy, ErrorsInVariables, Eva
 from .trajectories import Trajectory, load_folder, own_trajectories
 
 # What evaluation sets otherwise than a live calibration: the published procedure has no gate, and M5 and M6 come out
-# as published with the prior from the reference velocity.
-DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "reference"}
+# as published with the prior from the reference velocity. Its GNSS measures three axes, also where heave is zero.
+DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "reference", "gnss_axes": "xyz"}
 # The unit under test is mounted straight, at the reference point, in step, and its errors are constant.
 FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", "process_std_misalignment",
          "process_std_scale", "max_speed")  # fmt: skip

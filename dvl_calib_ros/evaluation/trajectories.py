@@ -14,9 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd
 from ..errors import InputError
@@ -45,6 +47,12 @@ class Trajectory:
     velocity: Array
     rotation_enu_from_body: Array | None = None
     angular_velocity: Array | None = None
+
+    @cached_property
+    def quaternions(self) -> Array:
+        """(N, 4) x, y, z, w of the attitude, which the run has."""
+        quaternions: Array = Rotation.from_matrix(self.rotation_enu_from_body).as_quat()
+        return quaternions
 
     @property
     def seconds(self) -> float:

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import Array
-from ..calibration.models import MODELS
-from ..calibration.observations import Observations
+from ..calibration.history import StateTrace
+from ..calibration.models import MODELS, Needs
+from ..calibration.observe import Observer
+from ..calibration.parameters import Parameters
+from ..calibration.samples import AlignedBlock, Codes, Pairing, Stamps
 
-Stamps = NDArray[np.int64]
-T = TypeVar("T")
-
-# Rows kept of each series at most: a figure shows no more. States are dear, they make the models work in small blocks.
+# Rows kept of each series at most: a figure shows no more.
 KEPT_STATES, KEPT_VELOCITIES = 300, 800
 
 
@@ -39,8 +38,8 @@ class ModelHistory:
 class RunHistory:
     """A run over time.
 
-    stamps_ns: (N,) of the rows of `models` and paired_share. paired_share: (N,) share of the DVL samples since the
-    stamp before that had a reference, nan where none was decided.
+    stamps_ns: (N,) of the rows of `models` and paired_share; a model's state is that of the samples up to then.
+    paired_share: (N,) share of the DVL samples since the stamp before that had a reference, nan where none was decided.
     dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, moved to the reference point.
     paired_ns (P,), paired_velocity (P, 3), reference_velocity (P, 3): those that had a reference, m/s; the DVL's as
     above, the reference in the body frame.
@@ -56,122 +55,102 @@ class RunHistory:
     reference_velocity: Array
 
 
-class Thinned(Generic[T]):
+class Thinned:
     """Keeps evenly spread rows of an endless series: every stride-th, the stride doubles when there are too many.
 
-    limit: rows kept at most. expected: length of the series as far as it is known; with a good guess fewer rows are
-    wanted in vain.
+    limit: rows kept at most. expected: length of the series as far as it is known.
     """
 
     def __init__(self, limit: int, expected: int = 0) -> None:
-        self.rows: list[T] = []
         self._limit = limit
         self._stride = max(1, -(-expected // limit))
         self._seen = 0
+        self._rows: list[tuple[Any, ...]] = []
 
-    def wants_next(self) -> bool:
-        """Count one more row; whether it is one to keep."""
-        wanted = self._seen % self._stride == 0
-        self._seen += 1
-        return wanted
-
-    def keep(self, row: T) -> None:
-        """Take the row that was wanted."""
-        self.rows.append(row)
-        if len(self.rows) > self._limit:
-            self.rows = self.rows[::2]
+    def add(self, *columns: Array | Stamps) -> None:
+        """Take the next rows, as columns (N, ...)."""
+        n = len(columns[0])
+        at = slice(-self._seen % self._stride, n, self._stride)
+        self._seen += n
+        self._rows += zip(*(column[at].copy() for column in columns), strict=True)
+        while len(self._rows) > self._limit:
+            self._rows = self._rows[::2]
             self._stride *= 2
 
-
-class _Moment(NamedTuple):
-    """All models after a DVL sample. paired, decided: DVL samples so far."""
-
-    stamp_ns: int
-    models: Mapping[str, _ModelMoment]
-    paired: int
-    decided: int
-
-
-class _ModelMoment(NamedTuple):
-    """used: samples so far. nis_sum: of νᵀS⁻¹ν over them."""
-
-    state: Array
-    std: Array
-    used: int
-    nis_sum: float
-
-
-_Velocities = tuple[int, Array, Array | None]  # stamp, DVL at the reference point, reference in the body
+    def columns(self, *shapes: tuple[int, ...]) -> list[Array]:
+        """What was kept, in columns of rows of these shapes."""
+        columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(shapes)
+        return [np.array(column).reshape(-1, *shape) for column, shape in zip(columns, shapes, strict=True)]
 
 
 class Recorder:
     """Collects a `RunHistory` beside a calibrator, without changing what it computes.
 
-    Give `observe` to the calibrator as its on_block, and call `note` after every DVL sample that it took.
+    Give `take` to the calibrator as its on_rows, `start` as its on_restart and `trace` as its trace. expected: about
+    how many DVL samples there will be.
     """
 
-    def __init__(self) -> None:
-        self._restarts = 0
-        self.expect(0)
+    def __init__(self, parameters: Parameters, expected: int = 0) -> None:
+        self._observer = Observer(parameters)
+        self._expected = expected
+        self.trace = StateTrace(KEPT_STATES, expected)
+        self.start()
 
-    def expect(self, n_samples: int) -> None:
-        """Start anew, to be told of about this many DVL samples."""
-        self._expected = n_samples
-        self._moments: Thinned[_Moment] = Thinned(KEPT_STATES, n_samples)
-        self._dvl: Thinned[_Velocities] = Thinned(KEPT_VELOCITIES, n_samples)
-        self._paired: Thinned[_Velocities] = Thinned(KEPT_VELOCITIES, n_samples)
+    def start(self) -> None:
+        """Start anew, as the calibration does."""
+        self._stamps_ns: list[Stamps] = []
+        self._pairing: list[Codes] = []
+        self._dvl = Thinned(KEPT_VELOCITIES, self._expected)
+        self._paired = Thinned(KEPT_VELOCITIES, self._expected)
 
-    def observe(self, stamps_ns: Sequence[int], seen: Observations) -> None:
-        """Take note of the velocities of a block."""
-        if seen.reference_body is None and seen.rotation_enu_from_body is not None:
-            return  # the same samples once more, now with attitude
-        series = self._dvl if seen.reference_body is None else self._paired
-        for i, stamp_ns in enumerate(stamps_ns):
-            if series.wants_next():
-                reference = None if seen.reference_body is None else seen.reference_body[i].copy()
-                series.keep((stamp_ns, seen.velocity_at_reference[i].copy(), reference))
-
-    def note(self, calibrator: Calibrator) -> None:
-        """Take note of the models' states."""
-        if calibrator.restarts != self._restarts:  # the calibration has started anew, so does its history
-            self._restarts = calibrator.restarts
-            self.expect(self._expected)
-        if self._moments.wants_next():
-            self._moments.keep(_moment(calibrator))
+    def take(self, block: AlignedBlock) -> None:
+        """Take note of rows."""
+        self._stamps_ns.append(block.stamps_ns)
+        self._pairing.append(block.pairing)
+        usable, paired = block.part(block.usable), block.part(block.paired)
+        if len(usable):
+            seen = self._observer.observe(usable, Needs.NOTHING, np.zeros(2))
+            self._dvl.add(usable.stamps_ns, seen.velocity_at_reference)
+        if len(paired):
+            seen = self._observer.observe(paired, Needs.REFERENCE, np.zeros(2))
+            assert seen.reference_body is not None
+            self._paired.add(paired.stamps_ns, seen.velocity_at_reference, seen.reference_body)
 
     def history(self, calibrator: Calibrator) -> RunHistory:
-        """What was collected, with the calibrator's state as it is now at its end."""
-        moments = [*self._moments.rows, _moment(calibrator)]
-        dvl, paired = self._dvl.rows, self._paired.rows
+        """What was collected until `Calibrator.finish`, with the calibrator's state as it is now at its end."""
+        numbers = self.trace.numbers()
+        stamps_ns = np.concatenate([*self._stamps_ns, np.zeros(0, dtype=np.int64)])
+        pairing = np.concatenate([*self._pairing, np.zeros(0, dtype=np.uint8)])
+        numbers = numbers[numbers < len(stamps_ns)]
+        decided, paired = np.cumsum(pairing != Pairing.AWAITING), np.cumsum(pairing == Pairing.PAIRED)
+        at = np.append(numbers, len(stamps_ns) - 1) if len(stamps_ns) else np.zeros(0, dtype=np.int64)
+        dvl_ns, dvl_velocity = self._dvl.columns((), (3,))
+        paired_ns, paired_velocity, reference_velocity = self._paired.columns((), (3,), (3,))
         return RunHistory(
-            stamps_ns=np.array([moment.stamp_ns for moment in moments]),
-            models={name: _model_history(name, [moment.models[name] for moment in moments]) for name in MODELS},
-            paired_share=_share(np.array([(moment.paired, moment.decided) for moment in moments])),
-            dvl_ns=np.array([row[0] for row in dvl], dtype=np.int64),
-            dvl_velocity=np.array([row[1] for row in dvl]).reshape(-1, 3),
-            paired_ns=np.array([row[0] for row in paired], dtype=np.int64),
-            paired_velocity=np.array([row[1] for row in paired]).reshape(-1, 3),
-            reference_velocity=np.array([row[2] for row in paired]).reshape(-1, 3),
+            stamps_ns=np.append(stamps_ns[numbers], calibrator.last_ns or 0),
+            models={name: _model_history(name, calibrator, self.trace, numbers) for name in MODELS},
+            paired_share=_share(np.column_stack([paired[at], decided[at]])) if len(at) else np.full(1, np.nan),
+            dvl_ns=dvl_ns.astype(np.int64),
+            dvl_velocity=dvl_velocity,
+            paired_ns=paired_ns.astype(np.int64),
+            paired_velocity=paired_velocity,
+            reference_velocity=reference_velocity,
         )
 
 
-def _moment(calibrator: Calibrator) -> _Moment:
-    models = {}
-    for name in MODELS:
-        estimate = calibrator.estimate(name)
-        nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
-        models[name] = _ModelMoment(estimate.state, estimate.std, estimate.used, nis_sum)
-    pairing = calibrator.counts["pairing"]
-    decided = pairing["paired"] + pairing["unpaired"]
-    return _Moment(calibrator.last_ns or 0, models, pairing["paired"], decided)
-
-
-def _model_history(name: str, moments: Sequence[_ModelMoment]) -> ModelHistory:
-    sums = np.array([(moment.nis_sum, moment.used) for moment in moments])
+def _model_history(name: str, calibrator: Calibrator, trace: StateTrace, numbers: Stamps) -> ModelHistory:
+    estimate = calibrator.estimate(name)
+    nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
+    states, stds, sums = [estimate.state[None]], [estimate.std[None]], [[(nis_sum, estimate.used)]]
+    if len(numbers):
+        state, used, nis_sums = calibrator.states_at(name, trace.standing(MODELS[name].needs, numbers))
+        states.insert(0, state.x)
+        stds.insert(0, np.sqrt(np.diagonal(state.p, axis1=1, axis2=2)))
+        sums.insert(0, list(zip(nis_sums.tolist(), used.tolist(), strict=True)))
     return ModelHistory(
-        state=np.array([moment.state for moment in moments]),
-        std=np.array([moment.std for moment in moments]),
-        nis=_share(sums) / MODELS[name].n_measurement,
+        state=np.concatenate(states),
+        std=np.concatenate(stds),
+        nis=_share(np.concatenate(sums)) / MODELS[name].n_measurement,
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +16,19 @@ from ..calibration.advice import data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.findings import Finding, finding
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
-from ..calibration.observations import Observations
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
-from ..calibration.samples import VelocityFrame
+from ..calibration.samples import AlignedBlock, Stream, VelocityFrame
 from ..calibration.screening import is_valid_velocity, unit_quaternion
 from ..calibration.verification import verification_document
 from ..errors import InputError
 from ..files.result_file import estimate_document, load_initial_calibration
+from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder, Refusal
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
-from ..messages.feed import MessageFeed
 from .recorder import Recorder, RunHistory
 
 BLOCK_SIZE = 512
-# Samples read between two reports of progress
-PROGRESS_EVERY = 2000
 
 
 @dataclass(frozen=True)
@@ -83,12 +79,14 @@ def replay(
     on_progress: Callable[[float], None] = lambda _: None,
     *,
     with_history: bool = False,
-    on_block: Callable[[Sequence[int], Observations], None] = lambda *_: None,
+    on_rows: Callable[[AlignedBlock], None] | None = None,
+    on_restart: Callable[[], None] = lambda: None,
 ) -> Replayed:
     """Calibrate with the bags at `paths`, read as one in order of log time.
 
-    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way,
-    else on_block is told as by `Calibrator`. Raises InputError if there is no bag or no usable DVL topic.
+    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way, else on_rows is
+    given the aligned rows, and on_restart told, as by `Calibrator`. Raises InputError if there is no bag or no usable
+    DVL topic.
     """
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
@@ -98,36 +96,37 @@ def replay(
     events: list[str] = []
     if parameters.prior_source == "initial_window":
         found.append(finding("PRIOR_HOLDS_ERROR"))
-    recorder = Recorder() if with_history else None
     with BagReader(paths, KNOWN_DEFINITIONS) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, found)
+        recorder = Recorder(parameters, bag.message_counts[chosen.dvl]) if with_history else None
         calibrator = Calibrator(
             _of_types(bag, chosen, parameters),
             prior_sway_heave=prior,
             initial=initial,
             block_size=BLOCK_SIZE,
             on_event=events.append,
-            on_block=recorder.observe if recorder else on_block,
+            on_rows=recorder.take if recorder else on_rows,
+            on_restart=recorder.start if recorder else on_restart,
             verified=True,
+            trace=recorder.trace if recorder else None,
         )
-        feed = MessageFeed(calibrator)
-        if recorder:
-            recorder.expect(bag.message_counts[chosen.dvl])
-        _feed_all(bag, chosen, feed, recorder, on_progress)
-        found += feed.decoder.problems.values()
+        decoder = MessageDecoder(calibrator.parameters)
+        _feed_all(bag, chosen, decoder, calibrator, on_progress)
+        calibrator.finish()
+        found += decoder.problems.values()
     result = calibrator.result()
-    found += _warnings(result, topics, feed)
+    found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator) if recorder else None
     return Replayed(
         result,
         (*bag.notes, *events, *map(str, found)),
         tuple(found),
-        feed.decoder.dvl_frame or "dvl_link",
+        decoder.dvl_frame or "dvl_link",
         history,
-        feed.decoder.frame_of_reference,
-        feed.decoder.dvl_type.name,
-        feed.decoder.turns_dvl,
+        decoder.frame_of_reference,
+        decoder.dvl_type.name,
+        decoder.turns_dvl,
     )
 
 
@@ -181,28 +180,18 @@ def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
 
 
 def _feed_all(
-    bag: BagReader, topics: Topics, feed: MessageFeed, recorder: Recorder | None, on_progress: Callable[[float], None]
+    bag: BagReader,
+    topics: Topics,
+    decoder: MessageDecoder,
+    calibrator: Calibrator,
+    on_progress: Callable[[float], None],
 ) -> None:
-    feed_dvl = feed.dvl if recorder is None else partial(_feed_and_note, feed, recorder)
-    take: dict[str, Callable[[Any, int], Any]] = {
-        topics.imu: feed.imu, topics.gnss: feed.reference, topics.dvl: feed_dvl,
-    }  # fmt: skip
-    streams = {topics.imu: "imu", topics.gnss: "reference", topics.dvl: "dvl"}
     start_ns, end_ns = bag.span_ns
-    span_ns = max(end_ns - start_ns, 1)
-    for count, (topic, log_ns, message, undecodable) in enumerate(bag.messages(take)):
-        if undecodable:
-            feed.undecodable(streams[topic], undecodable)
-        else:
-            take[topic](message, log_ns)
-        if count % PROGRESS_EVERY == 0:
-            on_progress((log_ns - start_ns) / span_ns)
+    streams = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
+    for stretch in sample_streams(bag, streams, decoder):
+        calibrator.feed(stretch.streams)
+        on_progress((stretch.log_ns - start_ns) / max(end_ns - start_ns, 1))
     on_progress(1.0)
-
-
-def _feed_and_note(feed: MessageFeed, recorder: Recorder, message: Any, received_ns: int) -> None:
-    if feed.dvl(message, received_ns) is not None:
-        recorder.note(feed.calibrator)
 
 
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
@@ -244,23 +233,23 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
     return sway, heave
 
 
-def _warnings(result: Result, topics: Topics, feed: MessageFeed) -> list[Finding]:
+def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[Finding]:
     """What the counts say that a user should not overlook."""
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
-        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(feed)}")
-    found = message_advice(result.counts) + feed.decoder.dvl_type.advice(dvl) + data_advice(result.counts)
-    if feed.decoder.zero_stamps:
-        found.append(finding("STAMPS_MISSING_IN_BAG", count=feed.decoder.zero_stamps))
+        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(decoder, dvl)}")
+    found = message_advice(result.counts) + decoder.dvl_type.advice(dvl) + data_advice(result.counts)
+    if decoder.zero_stamps:
+        found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_advice(estimate)
     return found
 
 
-def _remedy(feed: MessageFeed) -> str:
+def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
     """What is known of the DVL's messages that were refused."""
-    known = [str(found) for kind, found in feed.decoder.problems.items() if kind.startswith("dvl")]
-    known += map(str, feed.decoder.dvl_type.advice(feed.calibrator.counts["dvl"]))
+    known = [str(found) for kind, found in decoder.problems.items() if kind.startswith("dvl")]
+    known += map(str, decoder.dvl_type.advice(counts))
     return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 

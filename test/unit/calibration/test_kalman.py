@@ -64,23 +64,16 @@ def test_the_batch_equals_the_filter_whatever_the_gate_decides(seed, n_samples, 
     np.testing.assert_allclose(one.nis, all_at_once.nis, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.parametrize("way", [kalman.batch, lambda x, p, data, ends: kalman.recursion(x, p, data, None, ends)])
 @pytest.mark.parametrize("outliers, gate", [(0.0, np.inf), (0.05, 16.3), (0.5, 1.0)])
-def test_the_history_is_the_filter_stopped_after_every_sample(rng, outliers, gate):
+def test_the_states_on_the_way_are_those_of_a_filter_stopped_there(rng, outliers, gate, way):
     x, p, data = random_problem(rng, n_samples=40, outliers=outliers, gate=gate, weights=True)
-    history = kalman.history(x, p, data)
-    for stop in range(1, 41):
-        part = Measurements(
-            data.z[:, :stop],
-            data.h[:, :stop],
-            data.r[:, :stop],
-            data.weight[:, :stop],
-            data.usable[:, :stop],
-            data.gate,
-        )
-        after = kalman.recursion(x, p, part)
-        np.testing.assert_allclose(history.x[:, stop - 1], after.x, atol=1e-10)
-        np.testing.assert_allclose(history.p[:, stop - 1], after.p, atol=1e-10)
-    np.testing.assert_array_equal(history.used, kalman.recursion(x, p, data).used)
+    ends = np.array([0, 1, 1, 17, 40])
+    found = way(x, p, data, ends).at
+    for index, end in enumerate(ends):
+        stopped = kalman.recursion(x, p, data.part(slice(0, end)))
+        np.testing.assert_allclose(found.x[index], stopped.x, atol=1e-10)
+        np.testing.assert_allclose(found.p[index], stopped.p, atol=1e-10)
 
 
 def test_gating_that_does_not_settle_falls_back_to_the_filter(rng, monkeypatch):
@@ -88,7 +81,6 @@ def test_gating_that_does_not_settle_falls_back_to_the_filter(rng, monkeypatch):
     expected = kalman.recursion(x, p, data)
     monkeypatch.setattr(kalman, "MAX_GATE_PASSES", 1)
     np.testing.assert_array_equal(kalman.batch(x, p, data).x, expected.x)
-    np.testing.assert_allclose(kalman.history(x, p, data).x[:, -1], expected.x, atol=1e-14)
 
 
 def test_the_covariance_stays_symmetric_positive_definite_over_precise_updates(rng):

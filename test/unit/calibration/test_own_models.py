@@ -101,7 +101,7 @@ def test_g1_finds_5_degrees_but_for_what_the_error_model_cannot_hold(degrees, rn
     velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.4, 400), np.zeros(400)])
     errors = DvlErrors(misalignment_rpy=tuple(np.deg2rad(degrees)), scale=(0.005,) * 3)
     measured = measure_dvl(velocity, errors, np.eye(3), rng)
-    wide = {"initial_std_misalignment": 0.5, "initial_std_scale": 0.5, "gnss_aided_std": 0.001}
+    wide = {"initial_std_misalignment": 0.5, "initial_std_scale": 0.5, "gnss_aided_std": 0.001, "gnss_axes": "xyz"}
     estimate = calibrated_on(velocity, measured, **wide).estimate("G1")
     misalignment, scale = equivalent_error_terms(errors)
     np.testing.assert_allclose(estimate.misalignment, misalignment, atol=2.5e-3)

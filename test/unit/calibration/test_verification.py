@@ -39,11 +39,11 @@ def test_leaving_a_fold_out_equals_filtering_without_it(rng, weights):
 
 def test_folds_are_dealt_out_in_blocks_of_time_by_stamp_alone():
     stamps = np.arange(0, 100, dtype=np.int64) * 1_000_000_000 + 1_700_000_000_000_000_000
-    folds = folds_of(stamps.tolist(), Parameters(verification_block=10.0))
+    folds = folds_of(stamps, Parameters(verification_block=10.0))
     assert set(folds.tolist()) == set(range(FOLDS))
     assert (np.bincount(folds) == 20).all()
     assert np.count_nonzero(np.diff(folds)) == 9
-    np.testing.assert_array_equal(folds_of(stamps[7:].tolist(), Parameters()), folds[7:])
+    np.testing.assert_array_equal(folds_of(stamps[7:], Parameters()), folds[7:])
 
 
 def test_the_held_out_error_is_the_error_of_each_sample_with_the_state_that_has_not_seen_it(rng):

@@ -71,7 +71,7 @@ def test_a_dvl_message_becomes_the_sample_it_describes():
 
 @pytest.mark.parametrize(
     ("velocity", "variance"),
-    [((np.nan, 0, 0), 0.0), ((0, np.inf, 0), 0.0), ((99.0, 0, 0), 0.0), ((1, 0, 0), -1.0), ((1, 0, 0), np.nan)],
+    [((np.nan, 0, 0), 0.0), ((0, np.inf, 0), 0.0), ((99.0, 0, 0), 0.0), ((1, 0, 0), -2.0), ((1, 0, 0), np.nan)],
 )
 @pytest.mark.parametrize("stream", ["dvl", "reference"])
 def test_what_no_sensor_can_mean_is_counted_as_invalid(stream, velocity, variance):

@@ -216,14 +216,14 @@ def test_the_history_ends_with_the_result_and_holds_what_the_models_saw(tmp_path
 @pytest.mark.parametrize("expected", [0, 7, 1000, 10**6])
 @pytest.mark.parametrize("length", [5, 1000, 12_345])
 def test_a_series_of_any_length_is_thinned_evenly(length, expected):
-    series: Thinned[int] = Thinned(100, expected)
-    for i in range(length):
-        if series.wants_next():
-            series.keep(i)
-    assert 1 <= len(series.rows) <= 100
-    assert len(set(np.diff(series.rows))) <= 1
+    series = Thinned(100, expected)
+    for start in range(0, length, 77):
+        series.add(np.arange(start, min(start + 77, length)))
+    (rows,) = series.columns(())
+    assert 1 <= len(rows) <= 100
+    assert len(set(np.diff(rows))) <= 1
     if length >= expected:
-        assert len(series.rows) >= min(length, 50)
+        assert len(rows) >= min(length, 50)
 
 
 def test_a_long_recording_takes_no_more_memory_than_a_short_one(tmp_path):
@@ -233,15 +233,18 @@ def test_a_long_recording_takes_no_more_memory_than_a_short_one(tmp_path):
 
 
 def test_after_a_restart_the_history_starts_anew():
-    recorder = Recorder()
-    calibrator = Calibrator(Parameters(), block_size=8, on_block=recorder.observe)
+    recorder = Recorder(Parameters())
+    calibrator = Calibrator(
+        Parameters(), block_size=8, on_rows=recorder.take, on_restart=recorder.start, trace=recorder.trace
+    )
     first = steady_run(100)
     later = [sample._replace(stamp_ns=sample.stamp_ns + 1_000 * SECOND) for sample in steady_run(300)]
     for sample in [*later, *first]:
         if isinstance(sample, ReferenceSample):
             calibrator.feed_reference(sample)
-        elif calibrator.feed_dvl(sample):
-            recorder.note(calibrator)
+        else:
+            calibrator.feed_dvl(sample)
+    calibrator.finish()
     history = recorder.history(calibrator)
     assert calibrator.restarts == 1
     for stamps in (history.stamps_ns, history.dvl_ns, history.paired_ns):

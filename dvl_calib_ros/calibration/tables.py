@@ -1,0 +1,60 @@
+"""Columns that grow at their end and are forgotten at their start, so that memory stays flat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+SMALLEST = 128
+
+
+class Table:
+    """Rows with a column per entry of `LAYOUT` (dtype, shape of one element), which are attributes of these names.
+
+    The arrays are longer than what they hold: rows are in the slots begin .. size - 1. A row's number, counted since
+    the start, stays its own: slot + base.
+    """
+
+    LAYOUT: ClassVar[Mapping[str, tuple[Any, tuple[int, ...]]]]
+
+    def __init__(self) -> None:
+        self.begin = self.size = self.base = 0
+        for name, (dtype, shape) in self.LAYOUT.items():
+            setattr(self, name, np.empty((SMALLEST, *shape), dtype))
+        self._capacity = SMALLEST
+
+    @property
+    def end(self) -> int:
+        """Number of the row that comes next."""
+        return self.base + self.size
+
+    def extend(self, n: int) -> slice:
+        """The slots of n new rows, to be filled in."""
+        if self.size + n > self._capacity:
+            self._make_room(n)
+        first = self.size
+        self.size += n
+        return slice(first, self.size)
+
+    def _make_room(self, n: int) -> None:
+        held = self.size - self.begin
+        capacity = self._capacity
+        while capacity < 2 * (held + n):
+            capacity *= 2
+        for name, (dtype, shape) in self.LAYOUT.items():
+            grown = np.empty((capacity, *shape), dtype)
+            grown[:held] = getattr(self, name)[self.begin : self.size]
+            setattr(self, name, grown)
+        self.base += self.begin
+        self.begin, self.size, self._capacity = 0, held, capacity
+
+    def forget_before(self, slot: int) -> None:
+        """Give up the rows before a slot."""
+        self.begin = max(self.begin, slot)
+
+    def clear(self) -> None:
+        """Give up all rows; numbers go on."""
+        self.base += self.size
+        self.begin = self.size = 0
