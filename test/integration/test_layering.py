@@ -1,0 +1,70 @@
+"""Imports run one way: the core knows no ROS, bags or pictures, bags know no DVL, and nobody knows the commands."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+PACKAGE = ROOT / "dvl_calib_ros"
+FOREIGN = ("rclpy", "rosbags", "mcap", "apsw", "lz4", "yaml", "rich", "matplotlib", "jinja2", "joblib", "statsmodels")
+# what a package may import of its siblings; one that is not listed may import all but commands and node
+MAY_IMPORT = {
+    "calibration": {"errors"},
+    "effects": {"calibration", "errors"},
+    "bags": {"files", "errors"},
+    "messages": {"bags", "calibration", "errors"},
+    "files": {"bags", "messages", "calibration", "errors"},
+    "diagnosis": {"bags", "messages", "replay", "effects", "calibration", "errors"},
+    "report": {"diagnosis", "evaluation", "replay", "files", "effects", "calibration", "errors"},
+}
+WIRING = {"cli", "node", "demo"}
+
+
+def siblings_imported_by(path: Path) -> set[str]:
+    """Packages and modules of ours, beside the one that the file is in, which it imports, also within functions."""
+    inside = path.relative_to(PACKAGE).parent.parts
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            above = inside[: len(inside) - (node.level - 1)]
+            full = [*above, *(node.module.split(".") if node.module else [])]
+            found |= {full[0]} if full else {alias.name for alias in node.names if alias.name != "__version__"}
+    return found - set(inside[:1])
+
+
+def files_of(package: str) -> list[Path]:
+    return sorted((PACKAGE / package).rglob("*.py"))
+
+
+@pytest.mark.parametrize("package", ["calibration", "effects"])
+def test_the_core_takes_numpy_and_scipy_and_nothing_else(package):
+    """In a process of its own, into which nothing has been imported before."""
+    names = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in files_of(package)
+        if path.name != "__init__.py"
+    ]
+    script = f"import importlib, sys\nfor name in {names}: importlib.import_module(name)\nprint(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert "numpy" in loaded and len(names) > 5
+    assert loaded.intersection(FOREIGN) == set()
+
+
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_a_package_imports_only_those_below_it(package):
+    imported = {each for path in files_of(package) for each in siblings_imported_by(path)}
+    assert imported - MAY_IMPORT[package] == set()
+
+
+def test_nothing_but_the_wiring_imports_commands_and_node():
+    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")} - WIRING
+    assert len(packages) > 10
+    for package in packages:
+        for path in files_of(package):
+            assert siblings_imported_by(path).intersection(WIRING) == set(), path
