@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -139,15 +139,26 @@ def check_outputs(
 
 
 def console(stderr: bool = False) -> Console:
-    """A rich console; plain text where the output is no terminal, never narrower than a table needs there."""
+    """A rich console; plain text where the output is no terminal. Tables that are too wide for it are folded."""
     from rich.console import Console as RichConsole
+    from rich.table import Table as RichTable
+
+    from .folding import Folding
 
     class Console(RichConsole):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # main knows what to do; rich would exit with 1
 
-    wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 160
-    return Console(stderr=stderr, width=wide, highlight=False, emoji=False)
+        def print(self, *objects: Any, **options: Any) -> None:
+            shown = (Folding(each) if isinstance(each, RichTable) else each for each in objects)
+            super().print(*shown, **options)
+
+    return Console(stderr=stderr, width=_width(sys.stderr if stderr else sys.stdout), highlight=False, emoji=False)
+
+
+def _width(stream: TextIO) -> int | None:
+    """None for a terminal, which knows its own; elsewhere a table has all the room that it needs."""
+    return None if stream.isatty() else 160
 
 
 def print_warnings(notes: Sequence[str]) -> None:

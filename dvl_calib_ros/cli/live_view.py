@@ -9,8 +9,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..errors import printable
+
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
     from ..node.status import Status
 
@@ -21,6 +23,8 @@ REDRAW_S = 0.5
 LINE_S = 10.0
 COLOURS = {0: "green", 1: "yellow", 2: "red"}
 LOG_LINES = 5
+# The table without its last column, which is broken between words, and the longest word in that
+TABLE_WIDTH = 72
 
 
 def rendered(status: Status | None, now_s: float, log: Sequence[str] = ()) -> RenderableType:
@@ -28,7 +32,7 @@ def rendered(status: Status | None, now_s: float, log: Sequence[str] = ()) -> Re
     from rich.console import Group
     from rich.text import Text
 
-    tail = [Text(_printable(line), style="dim", no_wrap=True, overflow="ellipsis") for line in log[-LOG_LINES:]]
+    tail = [Text(printable(line), style="dim", no_wrap=True, overflow="ellipsis") for line in log[-LOG_LINES:]]
     if status is None:
         return Group("[yellow]waiting for the node's /diagnostics[/] ... (same ROS_DOMAIN_ID?)", *tail)
     colour = COLOURS.get(status.level, "red")
@@ -42,18 +46,14 @@ def rendered(status: Status | None, now_s: float, log: Sequence[str] = ()) -> Re
     silent = now_s - status.received_s
     if silent > SILENCE_S:
         head.insert(0, f"[bold red]nothing heard of the node for {silent:.0f} s[/]")
-    return Group(*head, _table(status), *tail)
+    return Group(*head, _Estimates(status), *tail)
 
 
 def _shown(text: str) -> str:
     """A text of another process as rich takes it: it can neither style nor move the cursor."""
     from rich.markup import escape
 
-    return escape(_printable(text))
-
-
-def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() else "�" for letter in text)
+    return escape(printable(text))
 
 
 def _counts(status: Status) -> str:
@@ -61,6 +61,29 @@ def _counts(status: Status) -> str:
     words += [f"{count} invalid" for count in [status.get("dvl invalid")] if count not in ("-", "0")]
     words += [f"NIS {status.get('mean NIS')}"] if status.get("samples used") != "0" else []
     return ", ".join(words)
+
+
+class _Estimates:
+    """A table, on a terminal that is too narrow for it a list."""
+
+    def __init__(self, status: Status) -> None:
+        self._status = status
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield _table(self._status) if options.max_width >= TABLE_WIDTH else _list(self._status)
+
+
+def _list(status: Status) -> RenderableType:
+    """What `_table` says, without its bars: numbers that are cut off or below the screen's end help nobody."""
+    lines = []
+    for name, unit in status.parameters:
+        key = f"{name} [{unit}]"
+        progress = status.values.get(f"progress {name} [%]")
+        done = "" if progress is None else f", {float(progress):.0f} % to fine"
+        missing = status.get(f"observed {name}").partition("needs ")[2]
+        fly = f"; fly {missing}" if missing else ""
+        lines.append(_shown(f"{name} {status.get(key)} ± {status.get(f'std {key}')} {unit}{done}{fly}"))
+    return "\n".join(lines)
 
 
 def _table(status: Status) -> RenderableType:
@@ -136,4 +159,4 @@ def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], 
         what = (status.get("model"), status.get("convergence"), str(status.level))
         if what != said or now_s - said_s > LINE_S:
             said, said_s = what, now_s
-            yield _printable(line(status))
+            yield printable(line(status))

@@ -1,0 +1,125 @@
+"""On a terminal of any width nothing is cut off: what is said at 300 columns is said at 80, 40 and 20."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from io_fixtures import replayed, run, write_bag
+from rich.console import Console
+from rich.table import Table
+
+from dvl_calib_ros.cli import common
+from dvl_calib_ros.cli.folding import Folding
+from dvl_calib_ros.cli.live_view import rendered
+from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.files.result_file import result_document, result_text
+from dvl_calib_ros.node.status import Status
+
+WIDTHS = [80, 40, 20]
+
+
+def numbers(text: str) -> Counter[str]:
+    return Counter(re.findall(r"[-+]?\d[\d.]*", text))
+
+
+def words(text: str) -> Counter[str]:
+    return Counter(re.findall(r"[^\s│┃┏┓┗┛┡┩┴┳╇━─┼├┤└┘╸╺…]+", text))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two bags, and the result of the first."""
+    folder = tmp_path_factory.mktemp("narrow")
+    for name in ("one", "two"):
+        write_bag(folder / name, run(40.0))
+    document = result_document(replayed(folder / "one").result)
+    (folder / "result.yaml").write_text(result_text(document))
+    return folder
+
+
+COMMANDS = {
+    "replay": ("replay", "one", "--verbose"),
+    "evaluate": ("evaluate", "one", "two", "--jobs", "1"),
+    "apply": ("apply", "result.yaml"),
+}
+
+
+def said(monkeypatch, capsys, width: int, *arguments: str) -> str:
+    monkeypatch.setattr(common, "_width", lambda _: width)
+    assert main([*arguments]) == 0
+    output = capsys.readouterr()
+    assert "…" not in output.out + output.err
+    return output.out + output.err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_says_every_number_and_name_on_any_terminal(monkeypatch, capsys, folder, command):
+    monkeypatch.chdir(folder)
+    wide = said(monkeypatch, capsys, 300, *COMMANDS[command])
+    for width in WIDTHS:
+        narrow = said(monkeypatch, capsys, width, *COMMANDS[command])
+        assert numbers(wide) - numbers(narrow) == Counter()
+        missing = set(words(wide)) - set(words(narrow))
+        of_names = {"model"}  # the head of the column of names, which a list has not
+        assert [word for word in missing - of_names if len(word) < width] == []
+
+
+VALUES = {
+    "model": "G1", "why": "auto: GNSS is available", "gnss": "GNSS is available", "convergence": "coarse",
+    "phi_x [deg]": "0.8834", "std phi_x [deg]": "1.4004", "progress phi_x [%]": "25.0",
+    "observed phi_x": "no (roll); needs turns or a figure eight", "delta_k_y [%]": "-10.1234",
+    "std delta_k_y [%]": "0.5432", "progress delta_k_y [%]": "7.0", "observed delta_k_y": "yes",
+    "heave [m/s]": "0.0012", "std heave [m/s]": "0.0200", "mean NIS": "2.104 of 3 (99 %: 2.829 .. 3.140)",
+    "samples used": "158312", "samples gated": "24", "dvl invalid": "7",
+}  # fmt: skip
+
+
+def drawn(width: int) -> str:
+    console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+    console.print(rendered(Status(1, "the DVL dropped out 3 times", VALUES, 100.0), 100.0))
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [80, 72, 71, 60, 40, 20])
+def test_the_live_view_shows_every_number_on_any_terminal(width):
+    text = drawn(width)
+    assert numbers(drawn(300).replace("± 1σ", "")) - numbers(text) == Counter()
+    assert max(map(len, text.splitlines())) <= width
+    assert len(text.splitlines()) <= 24 or width < 40, "it is to fit a terminal's height, too"
+
+
+CELLS = st.one_of(
+    st.floats(-1e4, 1e4).map(lambda value: f"{value:+.2f} ± {abs(value) / 7:.2f}"),
+    st.integers(0, 10**6).map(str),
+    st.sampled_from(["-", "", "G1 ◄", "[bold]M3[/]", "coarse", "turns, a box or a figure eight in calm water"]),
+)
+
+
+@given(data=st.data(), n_columns=st.integers(1, 9), n_rows=st.integers(0, 4), width=st.integers(20, 200))
+def test_no_table_loses_a_number_at_any_width(data, n_columns, n_rows, width):
+    def text_at(columns: int) -> str:
+        console = Console(file=io.StringIO(), width=columns, color_system=None)
+        console.print(Folding(table()))
+        return console.file.getvalue()
+
+    rows = [[data.draw(CELLS) for _ in range(n_columns)] for _ in range(n_rows)]
+    justified = [data.draw(st.sampled_from(["left", "right"])) for _ in range(n_columns)]
+    wrapped = [data.draw(st.booleans()) for _ in range(n_columns)]
+
+    def table() -> Table:
+        made = Table(title="3000 samples over 599.8 s", caption="± 1σ of 7 models")
+        for at in range(n_columns):
+            made.add_column(f"c{at}", justify=justified[at], no_wrap=wrapped[at])
+        for row in rows:
+            made.add_row(*row)
+        return made
+
+    narrow = text_at(width)
+    assert max(map(len, narrow.splitlines()), default=0) <= width and "…" not in narrow
+    heads = Counter({f"{at}": 99 for at in range(n_columns)})  # headers of columns come once per part, or per row
+    assert numbers(text_at(2000)) - numbers(narrow) - heads == Counter()
