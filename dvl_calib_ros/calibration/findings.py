@@ -263,6 +263,13 @@ _KINDS = (
         "check its power, cable and bottom lock (altitude, speed)",
     ),
     FindingKind(
+        "PROCESS_PAUSED",
+        "this process was not running for {seconds:.0f} s",
+        "It was stopped (Ctrl-Z, SIGSTOP), or the machine slept or was overloaded. What came meanwhile may be lost; a "
+        "gap in the DVL's samples is then no fault of the DVL.",
+        "let it run in the background (bg), keep the machine awake, give it more of a core",
+    ),
+    FindingKind(
         "DVL_FROZEN",
         "{count} DVL samples repeat one velocity more than max_repeats times; they are not used",
         "The driver hangs and sends its last velocity again.",

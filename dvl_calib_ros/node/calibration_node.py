@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -41,11 +40,12 @@ from ..files.result_file import (
 )
 from ..messages.drivers import velocity_type
 from ..messages.feed import MessageFeed
-from .diagnostics import RecentCounts, Silence, diagnose
+from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
 from .message_types import message_class
 from .parameters import declare_parameters
+from .pauses import Pauses, steady_s
 from .status import status_name
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
@@ -83,7 +83,8 @@ class CalibrationNode(Node):
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
-        self._silence, self._recent = Silence(time.monotonic()), RecentCounts()
+        self._pauses = Pauses(steady_s())
+        self._silence, self._recent = Silence(self._pauses.running_s(steady_s())), RecentCounts()
         self._save_problem: Finding | None = None
 
         self._estimate = self._output_message()
@@ -234,7 +235,11 @@ class CalibrationNode(Node):
         problems = [*decoder.problems.values(), *self._topic_problems()]
         if self._save_problem:
             problems.append(self._save_problem)
-        status = diagnose(self._calibrator, decoder.dvl_type, problems, self._silence, self._recent, time.monotonic())
+        now_s = self._pauses.running_s(steady_s())
+        status = diagnose(
+            self._calibrator, decoder.dvl_type, problems, self._silence, self._recent, now_s,
+            self._pauses.within(RECENT_S),
+        )  # fmt: skip
         status.name = status_name(self.get_fully_qualified_name())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
@@ -255,6 +260,7 @@ class CalibrationNode(Node):
         self._calibrator.reset()
         self._feed.decoder.forget()
         self._recent = RecentCounts()
+        self._pauses.forget()
         self._correction = None
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"

@@ -106,14 +106,19 @@ def diagnose(
     silence: Silence,
     recent: RecentCounts,
     now_s: float,
+    pauses_s: Sequence[float] = (),
 ) -> DiagnosticStatus:
     """Status of the running calibration, still without a name.
 
-    dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock.
+    dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock. pauses_s: how long
+    this process did not run, of late.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     grown = recent.grown(counts, now_s)
-    found = [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
+    # what came meanwhile is lost here, whether or not the DVL sent it
+    grown["dvl"]["dropouts"] -= min(grown["dvl"]["dropouts"], len(pauses_s))
+    found = [finding("PROCESS_PAUSED", seconds=sum(pauses_s))] if pauses_s else []
+    found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
     found += message_advice(grown) + data_advice(grown) + dvl_type.advice(grown["dvl"])
     found += gate_advice(estimate) + consistency_advice(estimate)
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first

@@ -5,6 +5,8 @@ from __future__ import annotations
 import random
 import socket
 
+from ..errors import InputError
+
 # Of RTPS (DDS Interoperability Wire Protocol 2.5, section 9.6.2): port of the first participant's discovery traffic
 PORT_BASE, DOMAIN_GAIN, FIRST_PARTICIPANT = 7400, 250, 10
 # Above, ports are those that systems give to outgoing connections.
@@ -17,7 +19,7 @@ def private_domain() -> dict[str, str]:
 
 
 def free_domain() -> int:
-    """A domain, at random, on which this host has no participant. Raises RuntimeError if there is none."""
+    """A domain, at random, on which this host has no participant. Raises InputError if there is none."""
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
@@ -25,4 +27,6 @@ def free_domain() -> int:
             except OSError:
                 continue
         return domain
-    raise RuntimeError("every ROS domain from 1 to 100 has a participant on this host")
+    raise InputError(
+        f"every ROS domain from {DOMAINS[0]} to {DOMAINS[-1]} has a participant on this host; end some of them"
+    )

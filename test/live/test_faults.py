@@ -12,6 +12,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
@@ -37,6 +38,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.node.pauses import PAUSE_S
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms
 
@@ -284,6 +286,23 @@ def test_silent_streams_are_named_while_others_go_on_and_no_more_when_they_are_b
     node.publish(as_messages(between(25, 40)))
     status = node.wait_until_it_says("DVL dropped out 1 times")
     assert status.level == DiagnosticStatus.WARN and "no usable" not in status.message
+
+
+def test_a_node_that_was_stopped_says_so_and_does_not_lay_the_gap_to_the_dvl(node):
+    node.publish(as_messages(between(0, 10)))
+    node.when_heard(Offline(PARAMETERS).feed(as_messages(between(0, 10))))
+    node.process.send_signal(signal.SIGSTOP)
+    try:
+        time.sleep(PAUSE_S + 2.0)
+    finally:
+        node.process.send_signal(signal.SIGCONT)
+    messages = as_messages(later(between(10, 40), 60))
+    node.publish(messages)
+    node.when_heard(Offline(PARAMETERS).feed([*as_messages(between(0, 10)), *messages]))
+    status = node.wait_until_it_says("this process was not running for")
+    assert "PROCESS_PAUSED" in status.message
+    assert "DVL dropped out" not in status.message and "no usable DVL message" not in status.message
+    assert {each.key: each.value for each in status.values}["dvl dropouts"] == "1"
 
 
 def test_a_hanging_dvl_is_kept_out_once_max_repeats_is_set(node):
