@@ -14,7 +14,10 @@ DASK = ["distributed>=2023.9"]
 COMPLETION = ["argcomplete>=3.1"]
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 DOCS = ["mkdocs>=1.6"]
-TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40", *DASK, *COMPLETION]
+PANDAS = ["pandas>=2.0"]
+NOTEBOOK = ["nbclient>=0.8", "nbformat>=5.7", "ipykernel>=6.20"]
+TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40", *DASK, *COMPLETION, *PANDAS]
+TEST += NOTEBOOK
 
 
 def shared(folder: str) -> list:
@@ -42,7 +45,7 @@ setup(
     package_data={NAME: ["py.typed", "report/templates/*"]},
     python_requires=">=3.10",
     install_requires=[*ROS_FREE, *STATISTICS, *REPORT],
-    extras_require={"ros": ROS, "dask": DASK, "completion": COMPLETION, "docs": DOCS, "test": TEST},
+    extras_require={"ros": ROS, "dask": DASK, "completion": COMPLETION, "docs": DOCS, "pandas": PANDAS, "test": TEST},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -1,7 +1,41 @@
-"""Calibrate a Doppler velocity log before a dive: live on ROS 2 Jazzy and over recorded bags."""
+"""Calibrate a Doppler velocity log before a dive: live on ROS 2 Jazzy and over recorded bags.
+
+The public interface, which is `api`: replay, doctor, diagnose, simulate, evaluate, and what they take and give. It is
+imported when it is asked for, since the command line must not wait for NumPy to print its help.
+"""
 
 import sys as _sys
 from pathlib import Path as _Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .api import (
+        Calibration,
+        InputError,
+        Mounting,
+        ParameterError,
+        Parameters,
+        Scenario,
+        diagnose,
+        doctor,
+        evaluate,
+        replay,
+        simulate,
+    )
+
+__all__ = [
+    "Calibration",
+    "InputError",
+    "Mounting",
+    "ParameterError",
+    "Parameters",
+    "Scenario",
+    "diagnose",
+    "doctor",
+    "evaluate",
+    "replay",
+    "simulate",
+]
 
 
 def _version() -> str:
@@ -18,3 +52,17 @@ def _version() -> str:
 
 
 __version__ = _version()
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    if name == "replay":  # a subpackage, which is callable
+        return importlib.import_module(".replay", __name__)
+    return getattr(importlib.import_module(".api", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -15,7 +15,7 @@ from . import common
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ..doctor.examine import Examination
+    from ..examination.examine import Examination
 
 NAME = "doctor"
 HELP = "say what is in a bag, what is wrong with it, and whether it can calibrate"
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Examine, print, save."""
-    from ..doctor.examine import examine
+    from ..examination.examine import examine
 
     common.check_outputs(arguments, "json")
     examination = examine(arguments.bags, common.load(arguments), common.given(arguments))

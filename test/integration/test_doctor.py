@@ -17,8 +17,8 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.doctor.examine import Examination, examine
-from dvl_calib_ros.doctor.kinds import KINDS
+from dvl_calib_ros.examination.examine import Examination, examine
+from dvl_calib_ros.examination.kinds import KINDS
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 

@@ -1,0 +1,368 @@
+"""The library's public interface: what the commands do, as functions that give dataclasses.
+
+    import dvl_calib_ros as dc
+    run = dc.replay("my_bag")
+    run.mounting
+    run.plot()
+
+Angles in degrees and lengths in metres where a name says so, else SI. Errors of files, topics and values are
+`InputError`, of parameters `ParameterError`, each one sentence with the remedy.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .calibration.findings import Finding
+from .calibration.frames import Array, rpy_from_rotation
+from .calibration.models import MODELS
+from .calibration.observability import body_angle_std, scale_std_ahead
+from .calibration.parameters import ParameterError, Parameters
+from .diagnosis.results import Diagnosis
+from .discovery.discover import Discovery, Given, discover
+from .errors import InputError
+from .examination.examine import Examination
+from .replay.replay import Replayed
+from .simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from .evaluation.bags import CrossCheck
+    from .evaluation.results import Evaluation
+
+__all__ = [
+    "Calibration",
+    "InputError",
+    "Mounting",
+    "ParameterError",
+    "Parameters",
+    "Scenario",
+    "diagnose",
+    "doctor",
+    "evaluate",
+    "replay",
+    "simulate",
+]
+StrPath = str | os.PathLike[str]
+Bags = StrPath | Sequence[StrPath]
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the DVL is mounted, as it was calibrated.
+
+    Parameters
+    ----------
+    rpy_deg
+        Corrected roll, pitch, yaw of the DVL in the body, degrees, as in a URDF origin (fixed axes X, Y, Z).
+    std_deg
+        Their standard deviations (1σ), degrees.
+    nominal_rpy_deg
+        What the calibration began with.
+    xyz_m
+        Lever arm: position of the DVL in the body, m.
+    scale_percent, scale_std_percent
+        How much too long a motion ahead is measured; nan where the model has no scale.
+    base_frame, dvl_frame
+        Names of the frames.
+    """
+
+    rpy_deg: tuple[float, float, float]
+    std_deg: tuple[float, float, float]
+    nominal_rpy_deg: tuple[float, float, float]
+    xyz_m: tuple[float, float, float]
+    scale_percent: float
+    scale_std_percent: float
+    base_frame: str
+    dvl_frame: str
+
+    @property
+    def urdf(self) -> str:
+        """The origin of the DVL's joint, to paste into a URDF."""
+        xyz = " ".join(f"{value:g}" for value in self.xyz_m)
+        return f'<origin xyz="{xyz}" rpy="{" ".join(f"{math.radians(angle):.6f}" for angle in self.rpy_deg)}"/>'
+
+    def __str__(self) -> str:
+        angles = (
+            f"{name} {angle:.2f}° ± {std:.2f}°"
+            for name, angle, std in zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
+        )
+        return f"{self.dvl_frame} in {self.base_frame}: {', '.join(angles)}"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a replay gives.
+
+    Parameters
+    ----------
+    replayed
+        All of it: every model's estimate, counts, verification, history.
+    discovery
+        What was found in the bags, and with which topics and parameters they were replayed.
+    bags
+        Where the bags are.
+    """
+
+    replayed: Replayed = field(repr=False)
+    discovery: Discovery = field(repr=False)
+    bags: tuple[Path, ...]
+
+    @property
+    def model(self) -> str:
+        """Name of the model that was selected."""
+        return self.replayed.result.selected
+
+    @property
+    def verdict(self) -> str:
+        """What the held-out data say: accept, marginal or reject."""
+        return self.replayed.result.verifications[self.model].verdict.value
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why, in sentences, the decisive one first."""
+        return self.replayed.result.verifications[self.model].reasons
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """What was found in the bags, in sentences."""
+        return self.discovery.found
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the data, each with its code and remedy."""
+        return self.replayed.findings
+
+    @property
+    def mounting(self) -> Mounting:
+        """The corrected mounting with its standard deviations."""
+        result = self.replayed.result
+        estimate = result.estimate
+        parameters = Parameters.from_mapping(result.parameters)
+        rotation = parameters.rotation_dvl_from_body
+        scale = scale_std_ahead(MODELS[estimate.model], estimate.covariance, parameters)
+        return Mounting(
+            _triple(np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(rotation)))),
+            _triple(np.degrees(body_angle_std(estimate.covariance, parameters))),
+            _triple(np.degrees(parameters.mounting_rpy)),
+            _triple(np.array(parameters.lever_arm)),
+            100.0 * float(rotation[:, 0] ** 2 @ estimate.scale) if len(scale) else math.nan,
+            100.0 * float(scale[0]) if len(scale) else math.nan,
+            parameters.base_frame,
+            self.replayed.dvl_frame,
+        )
+
+    def correct(self, velocity_dvl: Array) -> Array:
+        """Measured velocities (..., 3) m/s, forward-left-up axes of the DVL, to corrected ones in the body."""
+        rotation = self.discovery.parameters.rotation_dvl_from_body
+        return self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The selected model over time: time in s since the first DVL sample, states in SI with their σ as *_std.
+
+        Raises InputError without pandas, or if the replay kept no history.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise InputError("to_pandas needs the Python package pandas; pip install pandas") from None
+        history = self.replayed.history
+        if history is None:
+            raise InputError("this replay kept no history; replay with history=True")
+        model, estimate = history.models[self.model], self.replayed.result.estimate
+        first_ns = self.replayed.result.first_ns or 0
+        columns: dict[str, Array] = {"time_s": 1e-9 * (history.stamps_ns - first_ns)}
+        for index, name in enumerate(estimate.state_names):
+            columns[name], columns[f"{name}_std"] = model.state[:, index], model.std[:, index]
+        return pandas.DataFrame(columns)
+
+    def plot(self) -> Figure:
+        """The mounting over time with its ±1σ, and the velocity error before and after, as a matplotlib Figure."""
+        from .report.calibration_figure import calibration_figure
+
+        if self.replayed.history is None:
+            raise InputError("this replay kept no history; replay with history=True")
+        return calibration_figure(self.replayed)
+
+    def save(self, path: StrPath) -> Path:
+        """Write the result file (YAML), from which the node and `dvl-calib apply` go on. Raises InputError."""
+        from .files.result_file import result_document, save_result
+
+        target = Path(path)
+        document = result_document(self.replayed.result, self.replayed.dvl_frame, self.replayed.turned)
+        save_result(target, document, round(self.discovery.parameters.result_backups))
+        return target
+
+    def report(self, path: StrPath) -> Path:
+        """Write the report (HTML) with pictures. Raises InputError."""
+        from .report import write_replay_report
+
+        target = Path(path)
+        write_replay_report(target, self.replayed, self.bags, list(MODELS))
+        return target
+
+
+def replay(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    history: bool = True,
+    **parameters: Any,
+) -> Calibration:
+    """Calibrate with recorded bags, as ``dvl-calib replay`` does.
+
+    Parameters
+    ----------
+    bags
+        A rosbag2 folder, a .mcap or .db3 file, or several of them, which are read as one.
+    dvl_topic, gnss_topic, imu_topic
+        Topics; found by type, name and content where not named. gnss_topic, imu_topic: "none" does without.
+    params
+        A ROS 2 parameter file.
+    history
+        Keep the run over time, for `Calibration.plot`, `to_pandas` and `report`.
+    **parameters
+        Any of the node's parameters, in SI units, such as ``mounting_rpy=(0, 0, 0.785)``.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For what is no bag, has no DVL, or cannot be a parameter.
+    """
+    from .replay.replay import replay as run
+
+    paths = _paths(bags)
+    discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
+    replayed = run(paths, discovery.parameters, discovery.topics, with_history=history)
+    return Calibration(replayed, discovery, tuple(paths))
+
+
+def doctor(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Examination:
+    """Say what is in recordings, what is wrong with them, and whether they can calibrate; arguments as `replay`."""
+    from .examination.examine import examine
+
+    merged, names = _parameters(params, parameters)
+    return examine(_paths(bags), merged, Given(dvl_topic, gnss_topic, imu_topic, names))
+
+
+def diagnose(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Diagnosis:
+    """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``; as `replay`."""
+    from .diagnosis.diagnose import diagnose as run
+
+    paths = _paths(bags)
+    discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, {"min_speed": 0.0} | parameters)
+    return run(paths, discovery.parameters, discovery.topics)
+
+
+def simulate(bag: StrPath, scenario: Scenario | None = None, **scenario_fields: Any) -> Path:
+    """Write a simulated bag, as ``dvl-calib simulate``.
+
+    Parameters
+    ----------
+    bag
+        Folder to write; must not exist.
+    scenario
+        What to simulate; by default ten minutes along a box.
+    **scenario_fields
+        Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
+
+    Raises
+    ------
+    InputError
+        If the bag exists, or cannot be written.
+    """
+    from .bags.writer import Compression, Storage
+    from .simulation.scenario import write_bag
+
+    if scenario is not None and scenario_fields:
+        raise InputError("simulate: give a scenario or fields of one, not both")
+    target = Path(bag)
+    write_bag(scenario or Scenario(**scenario_fields), target, Storage.MCAP, Compression.NONE, with_truth=True)
+    return target
+
+
+def evaluate(
+    paths: Bags | None = None, *, models: Sequence[str] | None = None, **parameters: Any
+) -> Evaluation | CrossCheck:
+    """Evaluate the models, as ``dvl-calib evaluate``.
+
+    Parameters
+    ----------
+    paths
+        A folder of trajectories for the published procedure, None for the project's own trajectories, or two bags and
+        more, of which each calibrates and all others verify.
+    models
+        Names; all by default.
+    **parameters
+        Any of the node's parameters, in SI units.
+    """
+    from .evaluation.bags import cross_check
+    from .evaluation.evaluate import DEFAULTS
+    from .evaluation.evaluate import evaluate as run
+    from .parallel import Workers
+    from .replay.replay import Topics
+
+    names = tuple(MODELS) if models is None else tuple(models)
+    for name in names:
+        if name not in MODELS:
+            raise InputError(f"models: {name!r} is none of {', '.join(MODELS)}")
+    found = [] if paths is None else _paths(paths)
+    if len(found) > 1:
+        return cross_check(found, Parameters.from_mapping(parameters), names, Topics(), Workers())
+    return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)
+
+
+def _paths(bags: Bags) -> list[Path]:
+    return [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
+
+
+def _parameters(params: StrPath | None, given: Mapping[str, Any]) -> tuple[Parameters, frozenset[str]]:
+    """Parameters of a file and of a call, and the names that either sets."""
+    from .files.parameter_files import given_parameters, load_parameters
+
+    path = None if params is None else Path(params)
+    return load_parameters(path).replace(**given), given_parameters(path) | frozenset(given)
+
+
+def _discovered(
+    paths: list[Path],
+    topics: tuple[str | None, str | None, str | None],
+    params: StrPath | None,
+    given: Mapping[str, Any],
+) -> Discovery:
+    parameters, names = _parameters(params, given)
+    dvl, gnss, imu = topics
+    return discover(paths, parameters, Given(dvl, gnss, imu, names))
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (values + 0.0).tolist()
+    return x, y, z

@@ -1,0 +1,136 @@
+"""The public interface: five lines of Python do what the commands do."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import in_fresh_process, succeed
+from conftest import ROOT
+from io_fixtures import estimates, run, write_bag
+
+import dvl_calib_ros as dc
+from dvl_calib_ros.api import __all__ as PUBLIC  # noqa: N812
+from dvl_calib_ros.cli.main import main
+
+NOTEBOOK = ROOT / "examples" / "five_lines.ipynb"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    return write_bag(tmp_path_factory.mktemp("api") / "bag", run())
+
+
+@pytest.fixture(scope="module")
+def calibration(bag) -> dc.Calibration:
+    return dc.replay(bag)
+
+
+def test_five_lines_give_the_mounting_and_a_picture(tmp_path, bag):
+    script = f"""
+        import dvl_calib_ros as dc
+        run = dc.replay({str(bag)!r})
+        print(run.mounting)
+        run.plot().savefig({str(tmp_path / "run.png")!r})
+        print(run.verdict)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("dvl_link in base_link: roll ")
+    assert (tmp_path / "run.png").stat().st_size > 10_000
+
+
+def test_replay_is_what_the_command_gives(calibration, bag, tmp_path, capsys):
+    assert main(["replay", str(bag), "--json", str(tmp_path / "o.json")]) == 0
+    document = json.loads((tmp_path / "o.json").read_text())
+    state = calibration.replayed.result.estimates["G1"].state
+    np.testing.assert_allclose(state, document["models"]["G1"]["state"], rtol=0, atol=1e-12)
+    assert calibration.verdict == document["verification"]["G1"]["verdict"]
+    assert list(calibration.found) == document["discovery"]["found"]
+    out, _ = succeed(capsys, "replay", bag)
+    assert calibration.mounting.urdf in out
+
+
+def test_the_mounting_has_its_figures_in_degrees_and_per_cent(calibration, bag):
+    mounting = calibration.mounting
+    assert mounting.nominal_rpy_deg == (0.0, 0.0, 0.0)
+    state = estimates(bag)["G1"]
+    assert mounting.rpy_deg[2] == pytest.approx(-np.degrees(state[2]), abs=0.3)  # φ turns what is measured
+    assert 0.0 < mounting.std_deg[1] < 1.0 and mounting.scale_std_percent > 0.0
+
+
+def test_a_corrected_velocity_is_in_the_body(calibration):
+    rotation = np.array(calibration.replayed.result.estimate.rotation_body_from_dvl(np.eye(3)))
+    np.testing.assert_allclose(calibration.correct([1.0, 0.0, 0.0]), rotation[:, 0], atol=0.02)
+
+
+def test_the_run_over_time_is_a_data_frame_on_demand(calibration):
+    frame = pytest.importorskip("pandas") and calibration.to_pandas()
+    assert list(frame.columns[:3]) == ["time_s", "phi_x", "phi_x_std"]
+    assert frame["phi_z_std"].iloc[-1] < frame["phi_z_std"].iloc[0]
+
+
+def test_without_history_what_needs_it_says_so(bag):
+    without = dc.replay(bag, history=False)
+    for what in (without.plot, without.to_pandas):
+        with pytest.raises(dc.InputError, match=r"history=True|pandas"):
+            what()
+
+
+def test_the_other_functions_give_dataclasses(tmp_path, bag):
+    made = dc.simulate(tmp_path / "made", seconds=60.0, trajectory="figure8")
+    assert dc.doctor(made).verdict == "yes"
+    checked = dc.evaluate([bag, made], models=["G1"])
+    assert checked.models == ("G1",)
+    assert dc.replay([made], gnss_topic="none").model == "F1"
+    with pytest.raises(dc.InputError, match="none of"):
+        dc.evaluate(models=["M9"])
+    with pytest.raises(dc.ParameterError, match="did you mean"):
+        dc.replay(bag, min_spede=1.0)
+
+
+def test_a_saved_calibration_is_one_that_apply_takes(calibration, tmp_path, capsys):
+    saved = calibration.save(tmp_path / "c.yaml")
+    out, _ = succeed(capsys, "apply", saved)
+    assert "URDF:" in out
+
+
+def test_the_package_imports_nothing_heavy_until_it_is_asked():
+    assert in_fresh_process("import dvl_calib_ros", ["numpy", "rosbags", "matplotlib", "scipy"]) == []
+    assert in_fresh_process("import dvl_calib_ros.api", ["matplotlib", "pandas", "rclpy"]) == []
+
+
+def test_the_interface_is_what_the_package_says_it_is():
+    assert dc.__all__ == PUBLIC
+    for name in PUBLIC:
+        assert callable(getattr(dc, name)) and getattr(dc, name).__doc__
+    assert set(PUBLIC) <= set(dir(dc))
+    # in whatever order subpackages are imported
+    script = "import dvl_calib_ros.replay.replay, dvl_calib_ros as dc; assert callable(dc.replay)"
+    assert subprocess.run([sys.executable, "-c", script], cwd=ROOT).returncode == 0
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_from_its_first_cell_to_its_last(tmp_path):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    client = nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}})
+    client.execute()
+    shown = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in shown)
+
+
+def test_the_notebooks_cells_are_python_that_runs(tmp_path, monkeypatch):
+    """Without Jupyter: every cell in one namespace, as a kernel would."""
+    monkeypatch.chdir(ROOT)
+    namespace: dict = {}
+    for cell in json.loads(NOTEBOOK.read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), namespace)
+    assert namespace["run"].verdict in ("accept", "marginal")
