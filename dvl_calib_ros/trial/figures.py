@@ -21,6 +21,8 @@ from .truth import Category
 AT_SEA = (Family.HALF_REAL, Family.HORIZONTAL, Family.SEVERAL)
 # The error with what was said compensated may be so much larger than the possible one
 CLOSE_TO_POSSIBLE = 1.1
+# So far may the error that is said be from the true one: it is measured with one draw of the noise
+HONEST = 0.2
 KNOWN = (Category.SINGLE, Category.PAIR, Category.TRIPLE)
 
 
@@ -144,6 +146,11 @@ def _at_sea(scored: Sequence[Scored], twins: Sequence[Scored]) -> list[Figure]:
             f"error after within {CLOSE_TO_POSSIBLE:g} of the possible",
             _at_least(0.95),
             (case.error_over_possible <= CLOSE_TO_POSSIBLE for case in known),
+        ),
+        share(
+            f"error after said within {HONEST:.0%} of the true",
+            NO_TARGET,
+            (abs(case.error_said_over_true - 1.0) <= HONEST for case in known if case.after_mps is not None),
         ),
         *_unknown(scored),
         *([share("same as with all axes", _at_least(0.95), (a.agrees_with(b) for a, b in pairs))] if pairs else []),

@@ -48,6 +48,7 @@ class Scored:
 
     named: names of the effects, the strongest first, each with the ones that it cannot be told from. noise: names of
     the findings about the noise. left_mps: error (rms) that what was said leaves beyond the calibration and the noise.
+    after_mps: error after, noise included, as the diagnosis says it is.
     """
 
     truth: Truth
@@ -58,6 +59,7 @@ class Scored:
     cpu_s: float
     noise: frozenset[str]
     left_mps: float
+    after_mps: float | None = None
 
     @property
     def claimed(self) -> bool:
@@ -110,6 +112,11 @@ class Scored:
         return math.hypot(self.left_mps, self.truth.noise_mps) / self.truth.noise_mps
 
     @property
+    def error_said_over_true(self) -> float:
+        """Error after as the diagnosis says it is, over what it is."""
+        return (self.after_mps or math.nan) / math.hypot(self.left_mps, self.truth.noise_mps)
+
+    @property
     def chance_right(self) -> float:
         """Chance with which the likelihood prefers the truth over its nearest rival."""
         return NormalDist().cdf(min(self.truth.distances.values(), default=np.inf) / 2.0)
@@ -150,17 +157,22 @@ def _scored(truth: Truth, answer: Mapping[str, Any]) -> Scored:
     document = answer["document"]
     effects = document.get("effects", [])
     named = tuple((each["name"], frozenset([each["name"], *each.get("equivalent_to", [])])) for each in effects)
-    closure = (document.get("gap") or {}).get("closure")
+    gap = document.get("gap") or {}
     return Scored(
         truth,
         document["verdict"],
         named,
-        closure if closure is not None and math.isfinite(closure) else None,
+        _finite(gap.get("closure")),
         tuple(_intervals(truth, effects)),
         answer["cpu_s"],
         frozenset(each["name"] for each in document.get("noise", [])),
         answer.get("left_mps", 0.0),
+        _finite(gap.get("after_mps")),
     )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _intervals(truth: Truth, effects: Iterable[Mapping[str, Any]]) -> Iterable[Interval]:
