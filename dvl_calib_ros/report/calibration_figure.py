@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,6 +20,15 @@ _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")
 _SETTLING = 0.1
 
 
+class NotebookFigure(Figure):
+    """A figure that a notebook shows by itself, without pyplot and its state."""
+
+    def _repr_png_(self) -> bytes:
+        target = io.BytesIO()
+        self.savefig(target, format="png")
+        return target.getvalue()
+
+
 def calibration_figure(replayed: Replayed) -> Figure:
     """Above, roll, pitch and yaw of the correction over time with ±1σ; below, the velocity error of each sample.
 
@@ -30,7 +41,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
     rotation = parameters.rotation_dvl_from_body
     first_ns = result.first_ns or 0
     model = history.models[result.selected]
-    figure = Figure(figsize=(8.0, 5.6), layout="constrained")
+    figure = NotebookFigure(figsize=(8.0, 5.6), layout="constrained")
     angles, errors = figure.subplots(2, 1, sharex=True)
     time = 1e-9 * (history.stamps_ns - first_ns)
     # φ turns the measured velocity in the DVL's frame: about the body's axes it is the mounting's turn, reversed
