@@ -121,7 +121,7 @@ class BagReader:
         try:
             for message in source.messages(topics):
                 newest_ns, channel, data = message
-                if data[:4] == ZSTD_MAGIC:  # message compression; CDR begins otherwise
+                if data.startswith(ZSTD_MAGIC):  # message compression; CDR begins otherwise
                     unpacked = _unpacked_message(data)
                     if unpacked is None:
                         lost += 1

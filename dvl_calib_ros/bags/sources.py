@@ -10,7 +10,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,12 +19,14 @@ from .channels import Channel, definition_of
 from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
 from .raw_file import open_recording, unreadable
 from .salvage.damage import DamagedError, Salvaged
-from .salvage.mcap_file import MCAP_MAGIC, indexed_messages, read_summary, salvage_mcap
+from .salvage.mcap_file import MCAP_MAGIC, bytes_at_once, indexed_messages, read_summary, salvage_mcap
 from .salvage.sqlite_file import SQLITE_MAGIC, salvage_sqlite
 from .sorting import BagMessage, by_log_time
 from .sqlite import Database
 
 ROS1_MAGIC = b"#ROSBAG"
+# Chunks that overlap in time, as of a recorder that caches by topic, are merged in memory up to so many bytes.
+MERGED_AT_ONCE = 64 << 20
 DAMAGE = (DamagedError, OSError, sqlite3.Error, struct.error)
 
 Messages = Callable[[Collection[str]], Iterator[BagMessage]]
@@ -121,8 +123,10 @@ def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
 
     def messages(topics: Collection[str]) -> Iterator[BagMessage]:
         wanted = {number for number, channel in channels.items() if channel.topic in topics}
-        for log_ns, number, data in indexed_messages(path, summary, wanted):
-            yield log_ns, channels[number], data
+        in_order = bytes_at_once(summary, wanted) <= MERGED_AT_ONCE
+        found = indexed_messages(path, summary, wanted, in_order)
+        messages = ((log_ns, channels[number], data) for log_ns, number, data in found)
+        return messages if in_order else by_log_time(messages)
 
     span_ns = (statistics.message_start_time, statistics.message_end_time)
     return Source(shown, counts, span_ns, _until_damage(messages, path, salvage_mcap, counts))
@@ -183,13 +187,12 @@ def _until_damage(messages: Messages, path: Path, salvage: Salvage, counts: Mapp
 
     def all_messages(topics: Collection[str]) -> Iterator[BagMessage]:
         newest_ns, read = -1, 0
-        newest: list[tuple[str, bytes]] = []
+        newest: list[BagMessage] = []
         try:
             for message in messages(topics):
-                log_ns, channel, data = message
-                if log_ns != newest_ns:
-                    newest_ns, newest = log_ns, []
-                newest.append((channel.topic, data))
+                if message[0] != newest_ns:
+                    newest_ns, newest = message[0], []
+                newest.append(message)
                 read += 1
                 yield message
             if read < (announced := sum(count for channel, count in counts.items() if channel.topic in topics)):
@@ -202,20 +205,21 @@ def _until_damage(messages: Messages, path: Path, salvage: Salvage, counts: Mapp
 
 
 def _rest(
-    salvaged: Iterator[Salvaged], topics: Collection[str], newest_ns: int, newest: list[tuple[str, bytes]]
+    salvaged: Iterator[Salvaged], topics: Collection[str], newest_ns: int, newest: Sequence[BagMessage]
 ) -> Generator[BagMessage, None, str]:
     """What of a damaged recording comes after the messages that its index led to (at newest_ns: `newest`).
 
     Returns what is damaged.
     """
     damage = ""
+    known = {(channel.topic, data) for _, channel, data in newest}
 
     def later() -> Iterator[BagMessage]:
         nonlocal damage
         try:
             for message in _with_channels(salvaged):
                 log_ns, channel, data = message
-                is_later = log_ns > newest_ns or (log_ns == newest_ns and (channel.topic, data) not in newest)
+                is_later = log_ns > newest_ns or (log_ns == newest_ns and (channel.topic, data) not in known)
                 if is_later and channel.topic in topics:
                     yield message
         except DAMAGE as error:

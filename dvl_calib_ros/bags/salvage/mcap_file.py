@@ -14,7 +14,7 @@ import re
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import suppress
-from itertools import chain
+from itertools import accumulate, chain
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import BinaryIO
@@ -79,8 +79,25 @@ def _summary(file: BinaryIO) -> Summary | None:
     return summary
 
 
-def indexed_messages(path: Path, summary: Summary, channels: Collection[int]) -> Iterator[Found]:
-    """Messages of these channels in order of log time. Raises DamagedError where the index leads to no whole chunk."""
+def bytes_at_once(summary: Summary, channels: Collection[int]) -> int:
+    """What the chunks that hold messages of these channels at one time take, unpacked, at most."""
+    wanted = frozenset(channels)
+    changes = [
+        change
+        for index in chain.from_iterable(_overlapping(summary.chunk_indexes, wanted))
+        for change in (
+            (index.message_start_time, 0, index.uncompressed_size),
+            (index.message_end_time, 1, -index.uncompressed_size),
+        )
+    ]
+    return max(accumulate(change for *_, change in sorted(changes)), default=0)
+
+
+def indexed_messages(path: Path, summary: Summary, channels: Collection[int], in_order: bool = True) -> Iterator[Found]:
+    """Messages of these channels in order of log time, or chunk by chunk. Raises DamagedError at damage.
+
+    Merging takes as much memory as `bytes_at_once`.
+    """
 
     def read(index: ChunkIndex) -> Iterator[Found]:
         yield from _whole_chunk(file, size, index, tables, wanted)
@@ -90,8 +107,8 @@ def indexed_messages(path: Path, summary: Summary, channels: Collection[int]) ->
     size = path.stat().st_size
     with open_recording(path) as file:
         for group in _overlapping(summary.chunk_indexes, wanted):
-            if len(group) == 1:
-                yield from read(group[0])
+            if len(group) == 1 or not in_order:
+                yield from chain.from_iterable(map(read, group))
             else:
                 # a marker where each begins: merging opens a chunk only when its time has come
                 streams = [chain([(index.message_start_time, -1, b"")], read(index)) for index in group]

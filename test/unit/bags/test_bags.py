@@ -27,7 +27,7 @@ from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dvl_calib_ros.bags import sorting
+from dvl_calib_ros.bags import sorting, sources
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.samples import DvlSample, VelocityFrame
@@ -126,6 +126,18 @@ def test_mcap_files_of_other_writers_give_the_same_messages(tmp_path, plain, com
     (tmp_path / "other.mcap").write_bytes(content)
     messages, notes = raw_and_notes(tmp_path / "other.mcap")
     assert messages == raw(plain) and not notes
+
+
+@pytest.mark.parametrize(("at_once", "in_memory"), [(0, sorting.IN_MEMORY), (0, 20_000), (1 << 30, 20_000)])
+def test_chunks_of_one_topic_each_are_merged_in_memory_or_on_disk(tmp_path, plain, monkeypatch, at_once, in_memory):
+    monkeypatch.setattr(sources, "MERGED_AT_ONCE", at_once)
+    monkeypatch.setattr(sorting, "IN_MEMORY", in_memory)
+    by_topic = sorted(raw(plain), key=lambda message: message[0])
+    (tmp_path / "by_topic.mcap").write_bytes(mcap_bytes(by_topic, chunk_size=30_000, compression=CompressionType.LZ4))
+    found, notes = raw_and_notes(tmp_path / "by_topic.mcap")
+    assert [log_ns for _, log_ns, _ in found] == sorted(log_ns for _, log_ns, _ in by_topic)
+    assert sorted(found) == sorted(by_topic) and not notes
+    assert estimates(tmp_path / "by_topic.mcap") == estimates(plain)
 
 
 @pytest.mark.parametrize("in_memory", [sorting.IN_MEMORY, 20_000])
