@@ -6,6 +6,7 @@ order in which they finish changes anything.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -89,6 +90,7 @@ def _on_dask(
     except ImportError as error:
         raise InputError(f"--dask needs Dask ({error}); pip install 'dvl_calib_ros[dask]'") from error
     try:
+        asyncio.run(_greet(address))  # Client's own timeout does not hold where a port is open and silent
         client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise InputError(f"--dask {address}: no scheduler answers there; start one, or leave --dask out") from error
@@ -109,6 +111,25 @@ def _on_dask(
         except (CancelledError, CommClosedError, KilledWorker) as error:
             raise InputError(f"--dask {address}: the cluster was lost on the way; start it anew") from error
         return outcomes
+
+
+async def _greet(address: str) -> None:
+    """See that a scheduler answers. Raises OSError if none does."""
+    from distributed.comm.core import connect
+    from distributed.security import Security
+
+    async def greet() -> None:
+        comm = await connect(address, **Security().get_connection_args("client"))
+        try:
+            await comm.write({"op": "identity", "reply": True})
+            await comm.read()
+        finally:
+            comm.abort()
+
+    try:
+        await asyncio.wait_for(greet(), CONNECT_TIMEOUT_S)
+    except Exception as error:  # what another service says is read as anything, MemoryError among it
+        raise OSError(f"{type(error).__name__}: {error}") from error
 
 
 @contextmanager

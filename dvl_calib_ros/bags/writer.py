@@ -69,7 +69,7 @@ class BagWriter:
     def __init__(
         self, path: Path, storage: Storage = Storage.MCAP, compression: Compression = Compression.NONE
     ) -> None:
-        if path.exists():
+        if os.path.lexists(path):  # a link that leads nowhere, too
             raise InputError(f"{path}: exists already; give another name, or remove it first")
         if storage is Storage.SQLITE3 and compression is Compression.CHUNK:
             raise InputError("compression chunk is MCAP's; with sqlite3 use message or file")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -122,6 +123,7 @@ def check_outputs(
     files, folders: options that name what is written. Every other path in the arguments, and what the parameters name,
     is read. also_read: what is read beside.
     """
+    from ..errors import InputError
     from ..files.atomic import check_writable
     from ..files.outputs import check_outputs as check_apart
 
@@ -134,6 +136,9 @@ def check_outputs(
              if isinstance(path, Path)]  # fmt: skip
     if hasattr(arguments, "overrides") and (initial := load(arguments).initial_calibration):
         read.append(Path(initial))
+    for name in folders:
+        if os.path.islink(given[name]) and not given[name].exists():
+            raise InputError(f"{given[name]}: is a link that leads nowhere; give another name, or remove it first")
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0], read, as_options[1])
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from .. import __version__
+from ..streams import give_up_stdout, open_streams, say
 from . import apply, demo, diagnose, doctor, evaluate, import_, parameters, replay, run, salvage, simulate, watch
 
 COMMANDS = (run, watch, doctor, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo)
@@ -48,6 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad usage or bad input, said in one line on standard error."""
     if "_ARGCOMPLETE" in os.environ:
         _complete()
+    open_streams()
     # our matrices are small: more threads of BLAS only wait for each other (2.5 times the CPU in a diagnosis). Before
     # numpy is imported, which commands do when they are called
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -57,6 +59,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     try:
         return _run(argv)
+    except KeyboardInterrupt:
+        say(f"dvl-calib {next((word for word in argv if not word.startswith('-')), '')}: interrupted")
+        return 130
     except ModuleNotFoundError as error:  # where the package was built by colcon, which installs no other
         name = (error.name or "").partition(".")[0]
         if name in ("", __name__.partition(".")[0]):
@@ -76,13 +81,11 @@ def _run(argv: Sequence[str]) -> int:
         return code
     except (InputError, ParameterError) as error:
         return _fail(arguments.command, str(error))
-    except KeyboardInterrupt:
-        print(f"dvl-calib {arguments.command}: interrupted", file=sys.stderr)
-        return 130
     except BrokenPipeError:  # | head
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        give_up_stdout()
         return 0
     except OSError as error:
+        give_up_stdout()  # if that is what cannot be written
         name = "" if error.filename is None else f"{error.filename}: "
         return _fail(arguments.command, f"{name}{error.strerror or error}; check names, permissions and space")
 
@@ -98,7 +101,7 @@ def _complete() -> NoReturn:
 def _fail(command: str, message: str) -> int:
     from ..errors import printable
 
-    print(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}", file=sys.stderr)
+    say(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}")
     return 2
 
 

@@ -7,6 +7,7 @@ the axes it names.
 from __future__ import annotations
 
 import csv
+import os
 import re
 import shutil
 from dataclasses import dataclass
@@ -181,7 +182,7 @@ def import_recording(
     dvl: Path, gnss: Path | None, attitude: Path | None, output: Path, options: ImportOptions
 ) -> dict[str, int]:
     """Write one recording to a new bag; topic -> number of messages. Raises InputError, and then writes nothing."""
-    if output.exists():
+    if os.path.lexists(output):
         raise InputError(f"{output}: exists already; give another name, or remove it first")
     start_ns = options.start_ns
     dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -40,6 +39,7 @@ from ..files.result_file import (
 )
 from ..messages.drivers import velocity_type
 from ..messages.feed import MessageFeed
+from ..streams import say
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
@@ -333,12 +333,12 @@ class CalibrationNode(Node):
             return
         try:
             self._save(Path(path))
-            print(f"calibration_node: saved to {path}", file=sys.stderr)
+            say(f"calibration_node: saved to {path}")
         except NothingUsedError as error:
-            print(f"calibration_node: {error}", file=sys.stderr)
+            say(f"calibration_node: {error}")
         except InputError as error:
             result = result_text(self._result_document())
-            print(f"calibration_node: {error}. The result follows.\n{result}", file=sys.stderr)
+            say(f"calibration_node: {error}. The result follows.\n{result}")
 
 
 def _set_stamp(stamp: Any, nanoseconds: int) -> None:

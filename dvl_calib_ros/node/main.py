@@ -21,8 +21,10 @@ ENDS_WITH_STDIN = "--ends-with-stdin"
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until it is told to stop; 0, or 2 on a bad configuration, said in one line on standard error."""
     try:
+        from ..streams import open_streams
         from .ending import Ending
 
+        open_streams()
         given = list(sys.argv[1:] if args is None else args)
         with_parent = ENDS_WITH_STDIN in given
         with Ending(closed=sys.stdin.fileno() if with_parent else None) as ending:
@@ -43,12 +45,9 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         from ..errors import InputError
         from .calibration_node import CalibrationNode
     except ImportError as error:
-        print(
-            f"calibration_node: ROS 2 is not available ({error}); source /opt/ros/jazzy/setup.bash, or "
-            "pip install 'dvl_calib_ros[ros]'",
-            file=sys.stderr,
+        return _refused(
+            f"ROS 2 is not available ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
         )
-        return 2
     if ending.requested:
         return 0
     try:
@@ -86,10 +85,11 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
     return files
 
 
-def _refused(error: Exception) -> int:
+def _refused(error: Exception | str) -> int:
     from ..errors import printable
+    from ..streams import say
 
-    print(f"calibration_node: {printable(' '.join(str(error).split()))}", file=sys.stderr)
+    say(f"calibration_node: {printable(' '.join(str(error).split()))}")
     return 2
 
 

@@ -1,0 +1,148 @@
+"""Standard streams, disks, links and schedulers that fail: one line or none, no traceback, nothing left behind."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from command_line import fail
+from conftest import ROOT
+from io_fixtures import run, write_bag
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    return write_bag(tmp_path_factory.mktemp("failing") / "bag", run(40.0))
+
+
+def shell(redirected: str, *arguments, before: str = "", module: str = "cli.main") -> subprocess.CompletedProcess:
+    """A command with its standard streams as a shell redirects them."""
+    words = [sys.executable, "-m", f"dvl_calib_ros.{module}", *map(str, arguments)]
+    script = f'{before} exec "$@" {redirected}'
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        ["bash", "-c", script, "bash", *words], capture_output=True, text=True, env=environment, timeout=PATIENCE_S
+    )
+
+
+CLOSED = ["".join(each) for n in (1, 2, 3) for each in itertools.combinations(["<&- ", ">&- ", "2>&- "], n)]
+
+
+@pytest.mark.parametrize("closed", CLOSED)
+def test_closed_streams_are_as_good_as_nowhere(bag, tmp_path, closed):
+    done = shell(closed, "replay", bag, "--json", tmp_path / "out.json", "--verbose")
+    assert done.returncode == 0 and "Traceback" not in done.stdout + done.stderr
+    document = json.loads((tmp_path / "out.json").read_text())  # nothing that was said is in it
+    assert "models" in document and os.listdir(tmp_path) == ["out.json"]
+    assert (">&-" in closed.replace("2>&-", "")) == (done.stdout == "")
+
+
+@pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full", ">&- 2>&-"])
+def test_the_exit_code_says_what_standard_error_cannot(tmp_path, stream):
+    done = shell(stream, "replay", tmp_path / "missing")
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
+
+
+def test_a_closed_standard_error_does_not_end_the_node(tmp_path):
+    pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
+    done = shell("<&- >&- 2>&-", "--ros-args", "-p", "gnss_timout:=1.0", module="node.main")
+    assert done.returncode == 2
+    done = shell("2>&1", "--ros-args", "-p", "gnss_timout:=1.0", module="node.main")
+    assert done.returncode == 2 and done.stdout.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [("replay", "BAG"), ("parameters",), ("parameters", "--models")])
+def test_a_full_standard_output_is_said_in_one_line(bag, arguments):
+    done = shell(">/dev/full", *(bag if word == "BAG" else word for word in arguments))
+    assert done.returncode == 2
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"dvl-calib {arguments[0]}: No space left on device") and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("where", ["missing/x", "loop", "file/x"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("replay", "BAG", "--json"), ("replay", "BAG", "--save"), ("replay", "BAG", "--report"),
+        ("salvage", "BAG", "-o"), ("simulate", "--duration", "5"), ("import", "T.csv", "-o"),
+        ("evaluate", "--csv"), ("diagnose", "BAG", "--apply"),
+    ],
+)  # fmt: skip
+def test_a_link_that_leads_nowhere_is_refused_before_any_work(bag, tmp_path, monkeypatch, capsys, arguments, where):
+    monkeypatch.chdir(tmp_path)
+    Path("T.csv").write_text("0,1.5,0,0\n0.2,1.5,0,0\n")
+    Path("file").touch()
+    Path("loop").symlink_to(where)
+    before = sorted(os.listdir(tmp_path))
+    error = fail(capsys, *(bag if word == "BAG" else word for word in arguments), "loop")
+    assert "loop" in error
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("compression", ["none", "message", "file"])
+@pytest.mark.parametrize("command", ["salvage", "simulate", "import"])
+def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
+    bag, tmp_path, monkeypatch, capsys, command, storage, compression
+):
+    """The kernel's limit on a file's size stands in for the disk: the same calls fail half-way."""
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"{0.01 * i},1.5,{i % 7},0\n" for i in range(5000))
+    Path("T.csv").write_text(rows)
+    arguments = {
+        "salvage": ("salvage", bag, "-o", "new"),
+        "simulate": ("simulate", "new", "--duration", 100),
+        "import": ("import", "T.csv", "-o", "new"),
+    }[command]
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, limits[1]))
+    try:
+        error = fail(capsys, *arguments, "--storage", storage, "--compression", compression)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert "free some space" in error
+    assert os.listdir(tmp_path) == ["T.csv"]
+
+
+@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_a_port_that_is_open_and_is_no_scheduler_is_said_within_ten_seconds(bag, tmp_path, capsys, answer):
+    pytest.importorskip("distributed", reason="Dask is optional: pip install distributed")
+    other = write_bag(tmp_path / "other", run(10.0))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        connected = []
+
+        def accept() -> None:
+            while True:
+                try:
+                    connection, _ = server.accept()
+                except OSError:
+                    return
+                connected.append(connection)
+                if answer:
+                    connection.sendall(answer)
+
+        accepting = threading.Thread(target=accept, daemon=True)
+        accepting.start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        began = time.monotonic()
+        error = fail(capsys, "evaluate", bag, other, "--dask", address)
+        assert time.monotonic() - began < 10.0
+        assert f"--dask {address}: no scheduler answers there" in error
+        server.shutdown(socket.SHUT_RDWR)
+        accepting.join()
+        for connection in connected:
+            connection.close()
