@@ -17,5 +17,5 @@ def random_problem(rng, k=3, n_samples=150, n=4, m=3, outliers=0.0, weights=Fals
     z[:, rng.random(n_samples) < outliers] += 3.0
     weight = rng.uniform(0.1, 1.0, (k, n_samples)) if weights else np.ones((1, n_samples))
     usable = rng.random((k, n_samples)) < 0.9
-    data = Measurements(z, h, r, weight, usable, np.full(k, gate))
+    data = Measurements(z, h, r, weight, usable, np.full((k, 1), gate))
     return np.zeros((k, n)), np.tile(np.diag([0.05**2] * n), (k, 1, 1)), data

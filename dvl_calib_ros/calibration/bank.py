@@ -7,6 +7,7 @@ after a switch is that of having run the model from the start.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from .frames import Array
 from .history import Standing
 from .kalman import GaussianState
 from .models import N_MEASUREMENT, Model, Needs
-from .observations import Observations
+from .observations import Observations, Unmeasured
 from .parameters import Parameters
 from .samples import Index, Mask, Stamps
 
@@ -31,11 +32,17 @@ BATCH_FROM = 24
 
 
 class ModelCounts(NamedTuple):
-    """What one model did with the samples given to it, and the mean of νᵀS⁻¹ν over those it used (nan if none)."""
+    """What one model did with the samples given to it.
+
+    mean_nis, mean_rows: νᵀS⁻¹ν (nan if none) and number of rows, means over those it used. restarted: how often its
+    state was not finite, and it went on from before.
+    """
 
     used: int
     gated: int
     mean_nis: float
+    mean_rows: float
+    restarted: int
 
 
 class Assembler:
@@ -62,13 +69,23 @@ class Assembler:
             for index, model in enumerate(self.models)
             if model.in_correction_parameters
         }
-        self._gate = np.array([_gate(model, parameters) for model in self.models])
+        # by how many of its rows are left where axes of the reference are not measured
+        self._gates = np.array(
+            [
+                [_gate(max(model.n_measurement - dropped, 1), parameters) for dropped in range(N_MEASUREMENT)]
+                for model in self.models
+            ]
+        )
         self._needs_prior = np.array([model.needs_prior for model in self.models])
         rows = np.array([np.arange(N_MEASUREMENT) < model.n_measurement for model in self.models])
         self._own_rows = rows[:, None, :, None] & rows[:, None, None, :]
         self._one_noise = bool(rows.all()) and all(model.noise is None for model in self.models)
         self._one_weight = not any(model.motion_is_noise for model in self.models)
         self.process_rate = self._process_rate(parameters)
+
+    def start_of(self, index: int) -> GaussianState:
+        """State and covariance that one model starts from."""
+        return self._starts[index]
 
     def _start(self) -> GaussianState:
         k = len(self.models)
@@ -108,7 +125,41 @@ class Assembler:
             z[index, :, : model.n_measurement] = z_model
             h[index, :, : model.n_measurement, : model.n_state] = h_model
         usable = ~self._needs_prior[:, None] | prior_known
-        return kalman.Measurements(z, h, self._noise(seen), self._weight(seen, weight), usable, self._gate)
+        noise, gate = self._noise(seen), self._gates[:, :1]
+        if seen.unmeasured is not None:
+            noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
+        return kalman.Measurements(z, h, noise, self._weight(seen, weight), usable, gate)
+
+    def rows(self, seen: Observations) -> Array:
+        """Rows that each model is told by each sample (K, N or 1)."""
+        own = np.array([[float(model.n_measurement)] for model in self.models])
+        if seen.unmeasured is None:
+            return own
+        dropped = [_dropped_axes(model, seen.unmeasured).sum(axis=1) for model in self.models]
+        return own - np.array(dropped)
+
+    def _drop_unmeasured(
+        self, z: Array, h: Array, noise: Array, seen: Observations, unmeasured: Unmeasured
+    ) -> tuple[Array, Array]:
+        """R (K, N, 3, 3) and gate (K, N), with z and H turned into the reference's frame, unmeasured rows taken out."""
+        k, n_samples = z.shape[:2]
+        noise = np.broadcast_to(noise, (k, n_samples, 3, 3)).copy()
+        gate = np.repeat(self._gates[:, :1], n_samples, axis=1)
+        for index, model in enumerate(self.models):
+            axes = _dropped_axes(model, unmeasured)
+            at = np.flatnonzero(axes.any(axis=1))
+            if not len(at):
+                continue
+            turned = unmeasured.rotation_reference_from_body[at]
+            if not model.rows_in_body:
+                turned = turned @ seen.rotation_dvl_from_body.T
+            kept = ~axes[at]
+            z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
+            h[index, at] = turned @ h[index, at] * kept[:, :, None]
+            r = turned @ noise[index, at] @ turned.swapaxes(1, 2) * (kept[:, :, None] & kept[:, None, :])
+            noise[index, at] = r + np.eye(3) * axes[at, None, :]
+            gate[index, at] = self._gates[index, axes[at].sum(axis=1)]
+        return noise, gate
 
     def _noise(self, seen: Observations) -> Array:
         """R (K or 1, N or 1, 3, 3); rows that a model has not are of unit variance."""
@@ -124,6 +175,13 @@ class Assembler:
         if self._one_weight:
             return weight[None]
         return np.stack([seen.motion_weight if model.motion_is_noise else weight for model in self.models])
+
+
+def _dropped_axes(model: Model, unmeasured: Unmeasured) -> Mask:
+    """(N, 3) axes of the reference's frame that a model would need, and that are not measured."""
+    needed = (model.aided, model.aided, model.vertical_from_reference)
+    dropped: Mask = unmeasured.axes & needed
+    return dropped
 
 
 class ModelBank:
@@ -208,12 +266,14 @@ class _Group:
         self.index = {model.name: k for k, model in enumerate(models)}
         self.x, self.p = self._assembler.start
         self._states: dict[str, GaussianState] = {}
+        self._sound: dict[str, GaussianState] = {}  # the last that could be published
         self._last_stamp_ns: int | None = None
         self.n_given = 0
         k = len(models)
         self._used = np.zeros(k, dtype=np.int64)
         self._gated = np.zeros(k, dtype=np.int64)
-        self._nis_sum = np.zeros(k)
+        self._nis_sum, self._rows_sum = np.zeros(k), np.zeros(k)
+        self._restarted = np.zeros(k, dtype=np.int64)
 
     def update(
         self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None
@@ -222,10 +282,7 @@ class _Group:
         self.n_given += n_samples
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
-        if process is None and n_samples >= BATCH_FROM:
-            after = kalman.batch(self.x, self.p, data, ends)
-        else:
-            after = kalman.recursion(self.x, self.p, data, process, ends)
+        after = self._after(data, process, ends)
         self.x, self.p = after.x, after.p
         self._states.clear()
         if self._folds is not None:
@@ -234,7 +291,33 @@ class _Group:
         self._used += after.used.sum(axis=1)
         self._gated += (data.usable & ~after.used).sum(axis=1)
         self._nis_sum += np.where(after.used, after.nis, 0.0).sum(axis=1)
+        self._rows_sum += (after.used * self._assembler.rows(seen)).sum(axis=1)
         return standing
+
+    def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
+        """The models updated; one whose numbers run away stays as it was before, and is counted."""
+        try:
+            after = _filtered(self.x, self.p, data, process, ends)
+            sound = _is_sound(after.x, after.p)
+        except np.linalg.LinAlgError:
+            after, sound = None, np.zeros(len(self.x), dtype=bool)
+        if after is not None and sound.all():
+            return after
+        return kalman.Updated.joined([self._after_alone(k, data, process, ends) for k in range(len(self.x))])
+
+    def _after_alone(
+        self, k: int, data: kalman.Measurements, process: Array | None, ends: Ends | None
+    ) -> kalman.Updated:
+        own = slice(k, k + 1)
+        x, p, own_data = self.x[own], self.p[own], data.model(k)
+        with suppress(np.linalg.LinAlgError):
+            after = _filtered(x, p, own_data, None if process is None else process[:, own], ends)
+            if _is_sound(after.x, after.p).all():
+                return after
+        self._restarted[k] += 1
+        nothing = own_data.usable & False
+        at = None if ends is None else GaussianState(np.stack([x] * len(ends)), np.stack([p] * len(ends)))
+        return kalman.Updated(x, p, nothing, nothing.astype(float), at)
 
     def _standing_at(self, after: kalman.Updated, ends: Ends) -> Standing:
         assert after.at is not None
@@ -255,24 +338,72 @@ class _Group:
 
     def state(self, name: str) -> GaussianState:
         if name not in self._states:  # asked for more than once per sample, live
-            index = self.index[name]
-            self._states[name] = self._assembler.state(index, self.x[index], self.p[index])
+            self._states[name] = self._sound[name] = self._sound_state(name)
         return self._states[name]
+
+    def _sound_state(self, name: str) -> GaussianState:
+        """The state as it is to be published; the one before where the way from the filter's to it fails."""
+        index = self.index[name]
+        found = self._published(index, self.x[index], self.p[index])
+        if found is not None:
+            return found
+        self._restarted[index] += 1
+        return self._sound.get(name) or self._assembler.start_of(index)
+
+    def _published(self, index: int, x: Array, p: Array) -> GaussianState | None:
+        """A state (n,) of the filter as the model's; None if it has none that is finite."""
+        with suppress(np.linalg.LinAlgError):
+            state = self._assembler.state(index, x, p)
+            if _is_sound(state.x[None], state.p[None]).all():
+                return state
+        return None
 
     def states_at(self, name: str, standing: Standing) -> GaussianState:
         index = self.index[name]
-        return self._assembler.state(index, standing.x[:, index], standing.p[:, index])
+        x, p = standing.x[:, index], standing.p[:, index]
+        with suppress(np.linalg.LinAlgError):
+            states = self._assembler.state(index, x, p)
+            if _is_sound(states.x, states.p).all():
+                return states
+        singly = [self._published(index, *each) or self.state(name) for each in zip(x, p, strict=True)]
+        return GaussianState(np.array([state.x for state in singly]), np.array([state.p for state in singly]))
 
     def states_without_folds(self, name: str) -> list[GaussianState]:
         assert self._folds is not None  # asked for when the bank was made
-        index = self.index[name]
-        held = (self._folds.without(fold, index) for fold in range(FOLDS))
-        return [self._assembler.state(index, x, p) for x, p in held]
+        index, found = self.index[name], []
+        for fold in range(FOLDS):
+            state = None
+            with suppress(np.linalg.LinAlgError):
+                state = self._published(index, *self._folds.without(fold, index))
+            found.append(state or self.state(name))
+        return found
 
     def counts(self, name: str) -> ModelCounts:
         index = self.index[name]
         used = int(self._used[index])
-        return ModelCounts(used, int(self._gated[index]), float(self._nis_sum[index] / used) if used else float("nan"))
+        model = self._assembler.models[index]
+        return ModelCounts(
+            used,
+            int(self._gated[index]),
+            float(self._nis_sum[index] / used) if used else float("nan"),
+            float(self._rows_sum[index] / used) if used else float(model.n_measurement),
+            int(self._restarted[index]),
+        )
+
+
+def _filtered(
+    x: Array, p: Array, data: kalman.Measurements, process: Array | None, ends: Ends | None
+) -> kalman.Updated:
+    if process is None and data.z.shape[1] >= BATCH_FROM:
+        return kalman.batch(x, p, data, ends)
+    return kalman.recursion(x, p, data, process, ends)
+
+
+def _is_sound(x: Array, p: Array) -> Mask:
+    """(K,) of states x (K, n), P (K, n, n): finite, and variances positive."""
+    columns = np.concatenate([x, p.reshape(len(p), -1)], axis=1)
+    positive = np.diagonal(p, axis1=1, axis2=2) > 0.0
+    return np.logical_and(np.isfinite(columns).all(axis=1), positive.all(axis=1))
 
 
 def prior(model: Model, parameters: Parameters) -> GaussianState:
@@ -282,20 +413,20 @@ def prior(model: Model, parameters: Parameters) -> GaussianState:
     return GaussianState(np.zeros(model.n_state), np.diag(np.square(std)))
 
 
-def _gate(model: Model, parameters: Parameters) -> float:
-    """Largest νᵀS⁻¹ν that is used: the chi-square quantile, inf for no gate."""
+def _gate(rows: float, parameters: Parameters) -> float:
+    """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
     if parameters.gate_probability in (0.0, 1.0):
         return float("inf")
-    return 2.0 * float(gammaincinv(0.5 * model.n_measurement, parameters.gate_probability))
+    return 2.0 * float(gammaincinv(0.5 * rows, parameters.gate_probability))
 
 
-def nis_bounds(model: Model, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
-    """Two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter.
+def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
+    """Two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: of a sample, on average.
 
     Gated samples are not in the mean, so it is that of a chi-square variable cut off at the gate:
     E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal.
     """
-    m, gate = model.n_measurement, _gate(model, parameters)
+    m, gate = rows, _gate(rows, parameters)
     inside = chdtr(m, gate)
     mean = m * chdtr(m + 2, gate) / inside
     variance = m * (m + 2) * chdtr(m + 4, gate) / inside - mean**2

@@ -222,6 +222,9 @@ class Calibrator:
         pairing["awaiting_reference"] = aligner.n_judged - aligner.n_paired
         pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
         counts["calibration"] = {"restarts": self.restarts}
+        for name in MODELS:
+            if restarted := self._bank.counts(name).restarted:
+                counts["calibration"][f"{name} restarted"] = restarted
         return counts
 
     @property
@@ -281,7 +284,7 @@ class Calibrator:
         """Estimate of one model, by default the selected one, with all that is known about it."""
         model = MODELS[name or self.selected]
         state, covariance = self.state(model.name)
-        used, gated, mean_nis = self._bank.counts(model.name)
+        used, gated, mean_nis, rows, _ = self._bank.counts(model.name)
         return Estimate(
             model=model.name,
             state=state,
@@ -289,7 +292,7 @@ class Calibrator:
             used=used,
             gated=gated,
             mean_nis=mean_nis,
-            nis_bounds=nis_bounds(model, self.parameters, used),
+            nis_bounds=nis_bounds(rows, self.parameters, used),
             convergence=convergence(model, covariance, self.parameters),
             observability=observability(model, covariance, self.parameters),
         )

@@ -62,13 +62,14 @@ def _rows(h: Array) -> Array:
 class Moments:
     """All that is kept of samples with a reference to judge any correction by.
 
-    For each fold the number of samples and the sums of v vᵀ, g vᵀ, gᵀg and of the trace of R, with v (3,) m/s
-    measured, DVL frame, at the reference point, and g (3,) m/s the reference velocity, body frame.
+    For each fold the number of samples, and for each axis of the body, over the samples whose reference measures it,
+    the sums of v vᵀ, g vᵀ, g² and of the variance that R says; with v (3,) m/s measured, DVL frame, at the reference
+    point, and g m/s the reference velocity along the axis.
     """
 
     def __init__(self) -> None:
         self.count = np.zeros(FOLDS, dtype=np.int64)
-        self.vv = np.zeros((FOLDS, 3, 3))
+        self.vv = np.zeros((FOLDS, 3, 3, 3))
         self.gv = np.zeros((FOLDS, 3, 3))
         self.gg = np.zeros(FOLDS)
         self.noise = np.zeros(FOLDS)
@@ -77,16 +78,21 @@ class Moments:
         """Add N samples."""
         assert seen.reference_body is not None
         v, g = seen.velocity_at_reference, seen.reference_body
-        trace = np.broadcast_to(np.trace(seen.noise, axis1=1, axis2=2), folds.shape)
+        measured = np.broadcast_to(seen.measured_in_body, v.shape)
+        rotation = seen.rotation_dvl_from_body
+        variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, seen.noise, rotation), v.shape)
         for fold in np.unique(folds):
             at = folds == fold
             self.count[fold] += at.sum()
-            self.vv[fold] += v[at].T @ v[at]
-            self.gv[fold] += g[at].T @ v[at]
-            self.gg[fold] += np.sum(g[at] ** 2)
-            self.noise[fold] += trace[at].sum()
+            for axis in range(3):
+                known = v[at] * measured[at, axis, None]
+                self.vv[fold, axis] += known.T @ v[at]
+                self.gv[fold, axis] += g[at, axis] @ known
+            self.gg[fold] += np.sum(g[at] ** 2 * measured[at])
+            self.noise[fold] += np.sum(variance[at] * measured[at])
 
     def squared_error(self, fold: int, body_from_measured: Array) -> float:
-        """Sum over a fold of |g - C v|² (m/s)², C (3, 3)."""
+        """Sum over a fold of |g - C v|² (m/s)² along the measured axes, C (3, 3)."""
         c = body_from_measured
-        return float(self.gg[fold] - 2.0 * np.sum(c * self.gv[fold]) + np.sum(c @ self.vv[fold] * c))
+        squared = np.einsum("ai,aij,aj->", c, self.vv[fold], c)
+        return float(self.gg[fold] - 2.0 * np.sum(c * self.gv[fold]) + squared)

@@ -44,8 +44,8 @@ class Measurements:
 
     z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N), share
     of its own information that a sample adds, in 0..1 (below 1 for samples that share their noise with others).
-    usable: (K, N), False where a model must not use a sample. gate: (K,), largest normalised innovation squared that
-    is used, inf for no gate.
+    usable: (K, N), False where a model must not use a sample. gate: (K, N or 1), largest normalised innovation squared
+    that is used, inf for no gate.
     """
 
     z: Array
@@ -58,7 +58,15 @@ class Measurements:
     def part(self, at: slice) -> Measurements:
         """The samples of a slice."""
         r = self.r if self.r.shape[1] == 1 else self.r[:, at]
-        return Measurements(self.z[:, at], self.h[:, at], r, self.weight[:, at], self.usable[:, at], self.gate)
+        gate = self.gate if self.gate.shape[1] == 1 else self.gate[:, at]
+        return Measurements(self.z[:, at], self.h[:, at], r, self.weight[:, at], self.usable[:, at], gate)
+
+    def model(self, k: int) -> Measurements:
+        """Those of one model, as K = 1."""
+        own = slice(k, k + 1)
+        r = self.r if len(self.r) == 1 else self.r[own]
+        weight = self.weight if len(self.weight) == 1 else self.weight[own]
+        return Measurements(self.z[own], self.h[own], r, weight, self.usable[own], self.gate[own])
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,16 @@ class Updated:
     nis: Array
     at: GaussianState | None = None
 
+    @staticmethod
+    def joined(models: Sequence[Updated]) -> Updated:
+        """Of models one after the other, each as K = 1."""
+        x, p, used, nis = (
+            np.concatenate(each) for each in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
+        )
+        found = [each.at for each in models if each.at is not None]
+        at = GaussianState(*(np.concatenate(each, axis=1) for each in zip(*found, strict=True))) if found else None
+        return Updated(x, p, used, nis, at)
+
 
 def recursion(
     x: Array, p: Array, data: Measurements, process: Array | None = None, ends: NDArray[np.intp] | None = None
@@ -88,7 +106,7 @@ def recursion(
     k, n_samples = data.z.shape[:2]
     x, p = x.copy(), p.copy()
     identity = np.eye(x.shape[1])
-    one_r = data.r.shape[1] == 1
+    one_r, one_gate = data.r.shape[1] == 1, data.gate.shape[1] == 1
     used = np.zeros((k, n_samples), dtype=bool)
     nis = np.zeros((k, n_samples))
     on_the_way = [(x.copy(), p)]
@@ -101,7 +119,7 @@ def recursion(
         s_inverse = np.linalg.inv(hpht + r_i)
         innovation = data.z[:, i, :, None] - h @ x[:, :, None]
         nis_i = (innovation.transpose(0, 2, 1) @ s_inverse @ innovation)[:, 0, 0]
-        used_i = data.usable[:, i] & (nis_i <= data.gate)
+        used_i = data.usable[:, i] & (nis_i <= data.gate[:, 0 if one_gate else i])
         if (weight != 1.0).any():  # the gate asks whether this sample fits; the update, how much it may weigh
             r_i = r_i / weight[:, None, None]
             s_inverse = np.linalg.inv(hpht + r_i)
@@ -201,7 +219,7 @@ def _solve(x: Array, p: Array, data: Measurements) -> _Solved | None:
         information = [[_running_sum(prior[:, i, j], gained[i][j], mask) for j in range(i + 1)] for i in range(n)]
         information_state = [_running_sum(prior_state[:, i], gained_state[i], mask) for i in range(n)]
         nis = _normalised_innovation_squared(information, information_state, h, z, data.r, m)
-        passed = data.usable & (nis <= data.gate[:, None])
+        passed = data.usable & (nis <= data.gate)
         if not gated or np.array_equal(passed, used):
             return _Solved(information, information_state, used, np.where(data.usable, nis, 0.0))
         used, all_used = passed, False

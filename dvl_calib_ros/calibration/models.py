@@ -58,9 +58,11 @@ class Model:
     it acts on. needs_prior: True if it uses prior sway and heave.
 
     What a model may change of how it is filtered: noise: observations -> its own R (N or 1, 3, 3) (m/s)², of which a
-    model with fewer rows uses the first ones; None: `Observations.noise`. motion_is_noise: its noise is the vehicle's
-    motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first five states
-    are those of the correction, see `correction_parameters`.
+    model with fewer rows uses the first ones; None: `Observations.noise`. vertical_from_reference: it takes the
+    reference's vertical velocity for a measurement, so does without where there is none (M3, M4 and G1 assume their
+    own). rows_in_body: its three rows are those of the body, else those of the DVL. motion_is_noise: its noise is the
+    vehicle's motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first
+    five states are those of the correction, see `correction_parameters`.
     """
 
     name: str
@@ -75,6 +77,8 @@ class Model:
     nuisance: tuple[Nuisance, ...] = ()
     noise: Callable[[Observations], Array] | None = None
     motion_is_noise: bool = False
+    vertical_from_reference: bool = False
+    rows_in_body: bool = False
     in_correction_parameters: bool = False
 
     @property
@@ -278,8 +282,17 @@ def _aided(
     assumes: str,
     wrong_when: str,
 ) -> Model:
-    linearise = partial(_gnss_aided, scale_axes, heave_is_zero)
-    return Model(name, Needs.REFERENCE, 3, linearise, _SHOWN_WITH_GNSS, assumes, wrong_when, scale_axes)
+    return Model(
+        name,
+        Needs.REFERENCE,
+        3,
+        partial(_gnss_aided, scale_axes, heave_is_zero),
+        _SHOWN_WITH_GNSS,
+        assumes,
+        wrong_when,
+        scale_axes,
+        vertical_from_reference=not heave_is_zero,
+    )
 
 
 _TABLE = (
@@ -325,6 +338,7 @@ _TABLE = (
         scale_axes=_SCALE_PER_AXIS,
         nuisance=(Nuisance("heave", "m/s", "heave_offset_std"),),
         noise=_g1_noise,
+        rows_in_body=True,
         in_correction_parameters=True,
     ),
     Model(

@@ -30,6 +30,10 @@ class Assumptions(NamedTuple):
 ASSUMPTIONS = Assumptions()
 
 
+# (m/s)²: of an axis that is not measured; its information then is a 1e-5th of what heave is assumed to be known by
+UNMEASURED_VARIANCE = 1e4
+
+
 class Unmeasured(NamedTuple):
     """Axes that a reference velocity does not measure.
 
@@ -132,8 +136,23 @@ class Observations:
 
     @cached_property
     def noise_in_body(self) -> Array:
-        """Tᵀ R T (N or 1, 3, 3) (m/s)²."""
-        return self.rotation_dvl_from_body.T @ self.noise @ self.rotation_dvl_from_body
+        """Tᵀ R T (N or 1, 3, 3) (m/s)²; where an axis is not measured, as wide as that has to be to say nothing."""
+        noise: Array = self.rotation_dvl_from_body.T @ self.noise @ self.rotation_dvl_from_body
+        if self.unmeasured is None:
+            return noise
+        axes, turned = self.unmeasured
+        return noise + UNMEASURED_VARIANCE * np.einsum("nai,na,naj->nij", turned, axes.astype(float), turned)
+
+    @cached_property
+    def measured_in_body(self) -> Array:
+        """(N or 1, 3) 1 for the axes of the body along which the reference measures, 0 for the others."""
+        if self.unmeasured is None:
+            return np.ones((1, 3))
+        axes, turned = self.unmeasured
+        # an axis of the earth counts for the axis of the body that is nearest to it
+        along = np.einsum("nai,na->ni", turned**2, axes.astype(float))
+        measured: Array = (along < 0.5).astype(float)
+        return measured
 
     @cached_property
     def heave_gain(self) -> Array:

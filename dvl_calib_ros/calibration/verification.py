@@ -67,14 +67,18 @@ def held_out_error(
         uncorrected += moments.squared_error(fold, nominal)
         corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
         noise += moments.noise[fold]
-        calibration += _calibration_variance(covariance, moments.vv[fold])
+        calibration += _calibration_variance(covariance, moments.vv[fold], nominal)
     sums = (uncorrected, corrected, noise + calibration, calibration)
     return HeldOutError(samples, *(math.sqrt(max(total, 0.0) / samples) for total in sums))
 
 
-def _calibration_variance(covariance: Array, vv: Array) -> float:
-    """Sum of trace(J P Jᵀ) (m/s)² over samples of which only Σ v vᵀ is known: J is linear in v."""
-    return float(np.einsum("kai,lbi,ab,kl->", _JACOBIAN_BY_ERROR, _JACOBIAN_BY_ERROR, covariance, vv))
+def _calibration_variance(covariance: Array, vv: Array, rotation_body_from_dvl: Array) -> float:
+    """Sum of trace(J P Jᵀ) (m/s)² over samples of which only Σ v vᵀ is known: J is linear in v.
+
+    vv: (3, 3, 3) Σ v vᵀ of the samples that are judged along each axis of the body.
+    """
+    in_body = np.einsum("ij,kaj->kai", rotation_body_from_dvl, _JACOBIAN_BY_ERROR)
+    return float(np.einsum("kai,lbi,ab,ikl->", in_body, in_body, covariance, vv))
 
 
 # d(velocity)/d(error a) for a velocity along k, axis i: [k, a, i]

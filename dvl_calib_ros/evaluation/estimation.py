@@ -157,7 +157,7 @@ def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
         r=split(flat.r),
         weight=split(flat.weight),
         usable=split(flat.usable) & usable,
-        gate=np.repeat(flat.gate, len(usable)),
+        gate=split(flat.gate),
     )
 
 

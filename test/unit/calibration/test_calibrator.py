@@ -483,3 +483,112 @@ def test_a_dropout_is_longer_than_a_second_and_than_the_rate_explains():
     calibrator = calibrate([s for s in make_samples(NOISY) if not 10 < (s.stamp_ns - START_NS) / SECOND < 11.1])
     assert calibrator.counts["dvl"]["dropouts"] == 1
     assert calibrator.longest_dropout_ns == 1_200_000_000
+
+
+# ---------------------------------------------------------------- axes that the reference does not measure
+
+
+def with_vertical(samples, value, covariance=None):
+    """The samples with another vertical velocity of the reference."""
+    return [
+        s._replace(velocity=(*s.velocity[:2], value(i)), covariance=covariance) if isinstance(s, ReferenceSample) else s
+        for i, s in enumerate(samples)
+    ]
+
+
+HORIZONTAL = np.diag([0.01, 0.01, -1.0])
+
+
+@pytest.mark.parametrize("frame", VelocityFrame)
+def test_what_a_reference_says_of_an_axis_that_it_does_not_measure_changes_nothing(frame):
+    samples = make_samples(variant(NOISY, frame=frame, imu_every=1))
+    found = []
+    for value, variance in ((lambda i: 0.0, -1.0), (lambda i: 5.0 * np.sin(i), 1e6), (lambda i: -3.0, 1e300)):
+        calibrator = calibrate(with_vertical(samples, value, np.diag([0.01, 0.01, variance])), verified=True)
+        found.append(calibrator)
+        assert calibrator.estimate("M1").used > 250
+    for other in found[1:]:
+        assert_same(found[0], other, atol=1e-13)
+        for name in AIDED:
+            one, two = found[0].verification(name).held_out, other.verification(name).held_out
+            assert one.corrected == pytest.approx(two.corrected, rel=1e-9)
+
+
+def test_the_axes_that_are_measured_give_the_information_that_two_rows_have():
+    """M1 in the body frame, mounted straight: weighted least squares on the horizontal rows alone."""
+    samples = with_vertical(make_samples(variant(NOISY, gnss_phase=0)), lambda i: 0.3, HORIZONTAL)
+    calibrator = calibrate(samples, Parameters(gate_probability=0.0))
+    information, right = np.diag([1 / 0.05**2] * 3 + [1 / 0.006**2]), np.zeros(4)
+    references = {s.stamp_ns: s for s in only(samples, ReferenceSample)}
+    for sample in only(samples, DvlSample):
+        if sample.stamp_ns not in references:
+            continue
+        x, y, _ = references[sample.stamp_ns].velocity
+        z = sample.velocity[2]  # the best that is known of it
+        h = np.array([[0.0, -z, y, -x], [z, 0.0, -x, -y]])
+        weight = 1.0 / (0.01 + 0.025**2)
+        information += weight * h.T @ h
+        right += weight * h.T @ (np.array([x, y]) - sample.velocity[:2])
+    np.testing.assert_allclose(calibrator.state("M1").x, np.linalg.solve(information, right), atol=1e-12)
+    np.testing.assert_allclose(calibrator.state("M1").p, np.linalg.inv(information), atol=1e-12)
+
+
+def test_a_vertical_velocity_of_exactly_zero_does_not_count_until_one_is_not():
+    samples = make_samples(NOISY)
+    level = with_vertical(samples, lambda _: 0.0)
+    auto = calibrate(level)
+    assert_same(auto, calibrate(level, Parameters(gnss_axes="xy")))
+    assert auto.estimate("M1").std[1] > 3.0 * calibrate(level, Parameters(gnss_axes="xyz")).estimate("M1").std[1]
+    later = with_vertical(samples, lambda i: 0.0 if i < 700 else 0.01)
+    assert calibrate(later).estimate("M1").std[1] < 0.5 * auto.estimate("M1").std[1]
+
+
+# ---------------------------------------------------------------- no number may kill
+
+
+@pytest.mark.parametrize("variances", [(3e15,) * 3, (np.finfo(float).max, 0.01, 0.01), (1e308,) * 3, (1e-11, 1e2, 1e2)])
+@pytest.mark.parametrize("stream", [DvlSample, ReferenceSample])
+def test_no_variance_makes_a_state_that_is_not_finite(variances, stream):
+    samples = make_samples(NOISY)
+    claimed = [s._replace(covariance=np.diag(variances)) if isinstance(s, stream) else s for s in samples]
+    for block_size in (1, 64):
+        check_finite(calibrate(claimed, block_size=block_size, verified=True))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gate_probability": 0.0, "mounting_rpy": (0.0, 0.0, np.pi)},
+        {"gate_probability": 0.0, "mounting_rpy": (np.pi, 0.0, 0.0)},
+        {"gate_probability": 0.0, "initial_std_misalignment": 1.0, "lever_arm": (100.0, 100.0, -100.0)},
+        {"gnss_aided_std": 1e-4, "gnss_free_std": 1e-4, "initial_std_misalignment": 1.0, "initial_std_scale": 0.5},
+    ],
+    ids=str,
+)
+def test_no_parameters_make_a_state_that_is_not_finite(options):
+    samples = make_samples(NOISY)
+    for block_size in (1, 64):
+        check_finite(calibrate(samples, Parameters(**options), block_size=block_size, verified=True))
+
+
+def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_counted(monkeypatch):
+    samples = make_samples(NOISY)
+    calibrator = calibrate(samples[:900])
+    before, used = calibrator.state("M1"), calibrator.estimate("M1").used
+    linearise = MODELS["M1"].linearise
+    monkeypatch.setitem(MODELS["M1"].__dict__, "linearise", lambda seen: tuple(np.nan * each for each in linearise(seen)))
+    feed(calibrator, samples[900:1000])
+    calibrator.estimate("M1")
+    monkeypatch.undo()
+    counts = calibrator.counts["calibration"]
+    assert counts["M1 restarted"] > 0
+    np.testing.assert_array_equal(calibrator.state("M1").x, before.x)
+    feed(calibrator, samples[1000:])
+    assert calibrator.estimate("M1").used > used
+    check_finite(calibrator)
+
+
+def check_finite(calibrator: Calibrator):
+    for name, estimate in calibrator.result().estimates.items():
+        assert np.isfinite(estimate.state).all() and np.isfinite(estimate.covariance).all(), name
+        assert (np.diag(estimate.covariance) > 0.0).all(), name

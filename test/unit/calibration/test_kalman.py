@@ -92,7 +92,7 @@ def test_the_covariance_stays_symmetric_positive_definite_over_precise_updates(r
         np.full((1, 1, 1, 1), 1e-12),
         np.ones((1, 5000)),
         np.ones((1, 5000), bool),
-        np.array([np.inf]),
+        np.array([[np.inf]]),
     )
     x, p = np.zeros((1, 3)), np.eye(3)[None]
     for _ in range(4):

@@ -200,7 +200,7 @@ def test_a_padded_model_in_the_bank_is_the_model_alone(name, rng):
     alone = kalman.recursion(
         np.zeros((1, model.n_state)),
         prior(model, parameters).p[None],
-        kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([gate])),
+        kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
     after = bank.standing(model.needs, 1)
     k = [each.name for each in MODELS.values() if each.needs is model.needs].index(name)
