@@ -60,6 +60,9 @@ def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Finding]:
         found.append(finding("NO_TURN_RATE", count=dvl["no_turn_rate"]))
     if dvl.get("lever_arm_uncompensated"):
         found.append(finding("LEVER_ARM_NOT_COMPENSATED", count=dvl["lever_arm_uncompensated"]))
+    for name, count in counts["calibration"].items():
+        if count and name.endswith(" restarted"):
+            found.append(finding("MODEL_RESTARTED", model=name.removesuffix(" restarted"), count=count))
     if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
         found.append(finding("ALL_SLOW"))
     return found

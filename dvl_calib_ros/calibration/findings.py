@@ -159,6 +159,13 @@ _KINDS = (
         "The topic lags the DVL's by more than max_latency.",
         "raise max_latency, in proportion when a bag is played faster than recorded",
     ),
+    FindingKind(
+        "MODEL_RESTARTED",
+        "{model}: its numbers ran away {count} times; it went on from its last good state",
+        "Data and parameters contradict each other so much that the filter's arithmetic fails, as with no gate and a "
+        "mounting that is turned round.",
+        "check mounting_rpy and lever_arm, and leave gate_probability on",
+    ),
     # two publishers, wrong types, quality of service
     FindingKind(
         "STAMP_REPEATED",

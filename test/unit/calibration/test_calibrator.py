@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import SECOND, START_NS, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
+from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
@@ -576,12 +577,15 @@ def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_
     calibrator = calibrate(samples[:900])
     before, used = calibrator.state("M1"), calibrator.estimate("M1").used
     linearise = MODELS["M1"].linearise
-    monkeypatch.setitem(MODELS["M1"].__dict__, "linearise", lambda seen: tuple(np.nan * each for each in linearise(seen)))
+    monkeypatch.setitem(
+        MODELS["M1"].__dict__, "linearise", lambda seen: tuple(np.nan * each for each in linearise(seen))
+    )
     feed(calibrator, samples[900:1000])
     calibrator.estimate("M1")
     monkeypatch.undo()
     counts = calibrator.counts["calibration"]
     assert counts["M1 restarted"] > 0
+    assert "M1: its numbers ran away" in " ".join(map(str, data_advice(calibrator.counts)))
     np.testing.assert_array_equal(calibrator.state("M1").x, before.x)
     feed(calibrator, samples[1000:])
     assert calibrator.estimate("M1").used > used
