@@ -167,6 +167,14 @@ class Parameters:
         "geometry_msgs/msg/TwistWithCovarianceStamped",
         "Message type of the reference's topic, live.",
     )
+    position_window: float = _parameter(
+        1.0,
+        "Time over which two satellite positions are differenced where the reference is positions alone "
+        "(sensor_msgs/msg/NavSatFix). Longer: less noise, less true in turns.",
+        unit="s",
+        low=0.1,
+        high=30.0,
+    )
     mounting_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
         "Nominal orientation of the DVL in the body, as in a URDF origin (fixed axes X, Y, Z).",

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from ..errors import InputError
-from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
 from .survey import Look, Survey
 
 NONE = "none"
@@ -68,9 +68,9 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
     """The DVL's topic. Raises InputError if nothing in the recording is one."""
     present = survey.topics
     standard = _spelled(default, present)
-    if standard is not None and present[standard] in VELOCITY_TYPES:
+    if standard is not None and present[standard] in DVL_TYPES:
         return standard
-    looks = [look for look in survey.looks.values() if look.msgtype in VELOCITY_TYPES]
+    looks = [look for look in survey.looks.values() if look.msgtype in DVL_TYPES]
     own_type = [look for look in looks if look.msgtype not in REFERENCE_TYPES]
     named = [look for look in looks if _has(look, DVL_WORDS) and not is_derived(look)]
     found = own_type or named
@@ -79,7 +79,7 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
         if len(velocities) == 1 and len(looks) > 1:
             return velocities[0].topic
         raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic. {_listing(survey)}")
-    order = list(VELOCITY_TYPES)
+    order = list(DVL_TYPES)
     # a driver that sends several forms sends the plain one, the raw type, in full
     order.sort(key=lambda name: (name in REFERENCE_TYPES, name != TWIST_TYPE))
     return min(found, key=lambda look: (order.index(look.msgtype), not look.speed, -look.count, look.topic)).topic
@@ -123,7 +123,9 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
 
 
 def _rank(look: Look) -> float:
-    """Of two forms of one velocity the one with a covariance goes first."""
+    """Of two forms of one velocity the one with a covariance goes first, and positions last."""
+    if REFERENCE_TYPES[look.msgtype].is_position:
+        return 2.0
     return 0.0 if look.msgtype == TWIST_TYPE else 1.0
 
 
@@ -154,4 +156,4 @@ def _listing(survey: Survey) -> str:
 
 def wanted_types(role: str) -> Sequence[str]:
     """Message types that a role's topic may have."""
-    return {"dvl": list(VELOCITY_TYPES), "gnss": list(REFERENCE_TYPES), "imu": [IMU_TYPE]}[role]
+    return {"dvl": list(DVL_TYPES), "gnss": list(REFERENCE_TYPES), "imu": [IMU_TYPE]}[role]

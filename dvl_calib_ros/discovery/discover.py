@@ -239,6 +239,9 @@ class _Search:
     def _declared_reference(self, reference: Look) -> VelocityFrame | None:
         if self._parameters.gnss_frame != FROM_FRAME_ID:
             return VelocityFrame(self._parameters.gnss_frame)
+        of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
+        if of_type is not None:
+            return of_type
         name = reference.frame_id.strip("/")
         base = self._values.get("base_frame", self._parameters.base_frame).strip("/")
         if name in (base, self._parameters.base_frame.strip("/")):

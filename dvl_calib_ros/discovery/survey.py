@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from ..calibration.frames import Array
 from ..calibration.samples import Mask
 from ..messages.decode import stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
+from ..messages.fixes import FixDifference
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 60 bursts of 2 s show turns and
 # straights; 10 Hz is what a DVL gives at most.
@@ -129,6 +132,8 @@ def _look(
 ) -> Look | None:
     """None for a topic whose messages cannot be read."""
     read = _imu_row if msgtype == IMU_TYPE else _velocity_row(msgtype)
+    if msgtype in VELOCITY_TYPES and VELOCITY_TYPES[msgtype].is_position:
+        messages = _differences(messages)
     rows, stamps, frame_id = [], [], ""
     for log_ns, message in messages:
         try:
@@ -145,13 +150,31 @@ def _look(
     return Look(topic, msgtype, count, rate_hz, frame_id, np.array(stamps)[whole][order], values[whole][order])
 
 
+def _differences(messages: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
+    """Satellite positions as the velocities between them, at the middle of each window."""
+    difference = FixDifference()
+    found = []
+    for log_ns, message in messages:
+        stamp = stamp_ns(message.header.stamp) or log_ns
+        fixed = difference(stamp, message.latitude, message.longitude, message.altitude, None)
+        if fixed is not None and message.status.status >= 0:
+            velocity = SimpleNamespace(**dict(zip("xyz", fixed.velocity, strict=True)))
+            seconds, nanoseconds = divmod(fixed.stamp_ns, 1_000_000_000)
+            header = SimpleNamespace(
+                stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=message.header.frame_id
+            )
+            found.append((log_ns, SimpleNamespace(velocity=velocity, header=header)))
+    return found
+
+
 def _frame_id(msgtype: str, message: Any) -> str:
     kind = VELOCITY_TYPES.get(msgtype)
     return str(message.header.frame_id if kind is None else kind.frame_id(message))
 
 
 def _velocity_row(msgtype: str) -> Callable[[Any], list[float]]:
-    velocity = VELOCITY_TYPES[msgtype].velocity
+    kind = VELOCITY_TYPES[msgtype]
+    velocity = attrgetter("velocity") if kind.is_position else kind.velocity
 
     def row(message: Any) -> list[float]:
         v = velocity(message)

@@ -15,6 +15,7 @@ from ..bags.reader import BagReader
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
+from ..messages.fixes import FixDifference
 
 Stamps = NDArray[np.int64]
 # What reading a message, or columns, of another layout than its type's raises.
@@ -47,10 +48,15 @@ def recorded(bag: BagReader, topics: list[str], parameters: Parameters) -> dict[
     """Read these topics (velocities and IMUs) to the end."""
     types = bag.topics
     parts: dict[str, list[_Rows]] = {topic: [] for topic in topics}
+    fixes = {topic: FixDifference(parameters.position_window) for topic in topics}
     unreadable: Counter[str] = Counter()
     for window in windows(bag, topics):
         for part in window.parts:
             topic = part.channel.topic
+            kind = VELOCITY_TYPES.get(types[topic])
+            if kind is not None and kind.is_position:
+                parts[topic] += _differences(part, fixes[topic])
+                continue
             for rows in _rows(part, types[topic], parameters):
                 if rows is None:
                     unreadable[topic] += 1
@@ -82,6 +88,22 @@ def _rows(part: Part, msgtype: str, parameters: Parameters) -> Iterator[_Rows | 
             yield read(message, 1, part.arrival[row : row + 1], part.log_ns[row : row + 1], msgtype, parameters)
         except _UNREADABLE:
             yield None
+
+
+def _differences(part: Part, difference: FixDifference) -> Iterator[_Rows]:
+    """Satellite positions as the velocities between them."""
+    for row, (message, _) in enumerate(part.messages()):
+        at, log_ns = part.arrival[row : row + 1], part.log_ns[row : row + 1]
+        if message is None or message.status.status < 0:
+            continue
+        given = message.position_covariance if message.position_covariance_type else None
+        stamp = int(_stamps(message, 1)[0]) or int(log_ns[0])
+        found = difference(stamp, message.latitude, message.longitude, message.altitude, given)
+        if found is not None:
+            variances = np.full(3, np.nan) if found.covariance is None else np.diag(found.covariance)
+            # by the log time of the middle of its window, as if it had been measured then
+            middle = log_ns - (stamp - found.stamp_ns)
+            yield _Rows(at, middle, np.array([found.stamp_ns]), np.array([found.velocity]), variances[None], {})
 
 
 def _stamps(message: Any, n: int) -> Stamps:

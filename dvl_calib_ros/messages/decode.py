@@ -17,9 +17,12 @@ from ..calibration.imu_alignment import ImuAlignment
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from .drivers import VelocityType, velocity_type
+from .fixes import FixDifference
 
 # Under which messages are counted that no sensor can mean, and those in another frame
 INVALID, WRONG_FRAME = "invalid", "wrong_frame"
+# Positions without a fix, and those that have none a window before them
+NO_FIX, FIRST_FIX = "no_fix", "first_fix"
 # How the covariance begins of what an IMU does not measure
 NO_DATA = -1.0
 # Different frame_ids of the reference that are remembered.
@@ -116,6 +119,7 @@ class MessageDecoder:
         self._dvl_reader: _Reader | None = None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, VelocityFrame | None] = {}
+        self._fixes = FixDifference(self.parameters.position_window)
 
     # ------------------------------------------------------------------ one by one
 
@@ -144,11 +148,23 @@ class MessageDecoder:
             frame = self.reference_frame(kind.frame_id(message))
             if frame is None:
                 return Refusal(WRONG_FRAME)
-            velocity, covariance = self._reference_reader(message)
             stamp = self._stamp_ns(Stream.REFERENCE, message.header, received_ns)
+            if kind.is_position:
+                return self._difference(message, stamp, frame)
+            velocity, covariance = self._reference_reader(message)
         except UNREADABLE as error:
             return self.undecodable(Stream.REFERENCE, f"{kind.name}, {type(error).__name__}: {error}")
         return ReferenceSample(stamp, velocity, covariance, frame)
+
+    def _difference(self, message: Any, stamp_ns: int, frame: VelocityFrame) -> ReferenceSample | Refusal:
+        """The velocity between a satellite position and the one a window before."""
+        if message.status.status < 0:
+            return Refusal(NO_FIX)
+        given = message.position_covariance if message.position_covariance_type else None
+        found = self._fixes(stamp_ns, message.latitude, message.longitude, message.altitude, given)
+        if found is None:
+            return Refusal(FIRST_FIX)
+        return ReferenceSample(found.stamp_ns, found.velocity, found.covariance, frame)
 
     def imu(self, message: Any, received_ns: int) -> ImuSample | Refusal:
         """Decode a sensor_msgs/Imu. A covariance that starts with -1 says that there is no such data.
@@ -232,6 +248,8 @@ class MessageDecoder:
         p = self.parameters
         if p.gnss_frame != FROM_FRAME_ID:
             return VelocityFrame(p.gnss_frame)
+        if self.reference_type.reference_frame is not None:
+            return self.reference_type.reference_frame
         name = frame_id.lstrip("/")
         frame = VelocityFrame.BODY if name == p.base_frame.lstrip("/") else EARTH_FRAMES.get(name.lower())
         if frame is None:

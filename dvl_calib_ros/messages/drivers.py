@@ -7,6 +7,7 @@ dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.water
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,11 +18,16 @@ import numpy as np
 
 from ..calibration.findings import Finding, finding
 from ..calibration.parameters import Parameters
+from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 BOTTOM_TRACK, WATER_TRACK = 1, 2
+# coordinate_mode of ds_sensor_msgs/Dvl for the instrument's own axes
+DS_INSTRUMENT = 1
+# Variance (m/s)² of an axis that is not measured: nothing can be learnt from it
+NOT_MEASURED = 1e6
 # a velocity in three axes takes as many beams
 ENOUGH_BEAMS = 3
 _LARGEST = sys.float_info.max
@@ -54,7 +60,9 @@ class VelocityType:
     frame_id: message -> frame of the velocity. is_read_in_columns: whether these are written for columns of messages as
     well, which takes a type without lists. points_down: its axes
     are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
-    is_reference: whether reference velocities come in this type, too. definitions: for bags that embed none, the
+    is_reference, is_dvl: whether velocities of the reference and of DVLs come in this type. is_position: it holds
+    satellite positions, of which velocities are made (fixes.py). reference_frame: the axes of a reference in this type,
+    whatever its frame_id says, None if that says it. definitions: for bags that embed none, the
     versions of it that are about. install: how to get its package, where ROS does not bring it.
     """
 
@@ -70,6 +78,9 @@ class VelocityType:
     points_down: bool = False
     rules: tuple[Rule, ...] = ()
     is_reference: bool = False
+    is_dvl: bool = True
+    is_position: bool = False
+    reference_frame: VelocityFrame | None = None
     definitions: tuple[str, ...] = ()
     install: str = ""
 
@@ -132,6 +143,32 @@ def _dvl_msgs_covariance(message: Any) -> Any:
     if len(covariance):
         return covariance
     return None if message.fom == 0.0 else message.fom**2 * np.eye(3)
+
+
+class _Velocity(NamedTuple):
+    """Of a message that has no vector. m/s."""
+
+    x: float
+    y: float
+    z: float
+
+
+def _course_and_speed(message: Any) -> _Velocity:
+    """East, north, up from the course over ground (degrees from north), the speed and the climb."""
+    course = math.radians(message.track)
+    return _Velocity(message.speed * math.sin(course), message.speed * math.cos(course), message.climb)
+
+
+def _speed_covariance(message: Any) -> Any:
+    """From what the receiver claims for 95 per cent, which is twice the standard deviation."""
+    across, up = 0.5 * message.err_speed, 0.5 * message.err_climb
+    if not across > 0.0:
+        return None
+    return np.diag([across**2, across**2, up**2 if up > 0.0 else NOT_MEASURED])
+
+
+def _no_velocity(message: Any) -> Any:
+    raise ValueError("a position is no velocity")  # MessageDecoder makes one of two
 
 
 _LINEAR, _TWIST_LINEAR, _VELOCITY = attrgetter("twist.linear"), attrgetter("twist.twist.linear"), attrgetter("velocity")
@@ -274,15 +311,96 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             ),
             install="build the driver's dvl_msgs in your workspace",
         ),
+        *(
+            VelocityType(
+                name=name,
+                sent_by=sent_by,
+                velocity=_VELOCITY,
+                covariance=attrgetter("velocity_covariance"),
+                covariance_says="`velocity_covariance`; zero: not given",
+                rules=(
+                    Rule(
+                        "flagged_invalid",
+                        "`velocity_covariance` begins with -1",
+                        lambda message, _: np.asarray(message.velocity_covariance)[..., 0] == -1.0,
+                        _CHECK_LOCK,
+                    ),
+                    _zero_velocity(_VELOCITY),
+                ),
+                install=f"build {name.partition('/')[0]} in your workspace",
+            )
+            for name, sent_by in (
+                ("uuv_sensor_ros_plugins_msgs/msg/DVL", "uuv_simulator and Plankton"),
+                ("cola2_msgs/msg/DVL", "Girona vehicles (COLA2)"),
+                ("stonefish_ros2/msg/DVL", "the Stonefish simulator"),
+            )
+        ),
+        VelocityType(
+            name="ds_sensor_msgs/msg/Dvl",
+            sent_by="ds_dvl (Sentry, DAVE)",
+            velocity=_VELOCITY,
+            covariance=attrgetter("velocity_covar"),
+            lacks_covariance=lambda message: np.asarray(message.velocity_covar)[..., 0] == -1.0,
+            covariance_says="`velocity_covar`; -1 or zero: not given",
+            rules=(
+                Rule(
+                    "water_track",
+                    "`velocity_mode` is water track",
+                    lambda message, _: message.velocity_mode == WATER_TRACK,
+                    "that is velocity through the water, not over ground; let the DVL track the bottom",
+                ),
+                Rule(
+                    "other_axes",
+                    "`coordinate_mode` is not that of the instrument",
+                    lambda message, _: message.coordinate_mode != DS_INSTRUMENT,
+                    "let the driver send velocities in the instrument's axes (DVL_COORD_INSTRUMENT is 1)",
+                ),
+                Rule(
+                    "few_beams",
+                    f"`num_good_beams` below {ENOUGH_BEAMS}",
+                    lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
+                    _CHECK_LOCK,
+                ),
+                _zero_velocity(_VELOCITY),
+            ),
+            install="build ds_msgs in your workspace",
+        ),
+        VelocityType(
+            name="gps_msgs/msg/GPSFix",
+            sent_by="gpsd_client, swri: course, speed and climb",
+            velocity=_course_and_speed,
+            covariance=_speed_covariance,
+            is_read_in_columns=False,
+            covariance_says="`err_speed`, `err_climb` (95 %); zero: not given",
+            frame_says="east-north-up",
+            is_reference=True,
+            is_dvl=False,
+            reference_frame=VelocityFrame.ENU,
+            install="sudo apt install ros-$ROS_DISTRO-gps-msgs",
+        ),
+        VelocityType(
+            name="sensor_msgs/msg/NavSatFix",
+            sent_by="receivers that give positions alone (RTK)",
+            velocity=_no_velocity,
+            covariance=lambda _: None,
+            is_read_in_columns=False,
+            covariance_says="of the difference of two positions, from `position_covariance`",
+            frame_says="east-north-up",
+            is_reference=True,
+            is_dvl=False,
+            is_position=True,
+            reference_frame=VelocityFrame.ENU,
+        ),
     )
 }
 # for bags that do not say how messages are laid out
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
     name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
 }
+DVL_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_dvl}
 REFERENCE_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
 # what the parameters of these names may name
-TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": VELOCITY_TYPES, "gnss_type": REFERENCE_TYPES}
+TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
 
 
 def velocity_type(parameter: str, name: str) -> VelocityType:
@@ -299,7 +417,7 @@ def driver_table() -> str:
     """The documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
     for each in VELOCITY_TYPES.values():
-        axes = "forward-right-down" if each.points_down else "forward-left-up"
+        axes = "forward-right-down" if each.points_down else "forward-left-up" if each.is_dvl else "of the reference"
         rules = "; ".join(f"`{rule.counter}`: {rule.says}" for rule in each.rules)
         lines.append(
             f"| {each.name.replace('/msg/', '/')} | {each.sent_by} | {each.frame_says}, {axes} | "

@@ -25,7 +25,7 @@ from ..errors import InputError
 from ..files.result_file import estimate_document, load_initial_calibration
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder, Refusal
-from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE, VELOCITY_TYPES
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
 from .recorder import Recorder, RunHistory
 
 BLOCK_SIZE = 512
@@ -169,12 +169,12 @@ def _check_types(bag: BagReader, where: str, topics: Topics, found: list[Finding
             found.append(finding("BAG_NO_DEFINITION", type=types.pop()))
 
 
-_WANTED: Mapping[str, Set[str]] = {"dvl": VELOCITY_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
+_WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
 
 
 def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
     """Topics that may be the DVL's: of a type that only DVLs have, else with dvl in the name, else of any fitting."""
-    fitting = sorted(name for name, kind in present.items() if kind in VELOCITY_TYPES and name != topics.gnss)
+    fitting = sorted(name for name, kind in present.items() if kind in DVL_TYPES and name != topics.gnss)
     only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
     return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
 

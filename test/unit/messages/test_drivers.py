@@ -38,7 +38,7 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.bags import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.yaml_files import load_yaml
-from dvl_calib_ros.messages.drivers import VELOCITY_TYPES, driver_table, velocity_type
+from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
 from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.replay.replay import Topics, replay
@@ -399,7 +399,7 @@ def test_a_topic_of_a_type_that_holds_no_velocity_is_refused_with_those_that_do(
     bag = write_driver_bag(tmp_path / "bag", run()[:200], MARINE)
     with pytest.raises(InputError, match=r"imu/data holds sensor_msgs/msg/Imu, expected .*dvl_msgs/msg/DVL"):
         replay([bag], Parameters(), Topics(dvl="imu/data", imu="none"))
-    with pytest.raises(InputError, match=r"holds marine_acoustic_msgs/msg/Dvl, expected .*Odometry; set --gnss-topic"):
+    with pytest.raises(InputError, match=r"holds marine_acoustic_msgs/msg/Dvl, expected .*Odometry or .*NavSatFix; set --gnss-topic"):
         replay([bag], Parameters(), Topics(dvl="gnss/twist", gnss="dvl/twist"))
 
 
@@ -460,7 +460,8 @@ def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_
 
 def test_a_driver_is_added_by_one_entry(monkeypatch, bare, expected, tmp_path):
     vendor = "vendor_msgs/msg/Log"
-    monkeypatch.setitem(VELOCITY_TYPES, vendor, replace(VELOCITY_TYPES[A50], name=vendor))
+    for types in (VELOCITY_TYPES, DVL_TYPES):  # both are of the one entry
+        monkeypatch.setitem(types, vendor, replace(VELOCITY_TYPES[A50], name=vendor))
     bag = write_driver_bag(tmp_path / "bag", bare, A50)
     (tmp_path / "vendor.mcap").write_bytes(vendor_mcap(bag, vendor))
     assert estimates(tmp_path / "vendor.mcap") == expected
