@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.trial.motion import RECORDED
-from dvl_calib_ros.trial.plan import KINDS, Case, plan
+from dvl_calib_ros.trial.plan import KINDS, Case, Family, plan
 from dvl_calib_ros.trial.run import Trial
 from dvl_calib_ros.trial.scored import join
 from dvl_calib_ros.trial.truth import Category, unseal
@@ -78,3 +78,33 @@ def test_pairs_and_unknown_effects_are_seen(scored):
 
 def test_nothing_is_guessed_where_the_data_cannot_tell(scored):
     assert all(case.no_guess for case in scored[Category.UNIDENTIFIABLE])
+
+
+# ------------------------------------------------------------------ real motion
+
+
+@pytest.fixture(scope="module")
+def at_sea(tmp_path_factory, snapir_ins):
+    """Of every family with real motion, a null and lever arm with delay."""
+    cases = [Case(Category.NULL, RECORDED, family=family) for family in (Family.HALF_REAL, Family.HORIZONTAL)]
+    cases += [Case(Category.PAIR, RECORDED, family=family) for family in (Family.HALF_REAL, Family.HORIZONTAL)]
+    cases += [Case(Category.PAIR, RECORDED, "dvl_time_offset", family=Family.SEVERAL)]
+    trial = Trial(tmp_path_factory.mktemp("at_sea"), seed=0, jobs=2)
+    answers = trial.run(cases)
+    return {(case.truth.family, case.truth.category): case for case in join(unseal(trial.sealed), answers)}
+
+
+def test_on_real_motion_exactly_the_true_effects_are_named_with_and_without_a_vertical(at_sea):
+    pairs = [case for (_, category), case in at_sea.items() if category is Category.PAIR]
+    assert len(pairs) == 3
+    assert all(case.is_exact for case in pairs)
+    inside = [interval.holds for case in pairs for interval in case.intervals]
+    assert np.mean(inside) >= 0.8
+
+
+def test_on_real_motion_what_was_named_leaves_little_more_than_the_noise(at_sea):
+    assert all(case.error_over_possible < 1.2 for case in at_sea.values())
+
+
+def test_real_motion_alone_raises_no_alarm(at_sea):
+    assert not [family for (family, category), case in at_sea.items() if category is Category.NULL and case.claimed]
