@@ -92,7 +92,9 @@ def test_the_table_of_commands_is_that_of_the_code():
 
 def test_files_that_are_named_are_there():
     roots = (ROOT, ROOT / "dvl_calib_ros", ROOT / "docs")
-    folders = r"config|bags|test|docs|\.ci|calibration|effects|files|messages|node|cli|replay|report|diagnosis|trial"
+    folders = (
+        r"config|bags|test|docs|examples|\.ci|calibration|effects|files|messages|node|cli|replay|report|diagnosis|trial"
+    )
     named = {each for text in TEXT.values() for each in re.findall(rf"`((?:{folders})/[\w./]*)`", text)}
     assert len(named) > 10
     assert [each for each in sorted(named) if not any((root / each).exists() for root in roots)] == []
