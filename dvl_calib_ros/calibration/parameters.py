@@ -22,6 +22,7 @@ from .observations import ASSUMPTIONS
 from .samples import VelocityFrame
 
 AUTO = "auto"
+IAC = "iac"
 FROM_FRAME_ID = "from_frame_id"
 FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
 IMU_ENU, IMU_NED = "enu", "ned"
@@ -101,19 +102,20 @@ class Parameters:
 
     model: str = _parameter(
         AUTO,
-        "Model whose estimate is published: auto, or a model's name.",
-        choices=(AUTO, *MODELS),
+        "Model whose estimate is published: auto (what we recommend), iac (the published selection: IAC-G, M3 or M4, "
+        "with GNSS, IAC-GF, M5-M7, without), or a model's name.",
+        choices=(AUTO, IAC, *MODELS),
         read_only=False,
     )
     gnss_model: str = _parameter(
         "G1",
-        "What auto runs while GNSS is available.",
+        "What auto runs while GNSS is available; under iac M3, unless this is M4.",
         choices=_AIDED,
         read_only=False,
     )
     gnss_free_model: str = _parameter(
         "F1",
-        "What auto runs while GNSS is not available.",
+        "What auto runs while GNSS is not available; under iac M7, unless this is M5 or M6.",
         choices=_UNAIDED,
         read_only=False,
     )

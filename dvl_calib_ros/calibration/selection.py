@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from .parameters import AUTO, Parameters
+from .parameters import AUTO, IAC, Parameters
 from .samples import Mask, Stamps
+
+# The published selection; the first and the last are what the paper recommends
+IAC_G = ("M3", "M4")
+IAC_GF = ("M5", "M6", "M7")
 
 
 class Segment(NamedTuple):
@@ -90,10 +94,24 @@ class Selection:
 
     def model(self, parameters: Parameters) -> str:
         """Name of the selected model."""
-        if parameters.model != AUTO:
+        if parameters.model == IAC:
+            aided, unaided = published_models(parameters)
+        elif parameters.model == AUTO:
+            aided, unaided = parameters.gnss_model, parameters.gnss_free_model
+        else:
             return parameters.model
-        return parameters.gnss_model if self.gnss.available else parameters.gnss_free_model
+        return aided if self.gnss.available else unaided
 
     def reason(self, parameters: Parameters) -> str:
         """Why it is that model."""
-        return "set by parameter model" if parameters.model != AUTO else f"auto: {self.gnss.reason}"
+        follows_gnss = parameters.model in (AUTO, IAC)
+        return f"{parameters.model}: {self.gnss.reason}" if follows_gnss else "set by parameter model"
+
+
+def published_models(parameters: Parameters) -> tuple[str, str]:
+    """What `iac` runs: IAC-G with GNSS, IAC-GF without, of Yampolsky and Klein (see the table of models).
+
+    Where gnss_model or gnss_free_model name no such model, as by default, the ones that the paper ends with.
+    """
+    aided = parameters.gnss_model if parameters.gnss_model in IAC_G else IAC_G[0]
+    return aided, parameters.gnss_free_model if parameters.gnss_free_model in IAC_GF else IAC_GF[-1]

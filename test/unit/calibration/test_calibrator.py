@@ -190,6 +190,29 @@ def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and
     np.testing.assert_allclose(at, [0.0, 3.0, 45.0, 63.0], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, ("M7", "M3")),
+        ({"gnss_model": "M4", "gnss_free_model": "M5"}, ("M5", "M4")),
+        ({"gnss_model": "M1", "gnss_free_model": "A1"}, ("M7", "M3")),
+    ],
+)
+def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expected):
+    run = variant(NOISY, seconds=100, gnss_phase=0)
+    outage = [
+        s
+        for s in make_samples(run)
+        if not (isinstance(s, ReferenceSample) and 40 <= (s.stamp_ns - START_NS) / SECOND < 60)
+    ]
+    auto, iac = (calibrate(outage, Parameters(model=model, **given)) for model in ("auto", "iac"))
+    assert [segment.model for segment in iac.selection.segments] == [*expected, *expected]
+    assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in auto.selection.segments]
+    assert iac.result().selected_because == "iac: GNSS is available"
+    for name in MODELS:  # what is selected changes no estimate
+        np.testing.assert_array_equal(iac.state(name).x, auto.state(name).x)
+
+
 def test_a_flapping_receiver_does_not_flap_the_output():
     run = variant(NOISY, seconds=100, gnss_phase=0)
     flapping = [

@@ -34,7 +34,7 @@ def test_names_and_defaults_are_those_that_scripts_rely_on():
         ({"gnss_timeout": float("nan")}, "gnss_timeout: nan is not finite"),
         ({"gnss_timeout": "2"}, "gnss_timeout: expected a number"),
         ({"gnss_timeout": True}, "gnss_timeout: expected a number"),
-        ({"model": "M8"}, "model: 'M8' is not one of auto, M1"),
+        ({"model": "M8"}, "model: 'M8' is not one of auto, iac, M1"),
         ({"model": 3}, "model: expected text"),
         ({"gnss_model": "M7"}, "gnss_model: 'M7' is not one of M1"),
         ({"gnss_free_model": "M3"}, "gnss_free_model: 'M3' is not one of M5"),
