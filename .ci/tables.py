@@ -8,10 +8,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-OPTIONS = {
-    "parameters": (),
-    **{name: (f"--{name}",) for name in ("models", "effects", "drivers", "findings", "commands")},
-}
+OTHERS = ("models", "effects", "drivers", "findings", "doctor", "commands")
+OPTIONS = {"parameters": (), **{name: (f"--{name}",) for name in OTHERS}}
 
 
 def printed(*options: str) -> str:

@@ -7,6 +7,7 @@ a warning is an entry here and a call of `finding` where it is noticed. Codes ar
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -72,10 +73,10 @@ def finding(code: str, **fields: object) -> Finding:
     return Finding(code, kind.severity, kind.says.format(**fields), kind.remedy.format(**fields))
 
 
-def finding_table() -> str:
-    """The table of the documentation, in Markdown; … stands for what is put in."""
+def finding_table(kinds: Iterable[FindingKind]) -> str:
+    """A table of the documentation, in Markdown; … stands for what is put in."""
     lines = ["| code | it says | which means | what to do |", "|---|---|---|---|"]
-    for kind in FINDINGS.values():
+    for kind in kinds:
         code = f"`{kind.code}`" + (" (error)" if kind.severity is Severity.ERROR else "")
         cells = (_FIELD.sub("…", text).replace("|", "\\|") for text in (kind.says, kind.means, kind.remedy))
         lines.append(f"| {code} | {' | '.join(cells)} |")

@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
     what.add_argument("--findings", action="store_true", help="every warning with its meaning and remedy")
+    what.add_argument("--doctor", action="store_true", help="everything that the doctor can find wrong with a bag")
     what.add_argument("--commands", action="store_true", help="every command with an example")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
@@ -45,10 +46,11 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.commands:
         print(command_table(), end="")
         return
-    if arguments.findings:
-        from ..calibration.findings import finding_table
+    if arguments.findings or arguments.doctor:
+        from ..calibration.findings import FINDINGS, finding_table
+        from ..examination.kinds import KINDS
 
-        print(finding_table(), end="")
+        print(finding_table((FINDINGS if arguments.findings else KINDS).values()), end="")
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters

@@ -10,6 +10,7 @@ from conftest import ROOT
 from documentation import section
 
 from dvl_calib_ros.calibration.findings import FINDINGS, FindingKind, Severity, finding, finding_table
+from dvl_calib_ros.examination.kinds import KINDS
 
 PACKAGE = ROOT / "dvl_calib_ros"
 MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.name != "findings.py"]
@@ -70,5 +71,6 @@ def test_a_code_is_one_word_in_capitals(code):
         FindingKind(code, "a", "b", "c")
 
 
-def test_the_troubleshooting_page_is_the_table():
-    assert section("findings") == finding_table().strip(), "take it from: dvl-calib parameters --findings"
+@pytest.mark.parametrize(("name", "kinds"), [("findings", FINDINGS), ("doctor", KINDS)])
+def test_the_troubleshooting_page_has_the_tables(name, kinds):
+    assert section(name) == finding_table(kinds.values()).strip(), "take it from: python .ci/tables.py"

@@ -399,7 +399,9 @@ def test_a_topic_of_a_type_that_holds_no_velocity_is_refused_with_those_that_do(
     bag = write_driver_bag(tmp_path / "bag", run()[:200], MARINE)
     with pytest.raises(InputError, match=r"imu/data holds sensor_msgs/msg/Imu, expected .*dvl_msgs/msg/DVL"):
         replay([bag], Parameters(), Topics(dvl="imu/data", imu="none"))
-    with pytest.raises(InputError, match=r"holds marine_acoustic_msgs/msg/Dvl, expected .*Odometry or .*NavSatFix; set --gnss-topic"):
+    with pytest.raises(
+        InputError, match=r"holds marine_acoustic_msgs/msg/Dvl, expected .*Odometry or .*NavSatFix; set --gnss-topic"
+    ):
         replay([bag], Parameters(), Topics(dvl="gnss/twist", gnss="dvl/twist"))
 
 
