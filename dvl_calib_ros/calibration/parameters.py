@@ -151,6 +151,11 @@ class Parameters:
         "base_link",
         "Name of the body frame (forward-left-up): of calibrated_twist, and of a body-frame reference.",
     )
+    use_transforms: bool = _parameter(
+        True,
+        "Take mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description, where they are at their "
+        "default and the transforms have the DVL's frame.",
+    )
     dvl_frame: str = _parameter(
         "",
         "frame_id that DVL messages must carry. Empty: any but a body or earth frame, and the first one seen.",

@@ -91,7 +91,8 @@ class _Search:
 
     def __init__(self, seen: Survey, parameters: Parameters, given: Given, where: str) -> None:
         self._seen, self._parameters, self._given, self._where = seen, parameters, given, where
-        self._tree = FrameTree.of(seen.transforms, seen.descriptions)
+        used = parameters.use_transforms
+        self._tree = FrameTree.of(seen.transforms if used else (), seen.descriptions if used else ())
         self._values: dict[str, Any] = {}
         self._found: list[str] = []
         self._notes: list[str] = list(self._tree.problems)

@@ -236,6 +236,11 @@ class MessageDecoder:
         """Frame of the reference's messages, of the first that were taken; None before."""
         return next((frame for frame in self._reference_frames.values() if frame is not None), None)
 
+    @property
+    def frame_ids(self) -> tuple[str, str, str]:
+        """frame_id of the DVL's, the reference's and the IMU's messages, '' where none has come."""
+        return self.dvl_frame or "", next(iter(self._reference_frames), ""), self._imu_frame or ""
+
     def reference_frame(self, frame_id: str) -> VelocityFrame | None:
         """The frame of reference messages with this frame_id; None if it says nothing."""
         if frame_id not in self._reference_frames:

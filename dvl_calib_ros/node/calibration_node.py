@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,11 @@ from std_srvs.srv import Trigger
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
 from ..calibration.findings import Finding, finding
+from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
+from ..discovery.placement import Frames, not_default, placement
 from ..errors import InputError
 from ..files.atomic import check_writable
 from ..files.outputs import check_outputs
@@ -47,6 +49,7 @@ from .message_types import message_class
 from .parameters import declare_parameters
 from .pauses import Pauses, steady_s
 from .status import status_name
+from .transforms import Transforms
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
 QUEUE = 5000
@@ -75,11 +78,13 @@ class CalibrationNode(Node):
             initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(str(finding("PRIOR_HOLDS_ERROR")))
-        self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
-        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._begin(parameters, initial)
+        # a saved calibration is one of the mounting that it was saved with
+        self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
+        self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
+        self._given = not_default(parameters)
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
-        self._lever_arm = parameters.lever_arm if any(parameters.lever_arm) else None
         self._correction: Correction | None = None
         self._corrected_by = ""
         self._published = ("", 0)
@@ -89,7 +94,7 @@ class CalibrationNode(Node):
 
         self._estimate = self._output_message()
         self._corrected = self._output_message()
-        self._corrected.header.frame_id = parameters.base_frame
+        self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         latched = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=1,
@@ -100,9 +105,11 @@ class CalibrationNode(Node):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
-        self._feed_from = {
-            "dvl/twist": self._feed_dvl, "gnss/twist": self._feed.reference, "imu/data": self._feed.imu
-        }  # fmt: skip
+        self._feed_from: Mapping[str, Callable[[Any, int], Any]] = {
+            "dvl/twist": self._feed_dvl,
+            "gnss/twist": lambda message, received_ns: self._feed.reference(message, received_ns),
+            "imu/data": lambda message, received_ns: self._feed.imu(message, received_ns),
+        }
         self._subscribe(dvl_class, "dvl/twist")
         self._subscribe(gnss_class, "gnss/twist")
         self._subscribe(Imu, "imu/data")
@@ -113,6 +120,36 @@ class CalibrationNode(Node):
         # steady: diagnostics go on while simulated time stands still or jumps
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._log_configuration()
+
+    def _begin(self, parameters: Parameters, initial: Mapping[str, GaussianState] | None) -> None:
+        """Calibrate with these parameters from here on."""
+        self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
+        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._lever_arm = parameters.lever_arm if any(parameters.lever_arm) else None
+
+    def _place(self, message: Any) -> None:
+        """Begin anew with mounting, lever arm and orientation of the IMU from transforms, when they come or change.
+
+        message: the DVL's that is to be fed next.
+        """
+        if self._transforms is None or not self._transforms.heard:
+            return
+        decoder = self._feed.decoder
+        _, reference, imu = decoder.frame_ids
+        dvl = decoder.dvl_frame or decoder.dvl_type.frame_id(message)
+        tried = (self._transforms.heard, (dvl, reference, imu))
+        if tried == self._transforms_tried:
+            return
+        self._transforms_tried = tried
+        frames = Frames(dvl, reference, imu, decoder.dvl_type.points_down)
+        parameters = self._calibrator.parameters
+        found = placement(self._transforms.tree(), frames, parameters, self._given)
+        if found is None or parameters.replace(**found.values) == parameters:
+            return
+        self.get_logger().info(f"{found.said}; the calibration begins with it (use_transforms: false does without)")
+        self._begin(parameters.replace(**found.values), None)
+        self._corrected.header.frame_id = self._calibrator.parameters.base_frame
+        self._recent, self._correction = RecentCounts(), None
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Any:
         # every event callback is one more thing that the executor looks at for every message
@@ -175,6 +212,7 @@ class CalibrationNode(Node):
         return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
 
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
+        self._place(message)
         sample = self._feed.dvl(message, received_ns)
         if sample is not None:
             self._publish_corrected(sample)
