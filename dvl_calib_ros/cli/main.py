@@ -19,7 +19,9 @@ COMMANDS = (run, watch, doctor, replay, salvage, apply, diagnose, evaluate, simu
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say in one line what is wrong with the usage."""
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+        from ..errors import printable
+
+        self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
 
 
 def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:

@@ -38,6 +38,7 @@ COMMAND = {
     "diagnose": Command(
         "diagnose bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--apply", "--report")
     ),
+    "doctor": Command("doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json",)),
     "evaluate": Command(
         "evaluate runs --partial --params params.yaml", ("runs", "runs/T_dvl.npy", "params.yaml"),
         ("--json", "--csv", "--report"),
