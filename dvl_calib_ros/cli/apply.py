@@ -1,4 +1,4 @@
-"""Give a saved calibration to what uses it: URDF, static transform, robot_localization. Without options, show it.
+"""Write a saved calibration into a URDF, a static transform or robot_localization. Without options, show it.
 
 Every file is replaced whole and the one before kept as .bak; the same line with --rollback brings that back.
 """
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..files.mounting import CalibratedMounting
 
 NAME = "apply"
-HELP = "give a saved calibration to URDF, TF or robot_localization, or take it back"
+HELP = "write a saved calibration into URDF, TF or robot_localization, or take it back"
 EXAMPLE = "dvl-calib apply calibration.yaml --urdf robot.urdf --launch dvl_tf.launch.xml --fusion dvl_ekf.yaml"
 
 

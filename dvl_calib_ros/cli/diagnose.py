@@ -1,4 +1,4 @@
-"""Diagnose the sim-to-real gap of recorded bags: where the DVL differs from its simulation, and which effect does it.
+"""Diagnose recorded bags: where the DVL differs from what calibration and simulation expect, and which effect causes it.
 
 One sentence with the answer comes first. Several bags must be of one vehicle; whole bags are then held out.
 """
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..diagnosis.results import Diagnosis
 
 NAME = "diagnose"
-HELP = "find what a simulation lacks beside recorded bags, and how much it explains"
+HELP = "name what causes the velocity error that calibration leaves in recorded bags"
 EXAMPLE = "dvl-calib diagnose my_bag --apply compensated.yaml"
 COLOURS = {"no_gap": "green", "known": "green", "ambiguous": "yellow", "unknown": "red"}
 # At rest a bias shows that looks like scale at speed

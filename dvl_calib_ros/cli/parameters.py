@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 NAME = "parameters"
-HELP = "list every parameter, model, effect or driver, or write a parameter file"
+HELP = "list every parameter, model, effect, driver, warning or command, or write a parameter file"
 EXAMPLE = "dvl-calib parameters --yaml > calibration.yaml"
 
 

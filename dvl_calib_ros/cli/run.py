@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     common.add_parameter_options(parser)
     common.add_topic_options(parser)
-    parser.add_argument("--watch", action="store_true", help="show estimates, convergence and what to fly, live")
+    parser.add_argument("--watch", action="store_true", help="show estimates, convergence and missing manoeuvres, live")
     parser.add_argument("--ros-args", nargs=argparse.REMAINDER, default=[], dest="ros_args", help=argparse.SUPPRESS)
 
 

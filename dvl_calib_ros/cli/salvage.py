@@ -1,4 +1,4 @@
-"""Write what is whole in damaged recordings, all topics, to a new bag that every tool reads; say how much it is."""
+"""Recover damaged recordings, all topics, into a new bag that every tool reads, and say how much was recovered."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from . import common
 
 NAME = "salvage"
-HELP = "write what is whole in damaged recordings to a new bag"
+HELP = "recover damaged recordings into a new bag"
 PROGRESS_EVERY = 1000
 EXAMPLE = "dvl-calib salvage cut_off_bag -o whole_bag"
 
