@@ -1,4 +1,4 @@
-"""Diagnose recorded bags: where the DVL differs from what calibration and simulation expect, and which effect causes it.
+"""Diagnose recorded bags: where the DVL differs from what calibration leads to expect, and which effect causes it.
 
 One sentence with the answer comes first. Several bags must be of one vehicle; whole bags are then held out.
 """

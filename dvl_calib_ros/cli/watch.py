@@ -1,4 +1,4 @@
-"""Watch a calibration node that runs somewhere on the ROS domain: estimates, how far each is, which manoeuvre is missing.
+"""Watch a calibration node that runs somewhere on the ROS domain: estimates, progress, which manoeuvre is missing.
 
 Ctrl-C ends the view, not the node. ``dvl-calib run --watch`` starts a node and watches it.
 """

@@ -10,6 +10,8 @@ from scipy.stats import chi2
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 
+pytestmark = pytest.mark.slow  # hundreds of simulated runs
+
 N_RUNS = 100
 
 

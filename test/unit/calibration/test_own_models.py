@@ -53,6 +53,7 @@ def test_the_covariance_is_carried_over_by_the_derivative_of_the_map(correction)
 # ---------------------------------------------------------------- G1: with GNSS
 
 
+@pytest.mark.slow
 def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_g1():
     """Straight ahead at 1.5 m/s with 0.2 m/s of noise: M1 is pulled by -3 σ²/‖v‖² = -5.3 %, G1 is not."""
     parameters = Parameters(initial_std_scale=0.5, gnss_aided_std=0.2)

@@ -81,6 +81,7 @@ def test_a_good_run_is_accepted_with_the_error_that_was_predicted():
         assert held_out.samples == calibrator.counts["pairing"]["paired"]
 
 
+@pytest.mark.slow
 def test_a_dvl_without_errors_is_not_rejected_for_what_correcting_nothing_adds():
     for seed in range(10):
         run = MatchedRun("box", 200.0, gnss_std=0.1, dvl_std=0.01, seed=seed)

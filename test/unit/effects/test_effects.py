@@ -285,6 +285,7 @@ def test_the_registry_holds_own_effects_first_and_one_instance_of_each():
 PLUGIN = ROOT / "test" / "effect_plugin"
 
 
+@pytest.mark.slow
 def test_the_example_of_an_own_effect_is_found_once_its_package_is_installed(tmp_path):
     """Installed means: its module and its metadata are on the path, as pip puts them there."""
     project = configparser.ConfigParser()

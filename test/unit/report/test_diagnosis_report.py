@@ -17,6 +17,8 @@ from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
 from dvl_calib_ros.report import diagnosis_report, write_diagnosis_report
 
+pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each
+
 
 def page_of(folder, found: Diagnosis) -> Page:
     path = folder / "diagnosis.html"

@@ -58,6 +58,7 @@ def test_the_held_out_errors_of_every_model_are_shown(made):
         assert page.row(name)[1:] == [*numbers, str(error.samples), verification.verdict.value]
 
 
+@pytest.mark.slow
 def test_without_verification_the_report_says_so(tmp_path, made):
     replayed = made[1]
     unverified = replace(replayed, result=replace(replayed.result, verifications={}))
@@ -91,12 +92,14 @@ def test_the_type_of_the_dvls_data_is_shown(made):
     assert "DVL data geometry_msgs/msg/TwistWithCovarianceStamped" in made[0].text
 
 
+@pytest.mark.slow
 def test_warnings_are_shown(tmp_path):
     samples = [sample for sample in run() if isinstance(sample, DvlSample)]
     path, replayed = replay_page(tmp_path, samples)
     assert replayed.notes and all(note in Page(path).text for note in replayed.notes)
 
 
+@pytest.mark.slow
 def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
     figures = drawn(monkeypatch)
     page = Page(replay_page(tmp_path, models=MODELS)[0])
@@ -112,6 +115,7 @@ def test_models_can_be_told_apart_and_look_the_same_everywhere():
     assert len(set(MODEL_STYLES.values())) == len(MODELS)
 
 
+@pytest.mark.slow
 def test_the_same_data_gives_the_same_figures(tmp_path, made):
     again = tmp_path / "again.html"
     bag = tmp_path / "bag"
@@ -154,6 +158,7 @@ def test_names_of_trajectories_are_text_in_tables_and_figures(evaluated):
 # ------------------------------------------------------------------ unusual data
 
 
+@pytest.mark.slow
 def test_a_bag_without_gnss_has_no_residuals(tmp_path):
     samples = [sample for sample in run() if not isinstance(sample, ReferenceSample)]
     page = Page(replay_page(tmp_path, samples)[0])
@@ -161,12 +166,14 @@ def test_a_bag_without_gnss_has_no_residuals(tmp_path):
     assert "Residual" not in page.text and "Models with GNSS" not in page.text and "Models without GNSS" in page.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_report_of_hardly_any_samples(tmp_path, count):
     page = Page(replay_page(tmp_path, steady_run(count))[0])
     assert f"{count} of the DVL" in page.text and len(page.images()) > 3
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_stands_still(tmp_path):
     still = [sample._replace(velocity=(0.0, 0.0, 0.0)) for sample in steady_run(50)]
     page = Page(replay_page(tmp_path, still)[0])
@@ -202,6 +209,7 @@ def test_recording_does_not_change_the_estimates(tmp_path):
         np.testing.assert_allclose(other.covariance, estimate.covariance, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_history_ends_with_the_result_and_holds_what_the_models_saw(tmp_path):
     replayed = recorded(write_bag(tmp_path / "bag", run()))
     history, result = replayed.history, replayed.result
@@ -226,6 +234,7 @@ def test_a_series_of_any_length_is_thinned_evenly(length, expected):
         assert len(rows) >= min(length, 50)
 
 
+@pytest.mark.slow
 def test_a_long_recording_takes_no_more_memory_than_a_short_one(tmp_path):
     history = recorded(write_bag(tmp_path / "bag", steady_run(2000))).history
     assert KEPT_STATES // 2 <= len(history.stamps_ns) <= KEPT_STATES + 1
@@ -306,6 +315,7 @@ def test_the_summary_of_an_evaluation_names_the_best_of_each_kind(evaluated):
     assert f"Best without GNSS: {best_free} with" in evaluated.text
 
 
+@pytest.mark.slow
 def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_path):
     path = tmp_path / "evaluation.html"
     write_evaluation_report(path, evaluation())
@@ -316,6 +326,7 @@ def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_p
     assert Page(path).row(last)[2:4] == ["–", "–"]  # no attitude there: neither the set nor the mean
 
 
+@pytest.mark.slow
 def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
     path = tmp_path / "evaluation.html"
     write_evaluation_report(path, evaluation(own_generator=True))

@@ -107,6 +107,7 @@ def test_effects_add_up_and_may_be_given_twice():
     np.testing.assert_allclose(together, sum(alone), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_calibration_compensates_what_the_simulator_put_in(tmp_path):
     """Lever arm and time offset: the signs of simulator and calibration agree, with no word from the diagnosis."""
     options = {**QUIET, "trajectory": "box", "seconds": 90.0, "dvl_rate": 10.0, "gnss_rate": 20.0}
