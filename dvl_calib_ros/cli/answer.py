@@ -22,17 +22,16 @@ VERDICTS = {
     "marginal": ("Use this calibration with care:", "yellow"),
     "reject": ("Do not use this calibration:", "red"),
 }
-# Findings that discovery has dealt with: it says itself where the IMU's orientation is from, and that there is no GNSS.
-SETTLED = ("IMU_FRAME", "BAG_NO_GNSS")
 
 
-def shown_findings(replayed: Replayed, models: Sequence[str]) -> list[Finding]:
+def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Finding]:
     """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
     other = [f"{name}: " for name in replayed.result.estimates if name not in models]
+    settled = {"BAG_NO_GNSS"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
     return [
         found
         for found in replayed.findings
-        if found.code not in SETTLED and not any(found.says.startswith(prefix) for prefix in other)
+        if found.code not in settled and not any(found.says.startswith(prefix) for prefix in other)
     ]
 
 

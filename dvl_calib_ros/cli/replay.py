@@ -79,7 +79,7 @@ def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discove
 
     result, out = replayed.result, common.console()
     common.print_found(discovery, arguments.bags)
-    findings = shown_findings(replayed, [result.selected, *models])
+    findings = shown_findings(replayed, discovery, [result.selected, *models])
     known = {str(found) for found in replayed.findings}
     common.print_warnings(
         [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]

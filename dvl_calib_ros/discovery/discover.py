@@ -53,6 +53,7 @@ class Discovery:
     found: what was found and where; notes: what was passed over; contradictions: where the recording's data do not
     bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`. fit: how
     well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
+    knows_imu: whether it is known in which axes the IMU measures.
     """
 
     topics: Topics
@@ -63,6 +64,7 @@ class Discovery:
     values: Mapping[str, Any] = field(default_factory=dict)
     fit: Fit | None = None
     reference_frame: VelocityFrame | None = None
+    knows_imu: bool = False
     survey: Survey | None = field(default=None, repr=False)
 
     @property
@@ -115,6 +117,7 @@ class _Search:
             dict(self._values),
             self._chosen,
             self._reference_frame(reference),
+            self._knows_imu(imu),
             self._seen,
         )
 
@@ -255,6 +258,16 @@ class _Search:
             return None
         taken = self._values.get("gnss_frame")
         return self._declared_reference(reference) if taken is None else VelocityFrame(taken)
+
+    def _knows_imu(self, imu: Look | None) -> bool:
+        """Whether it is known how the IMU sits: a transform says so, or DVL and reference agree."""
+        if imu is None:
+            return False
+        placed = self._tree.placed(imu.frame_id, self._parameters.base_frame)
+        if placed is not None and placed.source:
+            return True
+        fit = self._chosen  # a reference in the body agrees whatever the IMU says
+        return fit is not None and fit.hypothesis.reference is not VelocityFrame.BODY and fit.best_left < FITS
 
     def _imu_frames(self, imu: Look | None) -> list[ImuFrame]:
         """How the IMU's data may be meant, the likeliest first."""

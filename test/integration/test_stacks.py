@@ -84,6 +84,14 @@ def test_mounting_and_lever_arm_come_from_the_transforms_of_the_bag(bags, name):
     assert min(np.abs(begun - each).max() for each in (nominal, nominal @ FLU_FROM_FRD)) < 1e-9
 
 
+def test_rtk_positions_alone_give_the_yaw_to_a_few_hundredths_of_a_degree(bags):
+    found, replayed = answered(bags["rtk_positions_only"])
+    assert "reference /rtk/fix (NavSatFix, enu, 5 Hz)" in found.found[0]
+    corrected = replayed.result.estimate.rotation_body_from_dvl(found.parameters.rotation_dvl_from_body)
+    roll, pitch, yaw = np.degrees(Rotation.from_matrix(true_mounting((0.0, 0.0, 0.0)).T @ corrected).as_rotvec())
+    assert abs(yaw) < 0.1 and abs(pitch) < 0.1 and abs(roll) < 2.0
+
+
 def test_what_is_given_stands_and_is_not_looked_for(bags):
     bag = bags["water_linked_driver_at_45_degrees"]
     given = Given(parameters=frozenset({"mounting_rpy", "lever_arm"}))
