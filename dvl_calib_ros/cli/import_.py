@@ -1,9 +1,12 @@
-"""Turn trajectories in CSV or NPY into bags.
+"""Turn trajectories in CSV or NPY, and logs of DVLs, into bags.
 
 A file holds rows of time and three values; a folder holds recordings NAME_dvl.csv, each with NAME_gnss.csv and
 NAME_attitude.csv where there are such, and becomes one bag per recording. Units are SI and radians; velocities are
 forward-right-down (frd) unless said otherwise and become ROS's forward-left-up; attitude is roll, pitch, yaw of the
 forward-right-down body in north-east-down.
+
+A log of Water Linked's JSON reports or of RDI's PD0 ensembles is known by its content. It has its own times: give
+--start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.
 """
 
 from __future__ import annotations
@@ -14,13 +17,15 @@ from pathlib import Path
 from . import common
 
 NAME = "import"
-HELP = "turn CSV or NPY trajectories into bags"
+HELP = "turn CSV or NPY trajectories, or logs of a DVL (Water Linked JSON, RDI PD0), into bags"
 EXAMPLE = "dvl-calib import T12_dvl.csv --gnss T12_gnss.csv --attitude T12_attitude.csv -o T12"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("dvl", type=Path, metavar="DVL", help="CSV or NPY of DVL velocities, or a folder of recordings")
+    parser.add_argument(
+        "dvl", type=Path, metavar="DVL", help="CSV or NPY of DVL velocities, a DVL's own log, or a folder of recordings"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write (for a folder: folder of bags)")
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="reference velocities")
     parser.add_argument("--attitude", type=Path, metavar="FILE", help="roll, pitch, yaw in north-east-down")

@@ -20,6 +20,7 @@ from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SampleWriter
+from .dvl_logs import is_dvl_log, read_dvl_log
 
 N_COLUMNS = 4
 SUFFIXES = ("csv", "npy")
@@ -185,12 +186,17 @@ def import_recording(
     if os.path.lexists(output):
         raise InputError(f"{output}: exists already; give another name, or remove it first")
     start_ns = options.start_ns
-    dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std)
+    left_out: dict[str, int] = {}
+    if dvl.is_file() and dvl.suffix not in (".csv", ".npy") and is_dvl_log(dvl):
+        dvl_samples, left_out = read_dvl_log(dvl)
+    else:
+        dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std)
     references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std) if gnss else []
     attitudes = read_attitude(attitude, start_ns) if attitude else []
     with BagWriter(output, options.storage, options.compression) as bag:
         SampleWriter(bag).recording(attitudes, references, dvl_samples)
-    return {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
+    written = {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
+    return written | {f"reports {reason}, left out": count for reason, count in left_out.items()}
 
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, dict[str, int]]:

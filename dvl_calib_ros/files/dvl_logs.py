@@ -1,0 +1,168 @@
+"""Logs of DVLs as the instruments write them: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
+
+Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
+time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
+PD0 in instrument or ship axes (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is
+turned. Instrument axes are taken for ship's, as with beam 3 forward; a replay finds a DVL that is mounted otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.frames import FLU_FROM_FRD, Array
+from ..calibration.samples import DvlSample
+from ..errors import InputError
+
+PD0_START = b"\x7f\x7f"
+# Of a file so much is looked at to tell what it is.
+_SNIFFED = 65536
+_FIXED_LEADER, _VARIABLE_LEADER, _BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
+_AXES = ("beam", "instrument", "ship", "earth")
+# A velocity of a beam or axis that could not be measured, mm/s
+_BAD_VELOCITY = -32768
+# forward-left-up from RDI's starboard, forward, up
+_FLU_FROM_RDI: Array = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+class Log(NamedTuple):
+    """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason."""
+
+    samples: list[DvlSample]
+    left_out: Counter[str]
+
+
+def is_dvl_log(path: Path) -> bool:
+    """Whether a file looks like a log of an instrument, by its content. Raises InputError if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(_SNIFFED)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or b'"vx"' in start
+
+
+def read_dvl_log(path: Path) -> Log:
+    """Read a log of either kind. Raises InputError for what is none, or holds no velocity that can be used."""
+    content = path.read_bytes()
+    log = _read_json(path, content) if b'"vx"' in content[:_SNIFFED] else _read_pd0(path, content)
+    if not log.samples:
+        why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
+        raise InputError(f"{path}: no velocity that can be used ({why})")
+    in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda each: each.stamp_ns)
+    log.left_out["of a time that was there already"] += len(log.samples) - len(in_order)
+    return Log(in_order, +log.left_out)
+
+
+# ---------------------------------------------------------------------- Water Linked
+
+
+def _read_json(path: Path, content: bytes) -> Log:
+    samples: list[DvlSample] = []
+    left_out: Counter[str] = Counter()
+    for line in content.decode("utf-8", "replace").splitlines():
+        start = line.find("{")  # a logger may write its own time before
+        if start < 0:
+            continue
+        try:
+            report = json.loads(line[start:])
+        except (json.JSONDecodeError, RecursionError):
+            left_out["not valid JSON"] += 1
+            continue
+        if isinstance(report, dict) and "vx" in report:
+            sample = _json_sample(path, report, left_out)
+            if sample is not None:
+                samples.append(sample)
+    return Log(samples, left_out)
+
+
+def _json_sample(path: Path, report: dict[str, Any], left_out: Counter[str]) -> DvlSample | None:
+    if report.get("velocity_valid") is not True:
+        left_out["without bottom lock"] += 1
+        return None
+    if "time_of_validity" not in report:
+        raise InputError(f"{path}: reports have no time_of_validity; it comes with the DVL's software 2.2 and later")
+    try:
+        velocity = FLU_FROM_FRD @ np.array([float(report[name]) for name in ("vx", "vy", "vz")])
+        stamp_ns = int(report["time_of_validity"]) * 1000
+        given = report.get("covariance")
+        covariance = np.array(given, dtype=float).reshape(3, 3) if given else float(report["fom"]) ** 2 * np.eye(3)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        left_out["damaged"] += 1
+        return None
+    if not np.isfinite(velocity).all() or not 0 < stamp_ns < 2**31 * 1_000_000_000:
+        left_out["damaged"] += 1
+        return None
+    x, y, z = velocity.tolist()
+    return DvlSample(stamp_ns, (x, y, z), FLU_FROM_FRD @ covariance @ FLU_FROM_FRD)
+
+
+# ---------------------------------------------------------------------- RDI
+
+
+def _next_ensemble(content: bytes, start: int) -> tuple[int, int] | None:
+    """Where the next whole ensemble begins and ends, its checksum right; None if there is none."""
+    while (at := content.find(PD0_START, start)) >= 0:
+        if at + 6 <= len(content):
+            (length,) = struct.unpack_from("<H", content, at + 2)
+            end = at + length + 2
+            if length >= 6 and end <= len(content):
+                (checksum,) = struct.unpack_from("<H", content, end - 2)
+                if sum(content[at : end - 2]) & 0xFFFF == checksum:
+                    return at, end
+        start = at + 1
+    return None
+
+
+def _ensembles(content: bytes) -> Iterator[dict[int, bytes]]:
+    """Data of each whole ensemble, by the data's ID."""
+    start = 0
+    while (found := _next_ensemble(content, start)) is not None:
+        at, start = found
+        body = content[at : start - 2]
+        n_types = body[5]
+        if 6 + 2 * n_types > len(body):
+            continue
+        offsets = struct.unpack_from(f"<{n_types}H", body, 6)
+        yield {struct.unpack_from("<H", body, each)[0]: body[each:] for each in offsets if each + 2 <= len(body)}
+
+
+def _read_pd0(path: Path, content: bytes) -> Log:
+    samples: list[DvlSample] = []
+    left_out: Counter[str] = Counter()
+    for data in _ensembles(content):
+        try:
+            sample = _pd0_sample(path, data, left_out)
+        except (struct.error, IndexError, KeyError, ValueError):
+            left_out["damaged"] += 1
+            continue
+        if sample is not None:
+            samples.append(sample)
+    return Log(samples, left_out)
+
+
+def _pd0_sample(path: Path, data: dict[int, bytes], left_out: Counter[str]) -> DvlSample | None:
+    if _BOTTOM_TRACK not in data:
+        left_out["without bottom track"] += 1
+        return None
+    axes = _AXES[data[_FIXED_LEADER][25] >> 3 & 3]
+    if axes not in ("instrument", "ship"):
+        raise InputError(f"{path}: velocities are in {axes} axes; set the DVL to instrument or ship axes (EX command)")
+    millimetres = struct.unpack_from("<3h", data[_BOTTOM_TRACK], 24)
+    if _BAD_VELOCITY in millimetres:
+        left_out["without bottom lock"] += 1
+        return None
+    year, month, day, hour, minute, second, hundredths = data[_VARIABLE_LEADER][4:11]
+    # RDI's year has two digits; no DVL of before 2000 writes these
+    at = datetime(2000 + year, month, day, hour, minute, second, tzinfo=timezone.utc)
+    stamp_ns = int(at.timestamp()) * 1_000_000_000 + hundredths * 10_000_000
+    x, y, z = (-0.001 * _FLU_FROM_RDI @ np.array(millimetres, dtype=float) + 0.0).tolist()
+    return DvlSample(stamp_ns, (x, y, z), None)

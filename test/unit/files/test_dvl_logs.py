@@ -1,0 +1,131 @@
+"""Logs as instruments write them become bags: the velocities, axes, times and gaps that they hold."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import fail, succeed
+
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.dvl_logs import is_dvl_log, read_dvl_log
+
+START_US = 1_638_191_471_563_017
+VELOCITIES = [(1.5, 0.1, -0.02), (1.4, -0.2, 0.01), (1.6, 0.0, 0.03)]
+
+
+def report(i: int, velocity: Sequence[float], **changes) -> str:
+    """As docs.waterlinked.com/dvl/dvl-json-protocol shows one."""
+    vx, vy, vz = velocity
+    return json.dumps(
+        {
+            "time": 106.4, "vx": vx, "vy": vy, "vz": vz, "fom": 0.01,
+            "covariance": [[1e-4, 1e-5, 0.0], [1e-5, 2e-4, 0.0], [0.0, 0.0, 3e-4]], "altitude": 0.5,
+            "transducers": [], "velocity_valid": True, "status": 0, "format": "json_v3.1", "type": "velocity",
+            "time_of_validity": START_US + 100_000 * i, "time_of_transmission": START_US + 100_000 * i + 5000,
+        } | changes
+    )  # fmt: skip
+
+
+def water_linked(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def ensemble(millimetres: Sequence[int], hundredths: int, axes: int = 2, checksum: int = 0) -> bytes:
+    """A PD0 ensemble with fixed leader, variable leader and bottom track, by the format's table of bytes."""
+    fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
+    fixed[25] = axes << 3
+    struct.pack_into("<H", variable, 0, 0x0080)
+    variable[4:11] = bytes([25, 11, 21, 10, 30, 15, hundredths])
+    struct.pack_into("<H", bottom, 0, 0x0600)
+    struct.pack_into("<4h", bottom, 24, *millimetres, 0)
+    offsets, at = [], 6 + 2 * 3
+    for part in (fixed, variable, bottom):
+        offsets.append(at)
+        at += len(part)
+    body = b"\x7f\x7f" + struct.pack("<HBB3H", at, 0, 3, *offsets) + bytes(fixed + variable + bottom)
+    return body + struct.pack("<H", (sum(body) + checksum) & 0xFFFF)
+
+
+def test_water_linked_reports_are_turned_to_forward_left_up_and_stamped_by_their_validity(tmp_path):
+    log = read_dvl_log(water_linked(tmp_path / "a50.log", *(report(i, v) for i, v in enumerate(VELOCITIES))))
+    assert [sample.stamp_ns for sample in log.samples] == [1000 * (START_US + 100_000 * i) for i in range(3)]
+    np.testing.assert_allclose([s.velocity for s in log.samples], np.array(VELOCITIES) * [1.0, -1.0, -1.0])
+    np.testing.assert_allclose(log.samples[0].covariance[0], [1e-4, -1e-5, 0.0])
+    assert not log.left_out
+
+
+def test_reports_that_hold_no_velocity_are_left_out_and_counted(tmp_path):
+    lines = (
+        "2021-11-29 12:31:11 " + report(0, VELOCITIES[0]),  # a logger's own time before
+        report(1, VELOCITIES[1], velocity_valid=False),
+        '{"type": "position_local", "x": 1.0}',
+        report(2, VELOCITIES[2])[:-9],
+        report(0, VELOCITIES[2]),
+        "not a report",
+    )
+    log = read_dvl_log(water_linked(tmp_path / "a50.log", *lines))
+    assert len(log.samples) == 1
+    assert log.left_out == {"without bottom lock": 1, "not valid JSON": 1, "of a time that was there already": 1}
+
+
+def test_pd0_bottom_track_is_the_vehicles_motion_in_forward_left_up(tmp_path):
+    path = tmp_path / "dive.pd0"
+    # ship axes (starboard, forward, up) of the bottom past the DVL: the vehicle goes ahead and to port
+    path.write_bytes(b"noise\x7f\x7f" + ensemble((200, -1500, 30), 25) + ensemble((0, -1600, 0), 50))
+    log = read_dvl_log(path)
+    np.testing.assert_allclose([s.velocity for s in log.samples], [(1.5, 0.2, -0.03), (1.6, 0.0, 0.0)])
+    first = datetime(2025, 11, 21, 10, 30, 15, 250_000, tzinfo=timezone.utc)
+    assert log.samples[0].stamp_ns == round(first.timestamp() * 100) * 10_000_000
+    assert log.samples[1].stamp_ns - log.samples[0].stamp_ns == 250_000_000
+    assert log.samples[0].covariance is None
+
+
+def test_pd0_ensembles_with_a_wrong_checksum_or_without_lock_give_no_velocity(tmp_path):
+    path = tmp_path / "dive.000"
+    path.write_bytes(
+        ensemble((0, -1000, 0), 1) + ensemble((0, -9000, 0), 2, checksum=1) + ensemble((-32768,) * 3, 3)
+        + ensemble((0, -1100, 0), 4)[:-40]
+    )  # fmt: skip
+    log = read_dvl_log(path)
+    assert [sample.velocity[0] for sample in log.samples] == [1.0]
+    assert log.left_out == {"without bottom lock": 1}
+
+
+@pytest.mark.parametrize(("axes", "name"), [(0, "beam"), (3, "earth")])
+def test_pd0_in_axes_that_cannot_be_mounted_is_refused_with_what_to_set(tmp_path, axes, name):
+    path = tmp_path / "dive.pd0"
+    path.write_bytes(ensemble((0, -1000, 0), 1, axes=axes))
+    with pytest.raises(InputError, match=f"{name} axes; set the DVL to instrument or ship"):
+        read_dvl_log(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"time,vx\n0,1\n", b"\x7f\x7f\x00\x00", bytes(range(256)) * 40])
+def test_what_is_no_log_is_not_taken_for_one(tmp_path, content):
+    path = tmp_path / "file.bin"
+    path.write_bytes(content)
+    assert not is_dvl_log(path)
+
+
+def test_import_writes_a_bag_of_either_log(tmp_path, capsys):
+    a50 = water_linked(tmp_path / "a50.json", *(report(i, VELOCITIES[0]) for i in range(20)))
+    rdi = tmp_path / "dive.pd0"
+    rdi.write_bytes(b"".join(ensemble((0, -1500, 0), i) for i in range(20)) + ensemble((-32768,) * 3, 30))
+    for log, said in ((a50, "20 dvl/twist"), (rdi, "20 dvl/twist, 1 reports without bottom lock, left out")):
+        bag = tmp_path / f"bag_{log.stem}"
+        out, _ = succeed(capsys, "import", log, "-o", bag)
+        assert out == f"{bag}: {said}\n"
+        with BagReader([bag]) as reader:
+            velocities = [message.twist.twist.linear.x for _, _, message, _ in reader.messages(["dvl/twist"])]
+        assert velocities == [1.5] * 20
+    empty = water_linked(tmp_path / "empty.json", report(0, VELOCITIES[0], velocity_valid=False))
+    assert "no velocity that can be used (1 without bottom lock)" in fail(
+        capsys, "import", empty, "-o", tmp_path / "none"
+    )
