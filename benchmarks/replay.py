@@ -15,7 +15,7 @@ from dvl_calib_ros.simulation.sensors import DvlErrors
 from . import Measurement
 
 SECONDS = 3600.0
-TARGET = 1.5
+TARGET = 0.75
 ROUNDS = 3
 
 # Each runs in a process of its own, so that CPU time and peak memory are its alone.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,6 @@ from .sorting import BagMessage
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
 WINDOW_MESSAGES, WINDOW_BYTES = 4096, 4 << 20
-# Messages that are taken before their bytes are looked at
-TAKEN = 256
 # A recorder has one layout or a few; garbage could have ever new ones.
 _MOST_LAYOUTS = 8
 Stamps = NDArray[np.int64]
@@ -88,12 +85,11 @@ def _taken(messages: Iterator[BagMessage]) -> list[BagMessage]:
     """The messages of the next window."""
     taken: list[BagMessage] = []
     size = 0
-    while len(taken) < WINDOW_MESSAGES and size < WINDOW_BYTES:
-        some = list(islice(messages, TAKEN))
-        if not some:
+    for message in messages:
+        taken.append(message)
+        size += len(message[2])
+        if len(taken) >= WINDOW_MESSAGES or size >= WINDOW_BYTES:
             break
-        taken += some
-        size += sum(len(data) for _, _, data in some)
     return taken
 
 

@@ -7,6 +7,7 @@ names, numbers and values of constants; here names must be plain, numbers bounde
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
@@ -16,6 +17,8 @@ from rosbags.typesys.store import Typestore
 # Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
 LONGEST_DEFINITION = 1 << 18
 LARGEST_ARRAYS = 1 << 16
+# Types made of definitions that are kept: making them takes longer than reading a minute, and recordings are alike.
+KEPT = 32
 _FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _TYPE = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 # rosbags evaluates the constants of IDL: a shift can take all memory, and nested brackets for ever to parse
@@ -39,6 +42,7 @@ def is_empty(definition: Definition | None) -> bool:
     return definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
 
 
+@lru_cache(maxsize=KEPT)
 def known_typestore(msgtype: str, text: str) -> Typestore:
     """Jazzy's types and one that a definition is known of, in MSG format."""
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -46,6 +50,7 @@ def known_typestore(msgtype: str, text: str) -> Typestore:
     return store
 
 
+@lru_cache(maxsize=KEPT)
 def typestore(definition: Definition | None, msgtype: str) -> Typestore:
     """Types for a message: from its definition, or Jazzy's if that is empty. Raises DefinitionError."""
     if definition is None or is_empty(definition):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from io_fixtures import mcap_bytes, raw, run, write_bag
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
@@ -25,12 +26,15 @@ from dvl_calib_ros.bags.salvage.sqlite_file import salvage_sqlite_stream
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
+from dvl_calib_ros.calibration.samples import Stream
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.trajectories import read_columns
 from dvl_calib_ros.files.urdf import read_urdf
 from dvl_calib_ros.files.yaml_files import parse_scalar
+from dvl_calib_ros.messages.columns import sample_streams
+from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.feed import MessageFeed
 
@@ -105,6 +109,31 @@ def run_message(data: bytes) -> None:
         _CALIBRATOR.reset()
 
 
+def run_columns(data: bytes) -> None:
+    """Messages of all streams as columns are what they are one by one. The first byte says how they are cut."""
+    if len(data) < 2:
+        return
+    size = 1 + data[0]
+    topics = {"dvl/twist": Stream.DVL, "gnss/twist": Stream.REFERENCE, "imu/data": Stream.IMU}
+    parts = [data[at : at + size] for at in range(1, len(data), size)][:30]
+    messages = [
+        (list(topics)[i % 3], 10**18 + i, part + _MESSAGE_ENDS[i % 3][len(part) :]) for i, part in enumerate(parts)
+    ]
+    path = _file("columns.mcap", mcap_bytes(messages))
+    found, singly = [], []
+    decoder = MessageDecoder(Parameters())
+    with BagReader([path]) as bag:
+        for stretch in sample_streams(bag, topics, decoder):
+            found += [(stream, isinstance(each, str)) for stream, each in stretch.streams.in_order()]
+    decoder = MessageDecoder(Parameters())
+    take = {"dvl/twist": decoder.dvl, "gnss/twist": decoder.reference, "imu/data": decoder.imu}
+    with BagReader([path]) as bag:
+        for topic, log_ns, message, why in bag.messages(topics):
+            refused = bool(why) or isinstance(take[topic](message, log_ns), Refusal)
+            singly.append((topics[topic], refused))
+    assert found == singly
+
+
 def run_definition(data: bytes) -> None:
     """The first byte says whether it is MSG or IDL."""
     kind = MessageDefinitionFormat.MSG if data[:1] < b"\x80" else MessageDefinitionFormat.IDL
@@ -170,8 +199,6 @@ def run_override(data: bytes) -> None:
 
 
 def _small_run() -> list[tuple[str, int, bytes]]:
-    from io_fixtures import raw, run, write_bag
-
     with tempfile.TemporaryDirectory() as folder:
         messages = raw(write_bag(Path(folder) / "bag", run(6.0)))
     return [next(message for message in messages if message[0] == topic) for topic in ("dvl/twist", "imu/data")]
@@ -215,6 +242,12 @@ def _sqlite_seeds() -> Iterator[bytes]:
             connection.commit()
             connection.close()
             yield path.read_bytes()
+
+
+def _column_seeds() -> Iterator[bytes]:
+    dvl, imu = (data for _, _, data in _small_run())
+    yield bytes([23]) + b"".join(each[:24] for each in (dvl, dvl, imu) * 4)
+    yield bytes([99]) + b"".join(each[:100] for each in (dvl, dvl.replace(b"dvl_link", b"map\0\0\0\0\0"), imu) * 3)
 
 
 def _definition_seeds() -> Iterator[bytes]:
@@ -280,6 +313,7 @@ def _override_seeds() -> Iterator[bytes]:
 _ALIASES = b"a: &a [1.0e-3, .nan]\nb: *a\nc: {d: !!binary aGFsbG8=, <<: {x: 1}}\n"
 _CALIBRATOR = Calibrator(Parameters())
 _SMALLEST_BAG = _small_mcap()
+_MESSAGE_ENDS = [_small_run()[number][2] for number in (0, 0, 1)]
 TARGETS = {
     "mcap": Target(run_mcap, _mcap_seeds),
     "sqlite": Target(run_sqlite, _sqlite_seeds),
@@ -287,6 +321,7 @@ TARGETS = {
     "sqlite_pages": Target(run_sqlite_pages, _sqlite_seeds),
     "metadata": Target(run_metadata, _metadata_seeds),
     "message": Target(run_message, _message_seeds),
+    "columns": Target(run_columns, _column_seeds),
     "definition": Target(run_definition, _definition_seeds),
     "result_file": Target(run_result_file, _result_seeds),
     "parameters": Target(run_parameters, _parameter_seeds),

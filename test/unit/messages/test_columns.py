@@ -9,7 +9,7 @@ import pytest
 from driver_fixtures import MARINE, ODOMETRY, TWIST, TWIST_STAMPED, TYPES, Maker, write_driver_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from io_fixtures import IMU_TYPE, JAZZY, TWIST_TYPE, mcap_bytes, run, write_bag
+from io_fixtures import IMU_TYPE, JAZZY, TWIST_TYPE, mcap_bytes, raw, run, write_bag
 
 from dvl_calib_ros.bags import columns as bag_columns
 from dvl_calib_ros.bags.reader import BagReader
@@ -142,12 +142,9 @@ def test_whatever_is_recorded_gives_the_same_in_columns(tmp_path_factory, messag
     path = tmp_path_factory.mktemp("bag") / "bag.mcap"
     path.write_bytes(mcap_bytes(messages))
     parameters = Parameters(dvl_frame=dvl_frame, imu_rpy=(0.1, 0.0, 0.5) if is_turned else (0.0, 0.0, 0.0))
-    before = bag_columns.WINDOW_MESSAGES, bag_columns.TAKEN
-    bag_columns.WINDOW_MESSAGES, bag_columns.TAKEN = window, min(window, before[1])
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bag_columns, "WINDOW_MESSAGES", window)
         assert_same([path], parameters)
-    finally:
-        bag_columns.WINDOW_MESSAGES, bag_columns.TAKEN = before
 
 
 def test_messages_of_several_bags_arrive_in_order_of_log_time(tmp_path):
@@ -158,6 +155,17 @@ def test_messages_of_several_bags_arrive_in_order_of_log_time(tmp_path):
     assert sorted(map(str, found)) == sorted(map(str, whole))  # of two at the same time either may be first
     stamps = [sample[1] for _, sample in found]
     assert stamps == sorted(stamps)
+
+
+def test_a_window_holds_no_more_than_it_may_of_messages_and_bytes(tmp_path, monkeypatch):
+    bag = write_bag(tmp_path / "bag", run(20.0))
+    monkeypatch.setattr(bag_columns, "WINDOW_BYTES", 10_000)
+    with BagReader([bag]) as reader:
+        sizes = [sum(len(part) for part in window.parts) for window in bag_columns.windows(reader, TOPICS)]
+    lengths = [len(data) for _, _, data in raw(bag)]
+    assert sum(sizes) == len(lengths)
+    assert max(sizes) <= 1 + 10_000 // min(lengths) and min(sizes[:-1]) >= 10_000 // max(lengths)
+    assert_same([bag], Parameters())
 
 
 def test_a_definition_without_what_is_read_is_counted_message_by_message(tmp_path):
