@@ -2,7 +2,9 @@
 
 Data flows one way::
 
-    samples -> streams (order, jumps) -> pairing -> bank of models -> selection -> Estimate
+    samples -> alignment (screening, order, pairing, gates) -> rows -> bank of models -> Estimate
+                                                                  └-> selection
 
-`calibrator.Calibrator` wires these together; the node, the replay and the evaluator all use it.
+`calibrator.Calibrator` wires these together; the node, the replay and the evaluator all use it. See
+docs/architecture.md.
 """

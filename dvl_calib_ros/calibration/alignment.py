@@ -7,7 +7,7 @@
 A row waits for attitude, and then for its reference, no longer than they can still come (streams.py), in order; models
 that need neither do not wait. `Aligner` takes samples one by one (live) or as columns (recordings). Columns with
 a jump of time among them, rare as they are, go row by row. So every rule has one meaning, and test_alignment.py holds
-both ways equal.
+both ways equal. (The module is long because each rule stands beside its twin.)
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,10 +24,10 @@ from .frames import Array, Quaternion, Vector, slerp, slerps
 from .gates import Gates, PriorWindow
 from .models import Needs
 from .parameters import XY, XYZ, Parameters
+from .rows import NO_DECISIONS, Decisions, Events, OrderedStreams, Rows, ScreenedStreams
 from .samples import (
     FRAME_CODES,
     AlignedBlock,
-    Codes,
     DvlSample,
     ImuSample,
     Index,
@@ -53,8 +52,7 @@ from .screening import (
     unit_quaternions,
     valid_rates,
 )
-from .streams import LONG_AGO_NS, Admitted, Bracket, Order, Sequencer, Track
-from .tables import Table
+from .streams import LONG_AGO_NS, Bracket, Order, Sequencer, Track
 
 # A DVL that sends nothing for so long, and for so many times its shortest interval, has dropped out.
 DROPOUT_NS = SECOND_NS
@@ -68,60 +66,6 @@ COLUMNS_FROM = 64
 FORGET_EVERY = 256
 _BODY = FRAME_CODES[VelocityFrame.BODY]
 _NO_ATTITUDE = (math.nan,) * 7
-
-
-class Rows(Table):
-    """The columns of `AlignedBlock` as they come to be known."""
-
-    LAYOUT: ClassVar = {
-        "stamps_ns": (np.int64, ()),
-        "row": (np.int64, ()),
-        "velocity_dvl": (np.float64, (3,)),
-        "covariance": (np.float64, (3, 3)),
-        "interval_ns": (np.int64, ()),
-        "verdict": (np.uint8, ()),
-        "prior_known": (np.bool_, ()),
-        "attitude": (np.float64, (7,)),
-        "pairing": (np.uint8, ()),
-        "reference": (np.float64, (12,)),
-        "frames": (np.uint8, ()),
-        "unmeasured": (np.uint8, ()),
-        "weight": (np.float64, ()),
-        "around_s": (np.float64, (2,)),
-    }
-    stamps_ns: Stamps
-    row: Stamps
-    velocity_dvl: Array
-    covariance: Array
-    interval_ns: Stamps
-    verdict: Codes
-    prior_known: Mask
-    attitude: Array
-    pairing: Codes
-    reference: Array
-    frames: Codes
-    unmeasured: Codes
-    weight: Array
-    around_s: Array
-
-    def await_partners(self, at: int | slice) -> None:
-        """Fill in what is not known yet."""
-        self.verdict[at] = Verdict.AWAITING
-        self.prior_known[at] = False
-        self.attitude[at] = math.nan
-        self.pairing[at] = Pairing.AWAITING
-        self.reference[at] = math.nan
-        self.frames[at] = self.unmeasured[at] = 0
-        self.weight[at] = 1.0
-        self.around_s[at] = 0.0
-
-    def block(self, first: int, end: int) -> AlignedBlock:
-        """The rows with these numbers, as long as nothing is added."""
-        at = slice(first - self.base, end - self.base)
-        return AlignedBlock(*[getattr(self, name)[at] for name in _COLUMNS])
-
-
-_COLUMNS = [each.name for each in fields(AlignedBlock)]
 
 
 class Aligner:
@@ -492,12 +436,12 @@ class Aligner:
             else:
                 take[stream](row)  # type: ignore[operator]
 
-    def _screened(self, streams: Streams) -> _Screened:
+    def _screened(self, streams: Streams) -> ScreenedStreams:
         max_speed = self.parameters.max_speed
         dvl, reference, imu = streams
         of_dvl, of_reference = screen_columns(dvl.covariances), screen_columns(reference.covariances)
         orientation, rates = unit_quaternions(imu.orientation), valid_rates(imu.angular_velocity)
-        return _Screened(
+        return ScreenedStreams(
             streams,
             (dvl.refused == 0) & of_dvl.valid & (of_dvl.unmeasured == 0) & are_valid_velocities(dvl.values, max_speed),
             (reference.refused == 0)
@@ -511,7 +455,7 @@ class Aligner:
             np.concatenate([orientation, rates], axis=1),
         )
 
-    def _ordered(self, screened: _Screened) -> _Ordered | None:
+    def _ordered(self, screened: ScreenedStreams) -> OrderedStreams | None:
         """The rows that are let through; None if a stream has a jump."""
         streams = screened.streams
         dvl_ns = streams.dvl.stamps_ns[screened.dvl]
@@ -525,27 +469,27 @@ class Aligner:
         imu = self.orders[Stream.IMU].admit_columns(imu_ns)
         if dvl is None or reference is None or imu is None:
             return None
-        return _Ordered(
+        return OrderedStreams(
             dvl, np.flatnonzero(screened.dvl)[dvl.rows], dvl_ns[dvl.rows],
             reference, np.flatnonzero(screened.reference)[reference.rows], reference_ns[reference.rows],
             imu, np.flatnonzero(screened.imu)[imu.rows], imu_ns[imu.rows],
             streams.reference.frames[screened.reference][reference.rows],
         )  # fmt: skip
 
-    def _take_ordered(self, screened: _Screened, chunk: _Ordered) -> bool:
+    def _take_ordered(self, screened: ScreenedStreams, chunk: OrderedStreams) -> bool:
         """Take columns without jumps; False, and nothing is changed, if rows may get their partner by waiting.
 
         (A row whose reference is overdue may, while attitude is waited for, see it come after all.)
         """
         dvl, reference, imu = screened.streams
-        events = _Events.of(
+        events = Events.of(
             (dvl.arrival[chunk.dvl_at], reference.arrival[chunk.reference_at], imu.arrival[chunk.imu_at]),
             (chunk.dvl_ns, chunk.reference_ns, chunk.imu_ns),
             (self.orders[Stream.DVL].last_ns, self._reference.newest_ns, self._imu.newest_ns),
             self._max_jump_ns,
         )
         if not len(events.arrival):  # nothing that would let rows go on
-            self._count_columns(screened, chunk, _NO_DECISIONS, events)
+            self._count_columns(screened, chunk, NO_DECISIONS, events)
             self._n_messages += len(dvl)
             return True
         decisions = self._decisions(chunk, events)
@@ -566,7 +510,7 @@ class Aligner:
         self._deadline_ns = LONG_AGO_NS  # what waits now is looked at with the next sample, whatever it is
         return True
 
-    def _decisions(self, chunk: _Ordered, events: _Events) -> _Decisions | None:
+    def _decisions(self, chunk: OrderedStreams, events: Events) -> Decisions | None:
         """When the rows that wait, and those that come, are decided."""
         rows, n_events = self.rows, len(events.horizon_ns)
         waiting = min(self.n_oriented, self.n_paired)
@@ -594,9 +538,11 @@ class Aligner:
             given_up = events.reference_ns[at] < stamps_to_pair[delayed]
             if (given_up & (events.reference_ns[later] != events.reference_ns[at])).any():
                 return None
-        return _Decisions(oriented_at[to_orient:], paired_at, stamps_to_pair)
+        return Decisions(oriented_at[to_orient:], paired_at, stamps_to_pair)
 
-    def _in_earth_frame(self, chunk: _Ordered, stamps_ns: Stamps, decided_at: Index, events: _Events) -> Mask | None:
+    def _in_earth_frame(
+        self, chunk: OrderedStreams, stamps_ns: Stamps, decided_at: Index, events: Events
+    ) -> Mask | None:
         """(N,) rows whose reference, once decided, is in an earth frame; None if none can be."""
         track, n_events = self._reference, len(events.horizon_ns)
         frames = np.concatenate([track.frames[track.begin : track.size], chunk.frames])
@@ -609,7 +555,9 @@ class Aligner:
         found = (decided_at < n_events) & (stamps_ns <= newest_ns) & (stamps_ns >= newest_ns - track.retention_ns)
         return found & (near | (all_ns[after] == stamps_ns)) & (frames[after] != _BODY)
 
-    def _count_columns(self, screened: _Screened, chunk: _Ordered, decisions: _Decisions, events: _Events) -> None:
+    def _count_columns(
+        self, screened: ScreenedStreams, chunk: OrderedStreams, decisions: Decisions, events: Events
+    ) -> None:
         """Count what is not let through."""
         for block, valid, order in zip(
             screened.streams, screened[1:4], (chunk.dvl, chunk.reference, chunk.imu), strict=True
@@ -632,7 +580,7 @@ class Aligner:
             before = decided[np.searchsorted(decisions.paired_at, at)]
             _add(self.tally["reference"], "late", int(np.count_nonzero(stamps_ns < before)))
 
-    def _append_columns(self, screened: _Screened, chunk: _Ordered) -> None:
+    def _append_columns(self, screened: ScreenedStreams, chunk: OrderedStreams) -> None:
         dvl, reference, _ = screened.streams
         if len(chunk.reference_ns):
             track, at = self._reference, chunk.reference_at
@@ -776,84 +724,6 @@ def align(
     aligner = Aligner(parameters, prior_sway_heave)
     aligner.take(streams)
     return aligner.rows.block(0, aligner.rows.end), aligner.prior.sway_heave
-
-
-class _Screened(NamedTuple):
-    """Columns of all streams; which rows are valid, and what is made of them."""
-
-    streams: Streams
-    dvl: Mask
-    reference: Mask
-    imu: Mask
-    dvl_covariance: Array
-    reference_values: Array
-    reference_unmeasured: Codes
-    imu_values: Array
-
-
-class _Ordered(NamedTuple):
-    """Of every stream what is let through: places in its block, and stamps (the DVL's compensated)."""
-
-    dvl: Admitted
-    dvl_at: Index
-    dvl_ns: Stamps
-    reference: Admitted
-    reference_at: Index
-    reference_ns: Stamps
-    imu: Admitted
-    imu_at: Index
-    imu_ns: Stamps
-    frames: Codes
-
-
-class _Decisions(NamedTuple):
-    """Events at which rows are decided: those to orient, those to pair (with their stamps), in order."""
-
-    oriented_at: Index
-    paired_at: Index
-    stamps_ns: Stamps
-
-
-_NO_DECISIONS = _Decisions(*(np.zeros(0, dtype=kind) for kind in (np.intp, np.intp, np.int64)))
-
-
-class _Events(NamedTuple):
-    """The T admitted samples in their order of arrival: at which events those of each stream are, and what is known
-    after each event: newest stamps of reference and IMU (`LONG_AGO_NS`: none), and the horizon (`_horizon_ns`)."""
-
-    arrival: Stamps
-    dvl_at: Index
-    reference_at: Index
-    imu_at: Index
-    reference_ns: Stamps
-    imu_ns: Stamps
-    horizon_ns: Stamps
-
-    @staticmethod
-    def of(
-        arrivals: tuple[Stamps, Stamps, Stamps],
-        stamps_ns: tuple[Stamps, Stamps, Stamps],
-        before_ns: tuple[int | None, int | None, int | None],
-        max_jump_ns: int,
-    ) -> _Events:
-        """Each of DVL, reference, IMU."""
-        arrival = np.concatenate(arrivals)
-        order = np.argsort(arrival, kind="stable")
-        at = np.empty(len(order), dtype=np.intp)
-        at[order] = np.arange(len(order))
-        first, second = len(arrivals[0]), len(arrivals[0]) + len(arrivals[1])
-        places = at[:first], at[first:second], at[second:]
-        newest = []
-        for place, stamps, before in zip(places, stamps_ns, before_ns, strict=True):
-            column = np.full(len(order), LONG_AGO_NS if before is None else before, dtype=np.int64)
-            column[place] = stamps
-            newest.append(np.maximum.accumulate(column))
-        dvl_ns = np.maximum(newest[0], 0)
-        horizon_ns = dvl_ns
-        for track_ns in newest[1:]:
-            ahead = (track_ns > dvl_ns) & (track_ns <= dvl_ns + max_jump_ns)
-            horizon_ns = np.maximum(horizon_ns, np.where(ahead, track_ns, dvl_ns))
-        return _Events(arrival[order], *places, newest[1], newest[2], horizon_ns)
 
 
 def _add(tally: Counter[str], name: str, count: int) -> None:

@@ -1,7 +1,8 @@
 """All models at once: every model that can use a sample is updated by it, always.
 
 So switching models by hand or automatically is a change of what is read, never of what is computed, and the state
-after a switch is that of having run the model from the start.
+after a switch is that of having run the model from the start. (Long, because the padding of models to one size, and its
+undoing, stand beside each other.)
 """
 
 from __future__ import annotations
