@@ -7,6 +7,7 @@ undoing, stand beside each other.)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
@@ -77,6 +78,7 @@ class Assembler:
                 for model in self.models
             ]
         )
+        self.n_rows = np.array([float(model.n_measurement) for model in self.models])
         self._needs_prior = np.array([model.needs_prior for model in self.models])
         rows = np.array([np.arange(N_MEASUREMENT) < model.n_measurement for model in self.models])
         self._own_rows = rows[:, None, :, None] & rows[:, None, None, :]
@@ -131,13 +133,10 @@ class Assembler:
             noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
         return kalman.Measurements(z, h, noise, self._weight(seen, weight), usable, gate)
 
-    def rows(self, seen: Observations) -> Array:
-        """Rows that each model is told by each sample (K, N or 1)."""
-        own = np.array([[float(model.n_measurement)] for model in self.models])
-        if seen.unmeasured is None:
-            return own
-        dropped = [_dropped_axes(model, seen.unmeasured).sum(axis=1) for model in self.models]
-        return own - np.array(dropped)
+    def rows_left(self, unmeasured: Unmeasured) -> Array:
+        """Rows that each model is told by each sample (K, N)."""
+        dropped = [_dropped_axes(model, unmeasured).sum(axis=1) for model in self.models]
+        return self.n_rows[:, None] - np.array(dropped)
 
     def _drop_unmeasured(
         self, z: Array, h: Array, noise: Array, seen: Observations, unmeasured: Unmeasured
@@ -205,10 +204,9 @@ class ModelBank:
         }
         self._group_of = {model.name: self._groups[model.needs] for model in models}
 
-    @property
-    def n_given(self) -> Mapping[Needs, int]:
+    def n_given(self, needs: Needs) -> int:
         """Number of rows that the models with these needs have had."""
-        return {needs: group.n_given for needs, group in self._groups.items()}
+        return self._groups[needs].n_given
 
     def update(
         self,
@@ -289,21 +287,24 @@ class _Group:
         if self._folds is not None:
             self._folds.add(folds_of(stamps_ns, self._parameters), data, after.used)
         standing = None if ends is None else self._standing_at(after, ends)
-        self._used += after.used.sum(axis=1)
+        n_used = after.used.sum(axis=1)
+        self._used += n_used
         self._gated += (data.usable & ~after.used).sum(axis=1)
         self._nis_sum += np.where(after.used, after.nis, 0.0).sum(axis=1)
-        self._rows_sum += (after.used * self._assembler.rows(seen)).sum(axis=1)
+        if seen.unmeasured is None:
+            self._rows_sum += n_used * self._assembler.n_rows
+        else:
+            self._rows_sum += (after.used * self._assembler.rows_left(seen.unmeasured)).sum(axis=1)
         return standing
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
         """The models updated; one whose numbers run away stays as it was before, and is counted."""
         try:
             after = _filtered(self.x, self.p, data, process, ends)
-            sound = _is_sound(after.x, after.p)
+            if _is_sound(after.x, after.p):
+                return after
         except np.linalg.LinAlgError:
-            after, sound = None, np.zeros(len(self.x), dtype=bool)
-        if after is not None and sound.all():
-            return after
+            pass  # of one of them: each by itself
         return kalman.Updated.joined([self._after_alone(k, data, process, ends) for k in range(len(self.x))])
 
     def _after_alone(
@@ -313,7 +314,7 @@ class _Group:
         x, p, own_data = self.x[own], self.p[own], data.model(k)
         with suppress(np.linalg.LinAlgError):
             after = _filtered(x, p, own_data, None if process is None else process[:, own], ends)
-            if _is_sound(after.x, after.p).all():
+            if _is_sound(after.x, after.p):
                 return after
         self._restarted[k] += 1
         nothing = own_data.usable & False
@@ -355,8 +356,8 @@ class _Group:
         """A state (n,) of the filter as the model's; None if it has none that is finite."""
         with suppress(np.linalg.LinAlgError):
             state = self._assembler.state(index, x, p)
-            if _is_sound(state.x[None], state.p[None]).all():
-                return state
+            if not self._assembler.models[index].in_correction_parameters or _is_sound(state.x, state.p):
+                return state  # the filter's own has been looked at
         return None
 
     def states_at(self, name: str, standing: Standing) -> GaussianState:
@@ -364,7 +365,7 @@ class _Group:
         x, p = standing.x[:, index], standing.p[:, index]
         with suppress(np.linalg.LinAlgError):
             states = self._assembler.state(index, x, p)
-            if _is_sound(states.x, states.p).all():
+            if _is_sound(states.x, states.p):
                 return states
         singly = [self._published(index, *each) or self.state(name) for each in zip(x, p, strict=True)]
         return GaussianState(np.array([state.x for state in singly]), np.array([state.p for state in singly]))
@@ -400,11 +401,11 @@ def _filtered(
     return kalman.recursion(x, p, data, process, ends)
 
 
-def _is_sound(x: Array, p: Array) -> Mask:
-    """(K,) of states x (K, n), P (K, n, n): finite, and variances positive."""
-    columns = np.concatenate([x, p.reshape(len(p), -1)], axis=1)
-    positive = np.diagonal(p, axis1=1, axis2=2) > 0.0
-    return np.logical_and(np.isfinite(columns).all(axis=1), positive.all(axis=1))
+def _is_sound(x: Array, p: Array) -> bool:
+    """Whether all of states x (..., n), P (..., n, n) are finite, with variances above zero."""
+    flat_x, flat_p = x.ravel(), p.ravel()
+    finite = math.isfinite(float(flat_x @ flat_x) + float(flat_p @ flat_p))  # nan and inf stay in sums
+    return finite and bool(np.diagonal(p, axis1=-2, axis2=-1).min() > 0.0)
 
 
 def prior(model: Model, parameters: Parameters) -> GaussianState:

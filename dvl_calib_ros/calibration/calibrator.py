@@ -133,7 +133,7 @@ class Calibrator:
             self.selection.update(rows.stamps_ns[at], rows.pairing[at] == Pairing.PAIRED, self.parameters)
             self._n_selected = aligner.n_paired
         for needs in Needs:
-            if aligner.given[needs] - self._bank.n_given[needs] >= self._block_size:
+            if aligner.given[needs] - self._bank.n_given(needs) >= self._block_size:
                 self._update(needs)
 
     # ------------------------------------------------------------------ models

@@ -109,6 +109,7 @@ def recursion(
     one_r, one_gate = data.r.shape[1] == 1, data.gate.shape[1] == 1
     used = np.zeros((k, n_samples), dtype=bool)
     nis = np.zeros((k, n_samples))
+    weighted = bool((data.weight != 1.0).any())
     on_the_way = [(x.copy(), p)]
     for i in range(n_samples):
         if process is not None:
@@ -116,13 +117,15 @@ def recursion(
         h, r_i, weight = data.h[:, i], data.r[:, 0 if one_r else i], data.weight[:, i]
         pht = p @ h.transpose(0, 2, 1)
         hpht = h @ pht
-        s_inverse = np.linalg.inv(hpht + r_i)
         innovation = data.z[:, i, :, None] - h @ x[:, :, None]
-        nis_i = (innovation.transpose(0, 2, 1) @ s_inverse @ innovation)[:, 0, 0]
+        if weighted:  # the gate asks whether this sample fits; the update, how much it may weigh
+            shared_r = r_i / weight[:, None, None]
+            for_gate, s_inverse = np.linalg.inv(hpht + np.stack(np.broadcast_arrays(r_i, shared_r)))
+            r_i = shared_r
+        else:
+            for_gate = s_inverse = np.linalg.inv(hpht + r_i)
+        nis_i = (innovation.transpose(0, 2, 1) @ for_gate @ innovation)[:, 0, 0]
         used_i = data.usable[:, i] & (nis_i <= data.gate[:, 0 if one_gate else i])
-        if (weight != 1.0).any():  # the gate asks whether this sample fits; the update, how much it may weigh
-            r_i = r_i / weight[:, None, None]
-            s_inverse = np.linalg.inv(hpht + r_i)
         gain = (pht @ s_inverse) * used_i[:, None, None]  # a gain of zero leaves x and P exactly as they are
         x += (gain @ innovation)[:, :, 0]
         # Joseph form: a sum of two positive semidefinite terms, so rounding cannot make P indefinite

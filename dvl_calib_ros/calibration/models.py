@@ -33,6 +33,7 @@ Linearised = tuple[Array, Array]
 class Needs(Enum):
     """What a sample must come with, beside the DVL's velocity, for a model to use it."""
 
+    __hash__ = object.__hash__  # Enum's own is slow, and asked for with every live sample
     NOTHING = "nothing"
     REFERENCE = "reference velocity"
     ATTITUDE = "attitude and angular velocity"

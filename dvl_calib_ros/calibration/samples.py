@@ -78,6 +78,7 @@ Sample = DvlSample | ReferenceSample | ImuSample
 class Stream(Enum):
     """The three streams, by the names that they are counted under."""
 
+    __hash__ = object.__hash__  # Enum's own is slow, and asked for with every live sample
     DVL = "dvl"
     REFERENCE = "reference"
     IMU = "imu"
