@@ -77,7 +77,7 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
     from pathlib import Path
 
     files, is_ros = [], False
-    for word, following in zip(args, [*args[1:], ""], strict=True):
+    for word, following in zip(args, [*args[1:], ""], strict=False):
         if word in ("--ros-args", "--"):
             is_ros = word == "--ros-args"
         elif is_ros and word == "--params-file":

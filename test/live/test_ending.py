@@ -75,6 +75,7 @@ def test_a_pipe_that_is_closed_is_a_request():
 def test_parameter_files_are_found_where_rcl_looks_for_them():
     words = ["--params-file", "no", "--ros-args", "--params-file", "a", "-p", "x:=1", "--params-file", "b", "--"]
     assert [*map(str, parameter_files([*words, "--params-file", "no"]))] == ["a", "b"]
+    assert [*parameter_files([])] == []  # ros2 run without any
 
 
 # ---------------------------------------------------------------- the node
