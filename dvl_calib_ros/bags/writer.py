@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 import yaml
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -89,8 +89,13 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         try:
             self._new_part()
-        except (OSError, sqlite3.Error) as error:
-            raise self._unwritable(error) from error
+        except WriterError as error:  # made by another since it was looked at
+            raise InputError(f"{self._path}: {error}; give another name") from error
+        except BaseException as error:  # an interrupt among them
+            shutil.rmtree(self._path, ignore_errors=True)
+            if isinstance(error, OSError | sqlite3.Error):
+                raise self._unwritable(error) from error
+            raise
         return self
 
     def __exit__(

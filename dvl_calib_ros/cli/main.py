@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from .. import __version__
@@ -60,7 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show φ must not end the run
             stream.reconfigure(errors="replace")
     try:
-        return _run(argv)
+        with _terminated_as_interrupted():
+            return _run(argv)
     except KeyboardInterrupt:
         say(f"dvl-calib {next((word for word in argv if not word.startswith('-')), '')}: interrupted")
         return 130
@@ -70,6 +74,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         called = next(module.NAME for module in COMMANDS if module.NAME in argv)
         return _fail(called, f"needs the Python package {name}, which is not installed; pip install {name}")
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end a command as Ctrl-C does: what is half written goes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if signal.getsignal(number) is signal.default_int_handler:  # not if the node, which ends, ignores it now
+                signal.signal(number, handler)
 
 
 def _run(argv: Sequence[str]) -> int:

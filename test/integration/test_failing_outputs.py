@@ -118,6 +118,21 @@ def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
     assert os.listdir(tmp_path) == ["T.csv"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_ended_half_way_leaves_no_half_of_a_bag(tmp_path, number):
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "simulate", str(tmp_path / "new"), "--duration", "3000"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + PATIENCE_S
+        while not os.listdir(tmp_path):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(number)
+        assert process.stderr.read() == "dvl-calib simulate: interrupted\n"
+    # Python makes the second of it where the interrupt went through an exec() of text; 130 to a shell, too
+    assert process.returncode in (130, -signal.SIGINT) and os.listdir(tmp_path) == []
+
+
 @pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
 def test_a_port_that_is_open_and_is_no_scheduler_is_said_within_ten_seconds(bag, tmp_path, capsys, answer):
     pytest.importorskip("distributed", reason="Dask is optional: pip install distributed")
