@@ -72,7 +72,7 @@ def test_package_xml_has_the_keys_of_all_that_the_node_imports():
     messages = {
         name.partition(".")[0]
         for path in node
-        for name in re.findall(r"^from (\w+)[\w.]* import", path.read_text(), re.M)
+        for name in re.findall(r"^ *from (\w+)[\w.]* import", path.read_text(), re.M)
         if name.endswith(("_msgs", "_srvs", "_interfaces")) or name == "rclpy"
     }
     assert len(messages) >= 5 and messages <= keys
