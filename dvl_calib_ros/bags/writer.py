@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 import yaml
+from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
@@ -79,6 +80,7 @@ class BagWriter:
         # a file holds one definition of each type: rosbag2 and rosbags look it up by the type's name
         self._parts: list[_Part] = []
         self._part_of: dict[Channel, _Part] = {}
+        self._channels: dict[tuple[str, str], Channel] = {}
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Attach a file to the bag. Raises InputError unless it is plain MCAP."""
@@ -120,8 +122,12 @@ class BagWriter:
 
     def message(self, topic: str, msgtype: str, log_ns: int, message: Any) -> None:
         """Write a message of a type that `typestore` has."""
-        data = bytes(self.typestore.serialize_cdr(message, msgtype))
-        self._write(Channel(topic, msgtype), log_ns, data)
+        channel = self._channels.get((topic, msgtype))
+        if channel is None:
+            text, _ = self.typestore.generate_msgdef(msgtype, ros_version=2)
+            channel = Channel(topic, msgtype, Definition(MessageDefinitionFormat.MSG, text))
+            self._channels[topic, msgtype] = channel
+        self._write(channel, log_ns, bytes(self.typestore.serialize_cdr(message, msgtype)))
 
     def raw(self, channel: Channel, log_ns: int, data: bytes) -> None:
         """Write a message as it was recorded, its definition with it."""
@@ -192,16 +198,9 @@ class _Part:
 
     def add(self, channel: Channel) -> None:
         topic, msgtype, definition = channel
-        if definition is None and msgtype in _JAZZY.types:
-            connection = self.writer.add_connection(topic, msgtype, typestore=_JAZZY)
-        else:
-            text = definition.text if definition else ""
-            digest = _type_hash(definition, msgtype)
-            connection = self.writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest)
-        self.connections[channel] = connection
-
-
-_JAZZY = get_typestore(Stores.ROS2_JAZZY)
+        text = definition.text if definition else ""
+        digest = _type_hash(definition, msgtype)
+        self.connections[channel] = self.writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest)
 
 
 def _type_hash(definition: Definition | None, msgtype: str) -> str:

@@ -14,6 +14,9 @@ from .frames import ENU_FROM_NED, Array, Quaternion, Vector, quaternion_from_rot
 from .parameters import IMU_NED, Parameters
 from .samples import ImuSample, SampleBlock
 
+# What is not finite stays so, and is counted further on.
+_QUIET = np.errstate(invalid="ignore", over="ignore")
+
 
 class ImuAlignment:
     """Turns samples of an IMU as parameters imu_rpy and imu_frame say.
@@ -52,10 +55,12 @@ class ImuAlignment:
             block, values=np.hstack([self._turned(block.orientation), self._in_body(block.angular_velocity)])
         )
 
+    @_QUIET
     def _turned(self, orientation: Array) -> Array:
         """Quaternions (N, 4) of the IMU in its world -> of the body in ENU."""
         return quaternion_product(quaternion_product(self._enu_from_world, orientation), self._imu_from_body)
 
+    @_QUIET
     def _in_body(self, angular_velocity: Array) -> Array:
         """(N, 3) rad/s; not by a matrix product, whose last bit depends on how many rows there are."""
         return np.sum(angular_velocity[:, None, :] * self._rotation_body_from_imu, axis=-1)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from driver_fixtures import A50, Maker, write_driver_bag
+from driver_fixtures import A50, Maker, forget_definitions, write_driver_bag
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from io_fixtures import JAZZY, TOPICS, estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dvl_calib_ros.bags import channels, definitions, sources
 from dvl_calib_ros.bags.channels import Channel, DecodingError
-from dvl_calib_ros.bags.definitions import Definition
+from dvl_calib_ros.bags.definitions import Definition, is_empty
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.calibration.samples import DvlSample
@@ -286,6 +286,15 @@ def test_a_database_with_two_definitions_of_a_type_tells_them_by_their_hash(tmp_
     with BagReader([file]) as bag:
         found = [(message.twist.twist.linear.x, why) for _, _, message, why in bag.messages(TOPICS)]
     assert found == [(1.5, "")] * 11
+
+
+def test_salvage_of_a_bag_without_definitions_writes_none(tmp_path):
+    """As it was recorded: nobody knows whether its messages are laid out as Jazzy's."""
+    bag = forget_definitions(write_bag(tmp_path / "bag", run(6.0), "sqlite3"))
+    assert main(["salvage", str(bag), "-o", str(tmp_path / "new"), "--storage", "sqlite3"]) == 0
+    with BagReader([tmp_path / "new"]) as reader:
+        assert all(is_empty(channel.definition) for topic in TOPICS for channel in reader.channels(topic))
+    assert raw(tmp_path / "new") == raw(bag)
 
 
 # ---------------------------------------------------------------------- what is no damage
