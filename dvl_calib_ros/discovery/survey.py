@@ -25,6 +25,8 @@ from ..messages.fixes import FixDifference
 # straights; 10 Hz is what a DVL gives at most.
 BURSTS, BURST_NS, BURST_EVERY_NS = 60, 2_000_000_000, 95_000_000
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
+# What is faster (m/s) is garbage, whose square may be no number any more; millimetres per second still pass.
+FASTEST = 1e5
 # Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
 MOST_STATIC = 200
 MOVING_TYPES = frozenset({*VELOCITY_TYPES, IMU_TYPE})
@@ -145,7 +147,8 @@ def _look(
     if not rows:
         return None
     values = np.array(rows, dtype=float)
-    whole = np.isfinite(values).all(axis=1) if msgtype != IMU_TYPE else np.ones(len(values), dtype=bool)
+    values[~(np.abs(values) < FASTEST)] = np.nan  # so that their squares are numbers
+    whole = (np.abs(values) < FASTEST).all(axis=1) if msgtype != IMU_TYPE else np.ones(len(values), dtype=bool)
     order = np.argsort(np.array(stamps)[whole], kind="stable")
     return Look(topic, msgtype, count, rate_hz, frame_id, np.array(stamps)[whole][order], values[whole][order])
 
@@ -210,5 +213,6 @@ def comparable(a: Look, at_s: Array, longest_gap_s: float = 1.5) -> tuple[Array,
         later[other_way, :4] *= -1.0
     values = before + share * (later - before)
     if a.msgtype == IMU_TYPE:
-        values[:, :4] /= np.linalg.norm(values[:, :4], axis=1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):  # an orientation of zeros is none, and becomes nan
+            values[:, :4] /= np.linalg.norm(values[:, :4], axis=1, keepdims=True)
     return values, near

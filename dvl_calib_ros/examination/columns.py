@@ -14,6 +14,7 @@ from ..bags.columns import Part, windows
 from ..bags.reader import BagReader
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
+from ..discovery.survey import FASTEST
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
 
@@ -151,13 +152,17 @@ def _joined(topic: str, msgtype: str, parts: list[_Rows], unreadable: int) -> Re
         empty = np.zeros(0, dtype=np.int64)
         return Recorded(topic, msgtype, empty, empty, np.zeros((0, width)), np.zeros((0, 3)), refused, unreadable)
     order = np.argsort(np.concatenate([part.arrival for part in parts]), kind="stable")
+    values = np.concatenate([part.values for part in parts])[order]
+    values[~(np.abs(values) < FASTEST)] = np.nan
+    variances = np.concatenate([part.variances for part in parts])[order]
+    variances[~(variances < FASTEST**2)] = np.nan
     return Recorded(
         topic,
         msgtype,
         np.concatenate([part.stamps_ns for part in parts])[order],
         np.concatenate([part.log_ns for part in parts])[order],
-        np.concatenate([part.values for part in parts])[order],
-        np.concatenate([part.variances for part in parts])[order],
+        values,
+        variances,
         refused,
         unreadable,
     )

@@ -142,7 +142,7 @@ def _dvl_msgs_covariance(message: Any) -> Any:
     covariance = getattr(message, "covariance", ())
     if len(covariance):
         return covariance
-    return None if message.fom == 0.0 else message.fom**2 * np.eye(3)
+    return None if message.fom == 0.0 else np.diag([message.fom**2] * 3)
 
 
 class _Velocity(NamedTuple):
