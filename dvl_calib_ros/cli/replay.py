@@ -50,9 +50,7 @@ def run(arguments: argparse.Namespace) -> None:
     write_report = report_writer(arguments, "write_replay_report")
     discovery = common.discovered(arguments, arguments.bags, parameters)
     with common.progress("replaying") as on_progress:
-        replayed = replay(
-            arguments.bags, discovery.parameters, discovery.topics, on_progress, with_history=write_report is not None
-        )
+        replayed = replay(arguments.bags, discovery.parameters, discovery.topics, on_progress, with_history=True)
     result = replayed.result
     if arguments.json is not None:
         common.write_json(
