@@ -39,7 +39,6 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
-        from rclpy.task import Future
 
         from ..calibration.parameters import ParameterError
         from ..errors import InputError
@@ -57,11 +56,12 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     node = None
     try:
         node = CalibrationNode(parameter_files(args))
-        asked_to_end = Future()
-        ending.tell(lambda: asked_to_end.set_result(None))
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin_until_future_complete(asked_to_end)
+        # spin_until_future_complete would remember one callback more with every message
+        ending.tell(lambda: executor.create_task(lambda: None))
+        while not ending.requested:
+            executor.spin_once()
     except (ParameterError, InputError) as error:
         return _refused(error)
     finally:
