@@ -24,10 +24,20 @@ ANSWERED = [name for name, stack in STACKS.items() if not stack.missing]
 UNPLACED = "lever_arm:="
 
 
+class Bags(dict[str, Path]):
+    """Each written when a test asks for it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __missing__(self, name: str) -> Path:
+        self[name] = STACKS[name].write(self._folder / name)
+        return self[name]
+
+
 @pytest.fixture(scope="module")
-def bags(tmp_path_factory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("stacks")
-    return {name: stack.write(folder / name) for name, stack in STACKS.items()}
+def bags(tmp_path_factory) -> Bags:
+    return Bags(tmp_path_factory.mktemp("stacks"))
 
 
 def answered(bag: Path, given: Given | None = None, **parameters) -> tuple[Discovery, Replayed]:
