@@ -29,7 +29,7 @@ class Ending:
 
     def __init__(self, closed: int | None = None) -> None:
         self._requested = threading.Event()
-        self._told: list[Callable[[], None]] = []
+        self._told: list[Callable[[], object]] = []
         self._closed = closed
 
     def __enter__(self) -> Ending:
@@ -57,7 +57,7 @@ class Ending:
         """Whether it has been asked for."""
         return self._requested.is_set()
 
-    def tell(self, function: Callable[[], None]) -> None:
+    def tell(self, function: Callable[[], object]) -> None:
         """Call a function, from another thread, when it is asked for; now, if it has been."""
         self._told.append(function)
         if self.requested:
