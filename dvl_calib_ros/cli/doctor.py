@@ -61,20 +61,11 @@ def _print(examined: Examination) -> None:
     names = ", ".join(path.name or str(path) for path in examined.paths)
     out.print(f"\n{escape(printable(names))}: {examined.seconds:.0f} s")
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in ("", "topic", "type", "frame", "Hz", "claims"):
-        is_type = column == "type"  # the longest and the least interesting
-        table.add_column(
-            column,
-            justify="right" if column == "Hz" else "left",
-            no_wrap=column != "topic",
-            overflow="ellipsis" if is_type else "fold",
-            max_width=14 if is_type else None,
-        )
+    for column in ("", "topic", "frame", "Hz", "claims"):
+        table.add_column(column, justify="right" if column == "Hz" else "left", overflow="fold")
     for content in examined.contents:
-        cells = (content.topic, content.msgtype.rsplit("/", 1)[-1], content.frame_id)
-        table.add_row(
-            content.role, *(escape(printable(cell)) for cell in cells), f"{content.rate_hz:.3g}", content.covariance
-        )
+        cells = [escape(printable(cell)) for cell in (content.topic, content.frame_id)]
+        table.add_row(content.role, *cells, f"{content.rate_hz:.3g}", content.covariance.removesuffix(" always"))
     out.print(table)
     for sentence in (*examined.discovery.found[1:], *examined.discovery.notes):
         out.print(f"[dim]{escape(printable(sentence))}[/]")

@@ -40,11 +40,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 def ros_arguments(arguments: argparse.Namespace) -> list[str]:
     """The options as ROS 2 arguments."""
+    from ..files.parameter_files import ros_override
+
     ros = ["--ros-args"]
     if arguments.params is not None:
         ros += ["--params-file", str(Path(arguments.params).resolve())]
     for override in arguments.overrides:
-        ros += ["-p", override]
+        ros += ["-p", ros_override(override)]
     for default, topic in (
         ("dvl/twist", arguments.dvl_topic),
         ("gnss/twist", arguments.gnss_topic),

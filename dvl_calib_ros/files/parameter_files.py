@@ -57,6 +57,13 @@ def given_parameters(path: Path | None, overrides: Sequence[str] = ()) -> frozen
     return frozenset({*in_file, *(_override(override)[0] for override in overrides)})
 
 
+def ros_override(text: str) -> str:
+    """An override in the form that ROS 2 takes, which knows no degrees. Raises InputError."""
+    name, value = _override(text)
+    written = text.partition(":=")[2]
+    return f"{name}:={value}" if value != parse_scalar(written) and written else text
+
+
 def _override(text: str) -> tuple[str, Any]:
     """Name and value of ``name:=value``. Raises InputError."""
     name, separator, written = text.partition(":=")

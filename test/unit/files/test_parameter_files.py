@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,14 @@ from hypothesis import strategies as st
 
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.parameter_files import load_parameters, names_of_others, parameter_file_text, parameter_table
+from dvl_calib_ros.files.parameter_files import (
+    given_parameters,
+    load_parameters,
+    names_of_others,
+    parameter_file_text,
+    parameter_table,
+    ros_override,
+)
 
 
 def file_with(folder: Path, text: str) -> Path:
@@ -228,3 +236,29 @@ def test_the_table_has_one_row_of_five_cells_for_every_parameter():
     rows = parameter_table().strip().splitlines()[2:]
     assert [row.split("`")[1] for row in rows] == list(SCHEMA)
     assert all(row.count("|") == 6 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("mounting_rpy:=[0, 0, 45deg]", (0.0, 0.0, math.radians(45.0))),
+        ("mounting_rpy:=0 -1.5deg 45°", (0.0, math.radians(-1.5), math.radians(45.0))),
+        ("mounting_rpy:=[0.0, 0.0, 0.7]", (0.0, 0.0, 0.7)),
+        ("imu_rpy:=180deg, 0, 0", (math.pi, 0.0, 0.0)),
+    ],
+)
+def test_angles_of_an_override_may_be_in_degrees_and_ros_gets_radians(text, expected):
+    name = text.partition(":=")[0]
+    assert getattr(load_parameters(None, [text]), name) == pytest.approx(expected)
+    assert getattr(load_parameters(None, [ros_override(text)]), name) == pytest.approx(expected)
+    assert "deg" not in ros_override(text) and "°" not in ros_override(text)
+
+
+def test_an_override_that_is_no_angle_goes_to_ros_as_it_was_typed():
+    for text in ("min_speed:=0.5", "model:=G1", "result_file:=", "result_file:=a b.yaml", "lever_arm:=[1,2,3]"):
+        assert ros_override(text) == text
+
+
+def test_what_a_file_leaves_at_its_default_is_not_given(tmp_path):
+    path = file_with(tmp_path, parameter_file_text().replace("min_speed: 0.3", "min_speed: 0.4"))
+    assert given_parameters(path, ["mounting_rpy:=[0,0,0]"]) == {"min_speed", "mounting_rpy"}
