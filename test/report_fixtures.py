@@ -187,7 +187,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
     values: dict[str, Any] = {
         "verdict": Verdict.AMBIGUOUS,
         "sentence": "The gap is explained by <i>two</i> effects.",
-        "gap": Gap(0.0321, 0.0043, 0.0346, 0.982, (0.91, 1.0)),
+        "gap": Gap(0.0421, 0.0353, 0.0346, 0.982, (0.91, 1.0), 0.007, 0.03),
         "effects": (
             FoundEffect("lever_arm", ("sideslip",), {"x_m": (0.3, 0.25, 0.35), "z_m": (-0.1, -0.3, 0.1)}, 0.85, 1e-20),
             FoundEffect(OWN_EFFECT, (), {"gain": (1500.0, 1200.0, 1800.0)}, -0.02, 1e-9),

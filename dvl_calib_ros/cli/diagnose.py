@@ -64,7 +64,6 @@ def run(arguments: argparse.Namespace) -> None:
     write_report = report_writer(arguments, "write_diagnosis_report")
     discovery = common.discovered(arguments, arguments.bags, parameters)
     parameters = discovery.parameters
-    common.print_found(discovery, arguments.bags)
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(
             arguments.bags,
@@ -77,9 +76,14 @@ def run(arguments: argparse.Namespace) -> None:
         common.write_json(arguments.json, diagnosis_document(diagnosis))
     if arguments.apply is not None:
         save_text(arguments.apply, parameter_file(compensated(parameters, diagnosis)))
+        if any(effect.by_recording for effect in diagnosis.effects):
+            for index, (name, _) in enumerate(diagnosis.recordings):
+                own = arguments.apply.with_name(f"{arguments.apply.stem}.{Path(name).stem}{arguments.apply.suffix}")
+                save_text(own, parameter_file(compensated(parameters, diagnosis, index)))
     if write_report is not None:
         write_report(arguments.report, diagnosis)
     _print(diagnosis)
+    common.print_found(discovery, arguments.bags)
 
 
 def _print(diagnosis: Diagnosis) -> None:
@@ -114,9 +118,9 @@ def _table(title: str, *columns: str) -> Table:
 def _effects(diagnosis: Diagnosis) -> Table:
     gap = diagnosis.gap
     title = (
-        f"gap {1e3 * gap.before:.1f} mm/s before, {1e3 * gap.after:.1f} after, over a noise floor of "
-        f"{1e3 * gap.noise_floor:.0f}; closure {_share(gap.closure)} ({_share(gap.interval[0])} to "
-        f"{_share(gap.interval[1])}), held out"
+        f"error {1e3 * gap.before:.1f} mm/s before, {1e3 * gap.after:.1f} after, held out, over noise of "
+        f"{1e3 * gap.noise_floor:.1f}; not explained {1e3 * gap.not_explained:.1f}; closure {_share(gap.closure)} "
+        f"({_share(gap.interval[0])} to {_share(gap.interval[1])})"
     )
     table = _table(title, "effect", "or else", "parameters (95 %)", "closure", "p")
     for effect in diagnosis.effects:
@@ -124,6 +128,8 @@ def _effects(diagnosis: Diagnosis) -> Table:
             effect.name, ", ".join(effect.equivalent_to) or "-", _values(effect.parameters), _share(effect.closure),
             f"{effect.p:.1g}",
         )  # fmt: skip
+        for recording, parameters in effect.by_recording.items():
+            table.add_row(f"  {recording}", "", _values(parameters), "", "")
     return table
 
 

@@ -1,39 +1,55 @@
-"""How much of the gap goes away, on data that the parameters have not seen."""
+"""How large the error is and how much of it goes away, on data that the parameters have not seen."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
-from ..effects.base import Effect
-from .fitting import Fit, Fitter
-from .problem import PRIOR_STD, Problem
-from .selection import Selection, selected_again
+from .composed import Hypothesis, Problem
+from .fitting import Fitter
+from .selection import Selection
+from .settings import SETTINGS
 
-BLOCK_S = 20.0
-FOLDS = 5
 RESAMPLES = 1000
+# Noise at high frequencies that is larger than what the messages claim by more than this is not taken for noise
+WORSE_THAN_CLAIMED = 3.0
+# Steps of a fit that starts from that to all of the data
+FOLD_STEPS = 6
 Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Vector RMS, m/s, on held-out data. closure: nan where there is no gap to close, as its interval."""
+    """Vector RMS, m/s, per sample, on held-out data. before, after: errors as they are, noise included.
+
+    noise_floor: what the instruments and the high frequencies show. closure: of what is beyond that, nan where there
+    is none; interval: its 95 per cent. not_explained: what of `after` is not noise. reported: noise that the messages
+    claim, None where they do not. by_recording: before and after of each of several.
+    """
 
     before: float
     after: float
     noise_floor: float
     closure: float
     interval: tuple[float, float]
+    not_explained: float = 0.0
+    reported: float | None = None
+    by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def beyond_noise(self) -> float:
+        """m/s, of before."""
+        return float(np.sqrt(max(0.0, self.before**2 - self.noise_floor**2)))
 
 
 @dataclass(frozen=True)
 class HeldOutResiduals:
-    """before, after: residuals (M, 3) m/s of calibrations without and with the effects that have not seen them.
-    floor: (M, 3) (m/s)², the square of the noise in both. block: (M,) index, for resampling.
+    """before, after: errors (F, 3) m/s of calibrations without and with the effects that have not seen them.
+    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling.
     """
 
     before: Array
@@ -49,36 +65,56 @@ class HeldOutResiduals:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
-def held_out(selection: Selection, dictionary: Array, only: Effect | None = None) -> HeldOutResiduals:
+def held_out(selection: Selection) -> HeldOutResiduals:
     """What is left before and after the effects of a selection, on held-out data.
 
-    Effects are selected, and fitted with the calibration, on all folds but one, and judged on that; `only`: that one
-    effect in all folds. The noise floor is what is left by everything together, the dictionary of `unexplained` too if
-    given, with the degrees of freedom given back: so it shares the noise of before and after, and their differences are
-    exact to the size of the gap rather than of the noise. A simulator that lacks nothing would still be calibrated on
-    the other folds: what that costs belongs to the floor.
+    Of one recording stretches of time in turn are held out; of several whole ones, with what belongs to the day
+    (`Effect.of_the_day`) fitted to them. Everything is fitted anew in the composed model.
     """
     fitter, fit = selection.fitter, selection.fit
-    block, fold = blocks_of(fitter.problem)
-    before, after = np.empty_like(fitter.residual), np.empty_like(fitter.residual)
-    floor = _floor(fitter, fit, dictionary)
-    for held in np.unique(fold):
-        test = fold[block] == held
-        train = selection.seen.without(test)
-        before[test] = train.left(train.solved([]), [])[test]
-        after[test] = before[test]
-        if fit.effects:
-            chosen = [fit.effects.index(only)] if only is not None else selected_again(train)
-            after[test] = train.left(train.solved(chosen), chosen)[test]
-        base = fitter.problem.base[test]
-        floor[test] += np.einsum("mip,pq,miq->mi", base, train.covariance([]), base, optimize=True)
-    return HeldOutResiduals(before, after, floor, block)
+    problem = fitter.problem
+    before, after = np.zeros((len(problem.bin_of), 3)), np.zeros((len(problem.bin_of), 3))
+    hypotheses = selection.base.hypothesis, fit.hypothesis
+    fold_of = folds_of(problem)
+    for fold in np.unique(fold_of):
+        held = fold_of == fold
+        at = held[problem.bin_of]
+        train = fitter.without(held)
+        for hypothesis, into in zip(hypotheses, (before, after), strict=True):
+            fitted = train.fit(hypothesis, fit.noise, FOLD_STEPS).hypothesis
+            if len(problem.recordings) > 1:
+                into[at] = _with_its_own_day(selection, fitted, int(fold))
+            else:
+                into[at] = problem.errors(problem.all_seen(fitted))[at]
+    block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
+    return HeldOutResiduals(before, after, noise_floor(selection), np.asarray(block, dtype=np.intp))
 
 
-def measure_gap(selection: Selection, dictionary: Array, only: Effect | None = None) -> Gap:
-    """Held-out gap before and after the effects of a selection, or one of them, with a bootstrap over blocks."""
-    before, after, floor = held_out(selection, dictionary, only).squares()
-    n = len(selection.fitter.residual)
+def _with_its_own_day(selection: Selection, hypothesis: Hypothesis, recording: int) -> Array:
+    """Errors of one recording with the vehicle as others tell it and the day as it tells itself."""
+    problem, noise = selection.fitter.problem, selection.fit.noise
+    alone = only(problem, recording)
+    of_it = problem.recording_of == recording
+    part = replace(noise, segments=alone.segments, level=noise.level[of_it])
+    if noise.rotation is not None:
+        part = replace(part, rotation=noise.rotation[of_it])
+    outliers = selection.fitter.outliers
+    fitter = Fitter(alone, outliers[of_it] if isinstance(outliers, np.ndarray) else outliers)
+    values = {name: (per[recording],) for name, per in hypothesis.values.items()}
+    fitted = fitter.fit(replace(hypothesis, values=values), part, only_of_the_day=True)
+    return alone.errors(fitted.seen)
+
+
+def only(problem: Problem, recording: int) -> Problem:
+    """The problem of one of its recordings."""
+    made = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
+    return replace(made, grids=(problem.grids[recording],), of_axes=problem.measured)
+
+
+def measure_gap(selection: Selection, residuals: HeldOutResiduals) -> Gap:
+    """Held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
+    before, after, floor = residuals.squares()
+    n = len(residuals.before)
 
     def closure(at: Integers) -> Array:
         gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
@@ -87,43 +123,117 @@ def measure_gap(selection: Selection, dictionary: Array, only: Effect | None = N
     rng = np.random.default_rng(0)
     resampled = closure(rng.integers(0, len(before), (RESAMPLES, len(before))))
     low, high = np.percentile(np.clip(resampled, -1.0, 1.0), [2.5, 97.5]).tolist()
-    excess = [max(0.0, float(part.sum() - floor.sum()) / n) for part in (before, after)]
-    is_gap = bool(selection.fit.effects) and excess[0] > 0.0
+    squares = [float(part.sum()) / n for part in (before, after, floor)]
+    is_gap = bool(selection.fit.effects) and squares[0] > squares[2]
     value = min(1.0, float(closure(np.arange(len(before))))) if is_gap else np.nan
     return Gap(
-        before=float(np.sqrt(excess[0])),
-        after=float(np.sqrt(excess[1])),
-        noise_floor=float(np.sqrt(max(0.0, floor.sum() / n))),
+        before=float(np.sqrt(squares[0])),
+        after=float(np.sqrt(squares[1])),
+        noise_floor=float(np.sqrt(squares[2])),
         closure=max(-1.0, value) if is_gap else np.nan,
         interval=(low, high) if is_gap else (np.nan, np.nan),
+        not_explained=float(np.sqrt(max(0.0, squares[1] - squares[2]))),
+        reported=_reported(selection.fitter.problem),
+        by_recording=_by_recording(selection.fitter.problem, residuals),
     )
 
 
-def blocks_of(problem: Problem) -> tuple[Integers, Integers]:
-    """Block of each of the M samples, and fold of each block: whole recordings, of one recording stretches in turn."""
-    index = np.floor(problem.time / BLOCK_S).astype(int)
-    keys = problem.recording_of * (index.max() + 1) + index
-    _, first, block = np.unique(keys, return_index=True, return_inverse=True)
-    if len(problem.recordings) > 1:
-        return block, problem.recording_of[first]
-    return block, np.arange(len(first)) % FOLDS
+def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tuple[float, float]]:
+    if len(problem.recordings) == 1:
+        return {}
+    of_sample = problem.recording_of[problem.bin_of]
+    found = {}
+    for index, recording in enumerate(problem.recordings):
+        at = of_sample == index
+        rms = [float(np.sqrt((each[at] ** 2).sum(axis=1).mean())) for each in (residuals.before, residuals.after)]
+        found[recording.name] = (rms[0], rms[1])
+    return found
 
 
-def _floor(fitter: Fitter, fit: Fit, dictionary: Array) -> Array:
-    """(M, 3) (m/s)², square of the noise: of what is left, and of what the fit has taken of it."""
-    base = fitter.problem.base
-    jacobians = [(effect, *fitter.jacobian(effect, fit.values[effect.name])) for effect in fit.effects]
-    series = fit.residual + base @ fit.change
-    for effect, specs, jacobian in jacobians:
-        series = series + jacobian @ np.array([fit.values[effect.name][spec.name] for spec in specs])
-    size = np.maximum(np.sqrt((dictionary**2).mean(axis=(0, 1))), 1e-12)
-    columns = np.concatenate([base, *(jacobian for *_, jacobian in jacobians), dictionary / size], axis=2)
-    weak = [np.array([1e-3 / spec.typical for spec in specs]) for _, specs, _ in jacobians]
-    prior = np.concatenate([1.0 / PRIOR_STD, *weak, np.full(dictionary.shape[2], 1e-3)])
-    white = fit.noise.whiten(np.concatenate([columns, series[:, :, None]], axis=2))
-    normal = white[:, :-1].T @ white[:, :-1] + np.diag(prior**2)
-    covariance = np.linalg.pinv(normal, hermitian=True)
-    left = series - columns @ (covariance @ (white[:, :-1].T @ white[:, -1]))
-    taken = np.einsum("mip,pq,miq->mi", columns, covariance, columns, optimize=True)
-    floor: Array = left**2 + taken
+def closure_alone(selection: Selection, gap: Gap, name: str) -> float:
+    """Share of the gap that one effect closes without the others, as fitted to all data."""
+    fitter, fit = selection.fitter, selection.fit
+    chosen = [effect for effect in fit.effects if effect.name == name]
+    if len(fit.effects) == 1 or not np.isfinite(gap.closure):
+        return gap.closure
+    alone = fitter.fit(fit.hypothesis.with_effects(chosen, len(fit.seen), {}), fit.noise)
+    without, with_it = (
+        float(np.mean((fitter.problem.errors(each.seen) ** 2).sum(axis=1))) for each in (selection.base, alone)
+    )
+    return float(np.clip((without - with_it) / max(gap.beyond_noise**2, 1e-300), -1.0, 1.0))
+
+
+# ------------------------------------------------------------------ noise
+
+
+def noise_floor(selection: Selection) -> Array:
+    """(F, 3) (m/s)²: the noise of each sample.
+
+    Where what the fit leaves is as small as the high frequencies say that the noise is, it is what is left, sample by
+    sample: so it shares the noise of before and after, and their differences are exact to the size of the gap rather
+    than of the noise. Where more is left, that is slow, and no noise: then the level of the high frequencies is.
+    """
+    problem, fit = selection.fitter.problem, selection.fit
+    left = problem.errors(fit.seen)
+    floor = np.zeros_like(left)
+    claimed = claimed_std(problem)
+    parameters = fit.columns.shape[2]
+    of_sample = problem.recording_of[problem.bin_of]
+    for recording in range(len(problem.recordings)):
+        at = of_sample == recording
+        high, error = high_frequency_variance(problem.sample_time[at], left[at])
+        if claimed is not None:
+            high = np.minimum(high, WORSE_THAN_CLAIMED**2 * claimed[recording] ** 2)
+        n = int(at.sum())
+        own = left[at] ** 2 * (1.0 + 2.0 * parameters / (3.0 * max(n, 1)))
+        is_noise = own.mean(axis=0).sum() <= high.sum() * (1.0 + SETTINGS.noise_tolerance * error)
+        floor[at] = own if is_noise else high
     return floor
+
+
+def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
+    """Variance (3,) that values (F, 3) show from sample to sample, and its relative standard error.
+
+    Of second differences: of white noise 6 times its variance, of what is slow next to nothing. Those that are far out
+    (outliers) are left out, like as many of white noise.
+    """
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    near = np.abs(time[2:] - time[:-2] - 2.0 * interval) < interval
+    second = second[near]
+    if len(second) < 4:
+        return np.zeros(values.shape[1]), np.inf
+    return np.asarray((second**2).mean(axis=0) / 6.0), float(np.sqrt(3.9 / len(second)))
+
+
+def claimed_std(problem: Problem) -> list[Array] | None:
+    """(3,) m/s per recording, that the messages claim of the difference per axis, None where one does not."""
+    found = []
+    for recording in problem.recordings:
+        if recording.dvl_std is None or recording.reference_std is None:
+            return None
+        measured = np.array(problem.measured)
+        reference = np.where(measured, recording.reference_std, 0.0)
+        found.append(np.where(measured, np.hypot(np.mean(recording.dvl_std), np.mean(reference[measured])), 0.0))
+    return found
+
+
+def _reported(problem: Problem) -> float | None:
+    claimed = claimed_std(problem)
+    return None if claimed is None else float(np.sqrt(np.mean([np.sum(each**2) for each in claimed])))
+
+
+# ------------------------------------------------------------------ folds
+
+
+def _block_keys(problem: Problem) -> Integers:
+    index = np.floor(problem.time / SETTINGS.block).astype(int)
+    index -= index.min()
+    return np.asarray(problem.recording_of * (index.max() + 1) + index, dtype=np.intp)
+
+
+def folds_of(problem: Problem) -> Integers:
+    """(M,) fold of each bin: whole recordings, of one recording stretches in turn."""
+    if len(problem.recordings) > 1:
+        return problem.recording_of
+    return np.asarray(np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds, dtype=np.intp)

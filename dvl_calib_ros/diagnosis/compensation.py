@@ -9,20 +9,43 @@ import yaml
 from ..calibration.parameters import SCHEMA, Parameters
 from .results import Diagnosis
 
+OFFSETS = {
+    "dvl_time_offset": "dvl_time_offset",
+    "reference_time_offset": "reference_time_offset",
+    "attitude_time_offset": "imu_time_offset",
+}
 
-def compensated(parameters: Parameters, diagnosis: Diagnosis) -> Parameters:
-    """The parameters with what was found on top: the rest of a lever arm, the rest of a time offset.
 
-    Only the first name of a set is taken. What the calibration has no parameter for is left alone.
+def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | None = None) -> Parameters:
+    """The parameters with what was found on top: the rest of a lever arm, of a clock's offset, drift and jump.
+
+    recording: of several, whose own (of the day) are wanted; None: only what belongs to the vehicle, and the day's
+    where there is but one recording. Only the first name of a set is taken. What the calibration has no parameter for
+    is left alone.
     """
     values: dict[str, Any] = {}
-    for effect in diagnosis.effects:
-        found = {name: value for name, (value, _, _) in effect.parameters.items()}
+    for effect in sorted(diagnosis.effects, key=lambda each: each.name == "time_offset_jump"):
+        parameter_values = effect.parameters
+        if effect.by_recording:
+            if recording is None:
+                continue
+            parameter_values = effect.by_recording.get(diagnosis.recordings[recording][0], {})
+        found = {name: value for name, (value, _, _) in parameter_values.items()}
+        if not found:
+            continue
         if effect.name == "lever_arm":
             axes = zip(parameters.lever_arm, ("x_m", "y_m", "z_m"), strict=True)
             values["lever_arm"] = tuple(known + found[axis] for known, axis in axes)
-        elif effect.name == "dvl_time_offset":
-            values["dvl_time_offset"] = parameters.dvl_time_offset + found["seconds"]
+        elif effect.name in OFFSETS:
+            name = OFFSETS[effect.name]
+            values[name] = values.get(name, getattr(parameters, name)) + found["seconds"]
+        elif effect.name == "clock_drift":
+            values["dvl_clock_drift"] = parameters.dvl_clock_drift + found["seconds_per_hour"] / 3600.0
+        elif effect.name == "time_offset_jump":
+            offset = values.get("dvl_time_offset", parameters.dvl_time_offset)
+            first_ns = diagnosis.recordings[recording or 0][1]
+            values["dvl_time_jump"] = found["seconds"]
+            values["dvl_time_jump_at"] = 1e-9 * first_ns + found["at_s"] + offset + 0.5 * found["seconds"]
     return parameters.replace(**values)
 
 

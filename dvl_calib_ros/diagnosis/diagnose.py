@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -11,37 +10,35 @@ from scipy.stats import norm
 
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
-from ..effects.base import Effect
+from ..calibration.samples import VelocityFrame
+from ..effects.base import Effect, Needs
 from ..effects.registry import EFFECTS
-from ..errors import InputError
 from ..replay.replay import Topics
-from .closure import Gap, measure_gap
-from .dictionary import is_time_of_run
-from .fitting import Fit, Fitter
+from .closure import Gap, closure_alone, held_out, measure_gap
+from .composed import amplitudes, is_time_of_run
+from .fitting import prior_std
+from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
-from .problem import PRIOR_STD, calibrated
 from .recordings import Recording, load_recordings
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
-from .selection import LEVEL, Selected, Selection, select
+from .selection import Selected, Selection, blocks_of, select
 from .series import collect_series
+from .settings import SETTINGS
 from .unexplained import Unexplained, unexplained
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
-# Fewer samples or less time than this say nothing
-MIN_SAMPLES, MIN_SECONDS = 60, 60.0
 # An effect could have been seen if one of its parameters could at so many times its typical size ...
 VISIBLE_TIMES_TYPICAL = 3.0
 # ... and a recording can only be cleared if that share of the effects could have been seen
 MIN_VISIBLE_SHARE = 0.5
-# The rest, as a share of the gap, from which a combination of effects does not explain it
-UNEXPLAINED_SHARE = 0.25
 POWER = 0.8
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
-# Recordings whose mounting differs by more than this (rad) are not of one vehicle
-SAME_MOUNTING = np.deg2rad(3.0)
+# What is left beyond the noise is told in the sentence from this share of the noise on
+WORTH_TELLING = 0.3
+Triple = tuple[float, float, float]
 
 
 def diagnose(
@@ -70,35 +67,32 @@ def diagnose_recordings(
     says_nothing = _says_nothing(recordings)
     if says_nothing:
         return _nothing_to_say(says_nothing, notes)
-    if len(recordings) > 1:
-        _check_mountings(recordings, parameters.rotation_dvl_from_body)
-    problem = calibrated(recordings, parameters.rotation_dvl_from_body)
-    testable = {name: effect for name, effect in effects.items() if effect.needs <= problem.available}
-    untestable = {
-        name: ", ".join(sorted(need.value for need in effect.needs - problem.available))
-        for name, effect in effects.items()
-        if name not in testable
-    }
-    selection = select(problem, testable)
+    available = frozenset.intersection(*(recording.available for recording in recordings))
+    untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
+    testable = {name: effect for name, effect in effects.items() if name not in untestable}
+    selection = select(recordings, parameters.rotation_dvl_from_body, np.array(parameters.lever_arm), testable)
+    if len(selection.fitter.problem.time) < SETTINGS.min_bins:
+        why = f"{len(selection.fitter.problem.bin_of)} samples have DVL, reference and attitude together"
+        return _nothing_to_say(f"{why}; record {SETTINGS.min_seconds:.0f} s at least, better 600 s", notes)
     rest = unexplained(selection.fitter, selection.fit)
-    gap = measure_gap(selection, rest.columns)
+    residuals = held_out(selection)
+    gap = measure_gap(selection, residuals)
     if selection.selected and not _is_borne_out(selection, gap, len(testable)):
         selection = selection.withdrawn()
         rest = unexplained(selection.fitter, selection.fit)
-        gap = measure_gap(selection, rest.columns)
-    detectable = {
-        name: _minimum_detectable(selection.fitter, selection.fit, effect, len(testable))
-        for name, effect in testable.items()
-    }
+        residuals = held_out(selection)
+        gap = measure_gap(selection, residuals)
+    detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, len(visible) / len(testable))
-    found = tuple(_found(selection, each, len(testable), gap, rest.columns) for each in selection.selected)
-    next_manoeuvre = _next_manoeuvre(verdict, selection.selected, testable, untestable, detectable)
+    covariance = selection.fit.covariance(blocks_of(selection.fitter.problem))
+    found = tuple(_found(selection, each, covariance, len(testable), gap) for each in selection.selected)
     columns = rest.columns
     if selection.selected and verdict is not Verdict.UNKNOWN:
-        fitter, fit = selection.fitter, selection.fit
-        columns = np.concatenate([fitter.jacobian(e, fit.values[e.name])[1] for e in fit.effects], axis=2)
+        columns = selection.fit.columns[:, :, 6:]
     is_gap = verdict in (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
+    hypothesis = selection.fit.hypothesis
+    calibration = zip([*hypothesis.phi, *hypothesis.scale], np.sqrt(np.diag(covariance)[:6]).tolist(), strict=True)
     return Diagnosis(
         verdict=verdict,
         sentence=_sentence(verdict, gap, found, rest, visible, len(testable)),
@@ -108,27 +102,49 @@ def diagnose_recordings(
         where=tuple(places(selection.fitter, selection.base, selection.fit, columns)) if is_gap else (),
         untestable=untestable,
         minimum_detectable=detectable,
-        next_manoeuvre=next_manoeuvre,
+        next_manoeuvre=_next_manoeuvre(verdict, selection.selected, testable, untestable, detectable),
         notes=tuple(notes),
-        series=collect_series(selection, rest) if with_series else None,
+        series=collect_series(selection, residuals, rest, covariance) if with_series else None,
+        calibration=tuple(_interval(float(value), std) for value, std in calibration),
+        compared_axes=_compared_axes(selection),
+        recordings=tuple((recording.name, recording.first_ns) for recording in recordings),
     )
+
+
+def _interval(value: float, std: float) -> Triple:
+    return value, value - 1.96 * std, value + 1.96 * std
+
+
+def _lacks(effect: Effect, available: frozenset[Needs], recordings: Sequence[Recording]) -> str:
+    """What recordings lack for an effect to be testable, '' if nothing."""
+    lacking = [need.value for need in effect.needs - available]
+    if effect.relative_to_first and len(recordings) < 2:
+        lacking.append("a second recording")
+    return ", ".join(sorted(lacking))
+
+
+def _compared_axes(selection: Selection) -> str:
+    problem = selection.fitter.problem
+    axes = "".join(name for name, measured in zip("xyz", problem.measured, strict=True) if measured)
+    if len(axes) == 3:
+        return axes
+    in_body = all(recording.frame is VelocityFrame.BODY for recording in problem.recordings)
+    return f"{axes} of the body" if in_body else f"{axes} of the body held level" if axes == "xy" else f"{axes} (ENU)"
 
 
 def _says_nothing(recordings: Sequence[Recording]) -> str:
     """Why recordings cannot say anything, '' if they can."""
-    samples = sum(len(recording.bins) - 1 for recording in recordings)
     seconds = sum(recording.seconds for recording in recordings)
-    if samples < MIN_SAMPLES or seconds < MIN_SECONDS:
-        return f"{samples} samples over {seconds:.0f} s are too few; record {MIN_SECONDS:.0f} s at least, better 600 s"
-    reference = [recording.reference_body for recording in recordings]
-    turned = [
-        np.einsum("nij,nj->ni", recording.rotation_enu_from_body, recording.reference_body)
-        for recording in recordings
-        if recording.rotation_enu_from_body is not None
-    ]
-    for values in (reference, turned):
-        if values and max(float(np.ptp(each, axis=0).max()) for each in values) < 1e-6:
-            return "the reference velocity is constant to the last digit; a receiver that has stopped says nothing"
+    samples = sum(min(len(recording.dvl.time), len(recording.reference.time)) for recording in recordings)
+    if samples < SETTINGS.min_bins or seconds < SETTINGS.min_seconds:
+        return (
+            f"{samples} samples over {seconds:.0f} s are too few; record {SETTINGS.min_seconds:.0f} s at least, "
+            "better 600 s"
+        )
+    if max(float(np.ptp(recording.reference.values, axis=0).max()) for recording in recordings) < 1e-6:
+        return "the reference velocity is constant to the last digit; a receiver that has stopped says nothing"
+    if not any(recording.measured[0] and recording.measured[1] for recording in recordings):
+        return "the reference does not measure the horizontal velocity"
     return ""
 
 
@@ -148,27 +164,6 @@ def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
     )
 
 
-def _check_mountings(recordings: Sequence[Recording], rotation_dvl_from_body: Array) -> None:
-    """Raise InputError if recordings, each calibrated by itself, disagree by more than a mounting can drift."""
-    fits = []
-    for recording in recordings:
-        problem = calibrated([recording], rotation_dvl_from_body)
-        std = np.maximum(1.4826 * np.median(np.abs(problem.residual), axis=0), 1e-9)
-        columns = (problem.base / std[:, None]).reshape(-1, 6)
-        covariance = np.linalg.inv(columns.T @ columns + np.diag(PRIOR_STD**-2))
-        fits.append((problem.calibration.phi, np.sqrt(np.diag(covariance))[:3]))
-    for (i, (a, std_a)), (j, (b, std_b)) in itertools.combinations(enumerate(fits), 2):
-        std = np.hypot(std_a, std_b)
-        apart = (np.abs(a - b) > SAME_MOUNTING) & (np.abs(a - b) > 6.0 * std)
-        if apart.any():
-            axis = int(np.argmax(np.where(apart, np.abs(a - b), 0.0)))
-            raise InputError(
-                f"{recordings[i].name} and {recordings[j].name}: their misalignments differ by "
-                f"{np.degrees(abs(a - b)[axis]):.1f}° about {'xyz'[axis]}, so the DVL was mounted differently; "
-                "diagnose them one at a time, or give each its mounting_rpy"
-            )
-
-
 def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
     """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
     p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
@@ -177,7 +172,7 @@ def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
 
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
     explained = max(0.0, selection.base.deviance - selection.fit.deviance)
-    if rest.found and rest.energy > UNEXPLAINED_SHARE * (explained + rest.energy):
+    if rest.found and rest.energy > SETTINGS.unexplained_share * (explained + rest.energy):
         return Verdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
@@ -185,32 +180,36 @@ def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> V
     return Verdict.NO_GAP if visible_share >= MIN_VISIBLE_SHARE else Verdict.INSUFFICIENT_EXCITATION
 
 
-def _covariance(
-    fitter: Fitter, fit: Fit, effects: Sequence[Effect], values: Mapping[str, Mapping[str, float]]
-) -> Array:
-    """Covariance of all parameters of effects, in order, with the calibration beside them."""
-    columns = [fitter.problem.base]
-    prior = [PRIOR_STD**-2]
-    for effect in effects:
-        specs, jacobian = fitter.jacobian(effect, values[effect.name])
-        columns.append(jacobian)
-        prior.append(np.array([(1e3 * spec.typical) ** -2 for spec in specs]))
-    white = fit.noise.whiten(np.concatenate(columns, axis=2))
-    left = fit.noise.whiten(fit.residual)
-    variance = float(left @ left) / max(len(left) - white.shape[1], 1)
-    covariance: Array = np.linalg.pinv(white.T @ white / variance + np.diag(np.concatenate(prior)), hermitian=True)
-    return covariance[6:, 6:]
-
-
-def _minimum_detectable(fitter: Fitter, fit: Fit, effect: Effect, n_tested: int) -> dict[str, float]:
+def _minimum_detectable(selection: Selection, effect: Effect, n_tested: int) -> dict[str, float]:
     """Size of each parameter that is found with a power of 80 per cent at the level of the tests."""
-    others = [other for other in fit.effects if other is not effect]
-    values = {**fit.values, effect.name: effect.defaults}
-    specs, _ = fitter.jacobian(effect, values[effect.name])
-    covariance = _covariance(fitter, fit, [*others, effect], values)
-    std = np.sqrt(np.diag(covariance))[-len(specs) :]
-    factor = float(norm.isf(LEVEL / n_tested / 2.0) + norm.ppf(POWER))
-    return {spec.name: factor * float(s) for spec, s in zip(specs, std, strict=True)}
+    fit, problem = selection.fit, selection.fitter.problem
+    columns = [fit.columns]
+    std = [prior_std(fit.hypothesis)]
+    if effect in fit.effects:
+        at = 6 + sum(len(fit.hypothesis.parameters_of(e)) for e in fit.effects[: fit.effects.index(effect)])
+    else:
+        at = fit.columns.shape[2]
+        columns.append(problem.columns(fit.hypothesis, fit.seen, effect, _somewhere(effect, problem.recordings)))
+        std.append(np.full(columns[-1].shape[2], 1e6))
+    white = fit.noise.whiten(np.concatenate(columns, axis=2))
+    prior = np.concatenate(std)
+    system = WhitenedLeastSquares.of(white, np.zeros(len(white)), prior, np.zeros(len(prior)))
+    own = np.sqrt(np.maximum(np.diag(system.covariance()), 0.0))[at:]
+    factor = float(norm.isf(SETTINGS.level / n_tested / 2.0) + norm.ppf(POWER))
+    return {spec.name: factor * float(each) for spec, each in zip(amplitudes(effect), own, strict=False)}
+
+
+def _somewhere(effect: Effect, recordings: Sequence[Recording]) -> list[Mapping[str, float]]:
+    """Defaults, with what comes in the midst of the run where no time is given."""
+    values: list[Mapping[str, float]] = []
+    for recording in recordings:
+        times = {
+            spec.name: 0.5 * recording.seconds
+            for spec in effect.parameters
+            if is_time_of_run(spec) and not any(is_time_of_run(o) for o in effect.parameters if o is not spec)
+        }
+        values.append(effect.defaults | times)
+    return values
 
 
 def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
@@ -218,26 +217,46 @@ def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
     return any(size <= VISIBLE_TIMES_TYPICAL * typical[name] for name, size in sizes.items())
 
 
-def _found(selection: Selection, selected: Selected, n_tested: int, gap: Gap, dictionary: Array) -> FoundEffect:
-    fitter, fit, effect = selection.fitter, selection.fit, selected.effect
-    covariance = _covariance(fitter, fit, fit.effects, fit.values)
-    stds = iter(np.sqrt(np.diag(covariance)).tolist())
-    parameters: dict[str, tuple[float, float, float]] = {}
-    for each in fit.effects:
-        for spec in fitter.jacobian(each, fit.values[each.name])[0]:
-            std = next(stds)
-            if each is effect:
-                value = fit.values[effect.name][spec.name]
-                parameters[spec.name] = (value, value - 1.96 * std, value + 1.96 * std)
-    for spec in effect.parameters:
-        if is_time_of_run(spec):
-            parameters[spec.name] = fitter.time_interval(fit, effect, spec)
-    closure = gap.closure
-    if len(fit.effects) > 1:
-        closure = measure_gap(selection, dictionary, only=effect).closure
-    ordered = {spec.name: parameters[spec.name] for spec in effect.parameters}
-    p = min(1.0, float(np.exp(selected.log_p)) * n_tested)
-    return FoundEffect(effect.name, selected.equivalent, ordered, closure, p)
+def _found(selection: Selection, selected: Selected, covariance: Array, n_tested: int, gap: Gap) -> FoundEffect:
+    fit, effect = selection.fit, selected.effect
+    stds = np.sqrt(np.diag(covariance))[6:].tolist()
+    by_recording: dict[int, dict[str, Triple]] = {}
+    for parameter, std in zip(fit.hypothesis.parameters(), stds, strict=True):
+        if parameter.effect is effect:
+            of_recording = by_recording.setdefault(parameter.recording or 0, {})
+            of_recording[parameter.spec.name] = _interval(fit.hypothesis.value(parameter), std)
+    for recording, parameters in by_recording.items():
+        for spec in effect.parameters:
+            if is_time_of_run(spec):
+                parameters[spec.name] = selection.fitter.time_interval(fit, effect, spec.name, recording)
+    ordered = {
+        recording: {spec.name: parameters[spec.name] for spec in effect.parameters}
+        for recording, parameters in by_recording.items()
+    }
+    names = [recording.name for recording in selection.fitter.problem.recordings]
+    together = _weighted_mean(list(ordered.values())) if len(ordered) > 1 else next(iter(ordered.values()))
+    is_of_each = effect.of_the_day and len(names) > 1
+    return FoundEffect(
+        effect.name,
+        selected.equivalent,
+        together,
+        closure_alone(selection, gap, effect.name),
+        min(1.0, float(np.exp(selected.log_p)) * n_tested),
+        {names[recording]: parameters for recording, parameters in ordered.items()} if is_of_each else {},
+    )
+
+
+def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:
+    """Of values with 95 per cent intervals; infinite ones as in the first."""
+    mean: dict[str, Triple] = {}
+    for name, first in each[0].items():
+        values = np.array([one[name] for one in each])
+        if not np.isfinite(values).all():
+            mean[name] = first
+            continue
+        weight = 1.0 / np.maximum((values[:, 2] - values[:, 1]) / 3.92, 1e-12) ** 2
+        mean[name] = _interval(float(weight @ values[:, 0] / weight.sum()), float(weight.sum() ** -0.5))
+    return mean
 
 
 def _next_manoeuvre(
@@ -274,20 +293,31 @@ def _sentence(
     verdict: Verdict, gap: Gap, found: Sequence[FoundEffect], rest: Unexplained, visible: Sequence[str], n_tested: int
 ) -> str:
     names = " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found)
-    closes = f"which closes {100.0 * gap.closure:.0f} % of the gap of {1e3 * gap.before:.1f} mm/s on held-out data"
+    falls = (
+        f"the error falls from {1e3 * gap.before:.1f} to {1e3 * gap.after:.1f} mm/s on held-out data, over noise of "
+        f"{1e3 * gap.noise_floor:.1f}"
+    )
+    is_left = gap.not_explained > WORTH_TELLING * gap.noise_floor
+    left = f"; {1e3 * gap.not_explained:.1f} mm/s are not explained" if is_left else ""
+    if is_left and rest.found:
+        left += f" and follow {rest.about}"
     if verdict is Verdict.KNOWN:
-        return f"The gap is explained by {names}, {closes}."
+        return f"The gap is explained by {names}: {falls}{left}."
     if verdict is Verdict.AMBIGUOUS:
-        return f"The gap is explained by {names}, {closes}; this data cannot tell between them."
+        return f"The gap is explained by {names}: {falls}{left}; this data cannot tell between them."
     if verdict is Verdict.UNKNOWN:
-        beside = f" beside {names}" if found else ""
+        if found:
+            return (
+                f"Beside {names} there is something that no effect of the library explains: {falls}{left}; what is "
+                f"left follows {rest.about}."
+            )
         return (
-            f"There is a gap of {1e3 * gap.before:.1f} mm/s that no effect of the library explains{beside}; "
-            f"what is left follows {rest.about}."
+            f"There is an error of {1e3 * gap.before:.1f} mm/s, over noise of {1e3 * gap.noise_floor:.1f}, that no "
+            f"effect of the library explains; it follows {rest.about}."
         )
     if verdict is Verdict.NO_GAP:
         return (
-            f"No gap beyond the noise of {gap.noise_floor:.3f} m/s; {len(visible)} of {n_tested} effects would have "
-            "shown at sizes that matter."
+            f"No gap beyond the noise of {gap.noise_floor:.3f} m/s{left}; {len(visible)} of {n_tested} effects would "
+            "have shown at sizes that matter."
         )
     return f"This data could not have shown a gap: {len(visible)} of {n_tested} effects would have shown."

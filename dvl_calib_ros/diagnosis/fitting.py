@@ -1,4 +1,4 @@
-"""Fits of hypotheses with exact traces: the calibration, and effects on top of it, with the noise that each leaves."""
+"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still."""
 
 from __future__ import annotations
 
@@ -6,184 +6,236 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import solve
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..calibration.frames import Array
-from ..effects.base import Effect, ParameterSpec
-from .dictionary import Variant, amplitudes, is_bent, variant_at
+from ..effects.base import Effect
+from .composed import Hypothesis, Problem, Seen, Values, amplitudes, is_time_of_run, whose_parameters
+from .least_squares import WhitenedLeastSquares
 from .noise import Noise
-from .problem import PRIOR_STD, Problem, Values
+from .settings import SETTINGS
 
-# Gauss-Newton: steps, halvings of one, and the share of a typical size at which it has converged
-MAX_STEPS, MAX_HALVINGS, CONVERGED = 8, 4, 1e-3
-MAX_KEPT_VARIANTS = 100
+# Gauss-Newton: at most so many steps; it stands still when none is longer than this share of its standard deviation
+MAX_STEPS, STANDS_STILL = 30, 0.01
+HALVINGS = 5
+# Standard deviations of what other noise explains by chance that are taken off
+BY_CHANCE = 1.5
+# Prior of an effect's parameters, in their typical sizes: wide enough to do nothing but where the data says nothing
+PRIOR_IN_TYPICAL = 50.0
+Mask = NDArray[np.bool_]
+
+
+def prior_std(hypothesis: Hypothesis) -> Array:
+    """(6 + p,) standard deviations of the prior of calibration and effects."""
+    own = [PRIOR_IN_TYPICAL * each.spec.typical for each in hypothesis.parameters()]
+    return np.array([SETTINGS.prior_angle] * 3 + [SETTINGS.prior_scale] * 3 + own)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A hypothesis fitted: which effects, with which values.
-
-    values: by effect and parameter. change, change_std: (6,) of φ and δk. residual: (M, 3) m/s that is left. noise: as
-    estimated from it. deviance: -2 log likelihood with that noise. dof: that the effects use up.
+    """A hypothesis fitted. seen: per recording. residual: (M, A) m/s that is left, outliers drawn in. columns:
+    (M, A, 6 + p) its derivatives. system: the last step's. own_noise: whitened, what made-up noise of the velocities
+    makes in it. deviance: whitened squares and prior, less those of that: a delay interpolates at another phase, a
+    low-pass takes noise off, which must not count for or against them.
     """
 
-    effects: tuple[Effect, ...]
-    values: Mapping[str, Values]
-    change: Array
-    change_std: Array
+    hypothesis: Hypothesis
+    seen: tuple[Seen, ...]
     residual: Array
     noise: Noise
+    columns: Array
+    system: WhitenedLeastSquares
     deviance: float
-    dof: float
+    own_noise: Array
 
+    def gain_over(self, rest: Fit) -> float:
+        """Deviance that this explains beyond another, for sure.
 
-@dataclass(frozen=True)
-class _Step:
-    """The least squares problem about some values, solved. steps: (6 + p,) to go from there. at: (6 + p,) with those
-    of the bent traces left where they are; residual (M, 3) and misfit are of that. std: (6,) of the calibration.
-    """
+        With other noise in it, it may fit the reference's noise better by chance: by a normal variable of this size.
+        """
+        other = self.own_noise - rest.own_noise
+        return rest.deviance - self.deviance - BY_CHANCE * 2.0 * float(np.sqrt(other @ other))
 
-    steps: Array
-    at: Array
-    std: Array
-    residual: Array
-    misfit: float
-    dof: float
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Of the hypothesis."""
+        return self.hypothesis.effects
+
+    @property
+    def values(self) -> Mapping[str, tuple[Values, ...]]:
+        """Of the hypothesis."""
+        return self.hypothesis.values
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom that the effects use up."""
+        return float(self.system.freedom()[6:].sum())
+
+    def covariance(self, block: NDArray[np.intp]) -> Array:
+        """(6 + p, 6 + p), of noise as it is whitened or as the scatter of blocks (M,) shows it, what is larger.
+
+        The sandwich H⁻¹ (Σ s sᵀ) H⁻¹ of the blocks' scores s holds whatever colour and level the noise has in a block.
+        """
+        inverse = self.system.covariance()
+        scores = self.scores(block)
+        n = len(scores)
+        sandwich = inverse @ (scores.T @ scores) @ inverse * n / max(n - 1, 1)
+        grown = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
+        return np.asarray(inverse * np.outer(grown, grown))
+
+    def scores(self, block: NDArray[np.intp]) -> Array:
+        """(B, 6 + p) sums of whitened columns times residual over blocks (M,)."""
+        white = self.noise.whiten(self.columns).reshape(len(block), -1, self.columns.shape[2])
+        left = self.noise.whiten(self.residual).reshape(len(block), -1)
+        each = np.einsum("map,ma->mp", white, left)
+        return np.stack([np.bincount(block, column) for column in each.T], axis=1)
 
 
 @dataclass(frozen=True)
 class Fitter:
-    """Fits hypotheses about one problem. residual: (M, 3), robustified, in place of the problem's own."""
+    """Fits hypotheses to one problem. outliers: (M, A) m/s, taken off the residual. held: (M,) bins not to be seen."""
 
     problem: Problem
-    residual: Array
-    _variants: dict[tuple[str, tuple[float, ...]], Variant] = field(default_factory=dict)
+    outliers: Array | float = 0.0
+    held: Mask | None = None
+    _fits: dict[tuple[object, ...], Fit] = field(default_factory=dict, repr=False)
 
-    def with_residual(self, residual: Array) -> Fitter:
-        """The same with another residual (M, 3)."""
-        return replace(self, residual=residual)
+    def without(self, held: Mask) -> Fitter:
+        """One that does not see some bins (M,)."""
+        return replace(self, held=held, _fits={})
 
-    def variant(self, effect: Effect, values: Values) -> Variant:
-        """The effect about values; kept, since most are asked for again."""
-        fixed = [] if is_bent(effect) else amplitudes(effect)
-        key = effect.name, tuple(values[spec.name] for spec in effect.parameters if spec not in fixed)
-        if key not in self._variants:
-            if len(self._variants) > MAX_KEPT_VARIANTS:
-                self._variants.clear()
-            self._variants[key] = variant_at(self.problem, effect, values)
-        return self._variants[key]
+    def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
+        """Through the model, and residual (M, A)."""
+        seen = tuple(self.problem.all_seen(hypothesis))
+        return seen, self.problem.residual(seen) - self.outliers
 
-    def jacobian(self, effect: Effect, values: Values) -> tuple[list[ParameterSpec], Array]:
-        """All parameters with a derivative and d trace / d parameter (M, 3, p)."""
-        return amplitudes(effect), self.variant(effect, values).columns
+    def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
+        """(M, A, 6 + p) derivatives of the residual."""
+        problem = self.problem
+        parts = [problem.calibration_columns(hypothesis, seen)]
+        parts += [problem.columns(hypothesis, seen, e, hypothesis.values[e.name]) for e in hypothesis.effects]
+        return np.concatenate(parts, axis=2)
 
-    def fit(self, effects: Sequence[Effect], noise: Noise, start: Mapping[str, Values]) -> Fit:
-        """Fit effects together with the calibration under a noise; parameters without a derivative stay at start.
+    def _white(self, noise: Noise, values: Array) -> Array:
+        white = noise.whiten(values)
+        if self.held is not None:
+            white = white[np.repeat(~self.held, self.problem.axes)]
+        return white
 
-        Gauss-Newton with halved steps; one step where all traces are linear.
-        """
-        values = {effect.name: start.get(effect.name, effect.defaults) for effect in effects}
-        bent = any(is_bent(effect) for effect in effects)
-        step = self._step(effects, noise, values)
-        for _ in range(MAX_STEPS if bent else 0):
-            moved, far = self._moved(effects, values, step.steps, 1.0)
-            for halving in range(1, MAX_HALVINGS + 1):
-                trial = self._step(effects, noise, moved)
-                if trial.misfit <= step.misfit or far < CONVERGED:
+    def _misfit(self, noise: Noise, residual: Array, hypothesis: Hypothesis) -> float:
+        white = self._white(noise, residual)
+        return float(white @ white + np.sum((hypothesis.vector() / prior_std(hypothesis)) ** 2))
+
+    def fit(self, start: Hypothesis, noise: Noise, max_steps: int = MAX_STEPS, only_of_the_day: bool = False) -> Fit:
+        """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept."""
+        kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
+        hypothesis = start
+        seen, residual = self.evaluated(hypothesis)
+        misfit = self._misfit(noise, residual, hypothesis)
+        for _ in range(max_steps):
+            columns = self.columns(hypothesis, seen)
+            system = self._system(noise, columns, residual, hypothesis)
+            free = np.flatnonzero(~kept)
+            step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
+            step[free] = system.part(free).solution() if len(free) else 0.0
+            moved, tried = False, step
+            for _ in range(HALVINGS):
+                trial = hypothesis.moved(tried)
+                trial_seen, trial_residual = self.evaluated(trial)
+                trial_misfit = self._misfit(noise, trial_residual, trial)
+                if trial_misfit <= misfit:
+                    moved = True
                     break
-                moved, far = self._moved(effects, values, step.steps, 0.5**halving)
-            if trial.misfit > step.misfit:
+                tried = 0.4 * tried
+            if not moved:
                 break
-            values, step = moved, trial
-            if far < CONVERGED:
+            gained = misfit - trial_misfit
+            hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
+            if np.abs(tried / std).max() < STANDS_STILL or gained < 1e-4:
                 break
-        at = 6
-        for effect in effects:
-            variant = self.variant(effect, values[effect.name])
-            part = step.at[at : at + len(variant.std)]
-            at += len(variant.std)
-            if not is_bent(effect):
-                values = {**values, effect.name: variant.moved(part)}
-        return Fit(
-            tuple(effects), values, self.problem.prior_change + step.at[:6], step.std, step.residual, noise,
-            noise.deviance(step.residual), step.dof,
-        )  # fmt: skip
+        columns = self.columns(hypothesis, seen)
+        system = self._system(noise, columns, residual, hypothesis)
+        own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
+        deviance = misfit - float(own_noise @ own_noise)
+        return Fit(hypothesis, seen, residual, noise, columns, system, deviance, own_noise)
 
-    def fit_with_noise(
-        self, effects: Sequence[Effect], noise: Noise, start: Mapping[str, Values], rounds: int = 2
-    ) -> Fit:
-        """`fit`, with the noise estimated anew from what it leaves, and again."""
-        fit = self.fit(effects, noise, start)
-        for _ in range(rounds):
-            noise = noise.updated(fit.residual)
-            fit = self.fit(effects, noise, fit.values)
-        return fit
+    def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
+        """(S n,) whitened, what made-up noise of the velocities makes in the residual (M, A) of a hypothesis."""
+        white = [
+            self._white(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
+            for shaken in self.problem.shaken
+        ]
+        return np.concatenate(white)
 
-    def _step(self, effects: Sequence[Effect], noise: Noise, values: Mapping[str, Values]) -> _Step:
-        """Solve about values. The residual and misfit hold those of the bent traces at the values themselves."""
-        found = [self.variant(effect, values[effect.name]) for effect in effects]
-        target = self.residual - self.problem.base @ self.problem.prior_change
-        for one in found:
-            if one.offset is not None:
-                target = target - one.offset
-        raw = np.concatenate([self.problem.base, *(one.columns for one in found)], axis=2)
-        white = noise.whiten(np.concatenate([raw, target[:, :, None]], axis=2))
-        gram = white.T @ white
-        prior = np.concatenate([PRIOR_STD, *(one.std for one in found)]) ** -2.0
-        normal, seen = gram[:-1, :-1] + np.diag(prior), gram[:-1, -1]
-        straight = np.concatenate([np.ones(6, bool), *(np.full(len(one.std), one.offset is None) for one in found)])
-        at = np.zeros(len(seen))
-        at[straight] = solve(normal[np.ix_(straight, straight)], seen[straight], assume_a="pos")
-        centre = np.concatenate([np.zeros(6), *(one.centre for one in found)])
-        misfit = float(gram[-1, -1] - 2.0 * at @ seen + at @ normal @ at + centre**2 @ prior)
-        variances = np.diag(np.linalg.inv(normal))
-        held = variances * prior  # share that the prior has in each: no degree of freedom
-        return _Step(
-            steps=at if straight.all() else solve(normal, seen, assume_a="pos"),
-            at=at,
-            std=np.sqrt(variances[:6]),
-            residual=target - raw @ at,
-            misfit=misfit,
-            dof=float(np.sum(1.0 - held[6:])),
+    def _system(self, noise: Noise, columns: Array, residual: Array, hypothesis: Hypothesis) -> WhitenedLeastSquares:
+        """Of the step (6 + p,) from a hypothesis."""
+        return WhitenedLeastSquares.of(
+            self._white(noise, columns), -self._white(noise, residual), prior_std(hypothesis), -hypothesis.vector()
         )
 
-    def _moved(
-        self, effects: Sequence[Effect], values: Mapping[str, Values], steps: Array, share: float
-    ) -> tuple[dict[str, Values], float]:
-        """Values a share of the steps on, and how far the farthest of the bent has gone, in typical sizes."""
-        moved: dict[str, Values] = {}
-        far, at = 0.0, 6
-        for effect in effects:
-            variant = self.variant(effect, values[effect.name])
-            part = steps[at : at + len(variant.std)]
-            at += len(variant.std)
-            moved[effect.name] = variant.moved(share * part if is_bent(effect) else part)
-            if is_bent(effect):
-                far = max(
-                    far,
-                    *(
-                        abs(moved[effect.name][spec.name] - values[effect.name][spec.name]) / spec.typical
-                        for spec in amplitudes(effect)
-                    ),
-                )
-        return moved, far
+    def fit_kept(self, start: Hypothesis, noise: Noise) -> Fit:
+        """`fit`, not done twice for the same effects under the same noise."""
+        windows = tuple(
+            value[spec.name]
+            for effect in start.effects
+            for value in start.values[effect.name]
+            for spec in effect.parameters
+            if is_time_of_run(spec)
+        )
+        key = (id(noise), tuple(sorted(effect.name for effect in start.effects)), windows)
+        if key not in self._fits:
+            self._fits[key] = self.fit(start, noise)
+        return self._fits[key]
 
-    def time_interval(self, fit: Fit, effect: Effect, spec: ParameterSpec) -> tuple[float, float, float]:
+    def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
+        """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
+        for step in steps:
+            for effect in fit.effects:
+                for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
+                    fit = self._finer(fit, effect, spec.name, step)
+        return fit
+
+    def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
+        for sign in (-1.0, 1.0):
+            per = fit.values[effect.name]
+            if not all(np.isfinite(each[name]) for each in per):
+                continue
+            moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
+            values = {**fit.values, effect.name: moved}
+            trial = self.fit(replace(fit.hypothesis, values=values), fit.noise, 3)
+            if trial.deviance < fit.deviance:
+                fit = trial
+        return fit
+
+    def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """A time at which an effect begins or ends, with those that the data takes for as good (95 per cent)."""
-        value = fit.values[effect.name][spec.name]
-        seconds = max(recording.seconds for recording in self.problem.recordings)
+        value = fit.values[effect.name][recording][name]
+        seconds = self.problem.recordings[recording].seconds
         if not np.isfinite(value):
             return value, seconds, value
         as_good = [value]
         for sign in (-1.0, 1.0):
-            step = seconds / 500.0
+            step = 0.5 * self.problem.interval
             while 0.0 <= (at := value + sign * step) <= seconds:
-                trial = self.fit(
-                    fit.effects, fit.noise, {**fit.values, effect.name: {**fit.values[effect.name], spec.name: at}}
+                per = tuple(
+                    {**each, name: at} if index == recording else each
+                    for index, each in enumerate(fit.values[effect.name])
                 )
-                if trial.deviance > fit.deviance + chi2.isf(0.05, 1):
+                moved = replace(fit.hypothesis, values={**fit.values, effect.name: per})
+                if self.fit(moved, fit.noise, 2).deviance > fit.deviance + chi2.isf(0.05, 1):
+                    as_good.append(at)  # the first that is worse bounds those that are as good
                     break
                 as_good.append(at)
-                step *= 1.5
+                step *= 1.6
         return value, min(as_good), max(as_good)
+
+
+def names_of(effects: Sequence[Effect]) -> frozenset[str]:
+    """Their names."""
+    return frozenset(effect.name for effect in effects)
+
+
+def n_amplitudes(effect: Effect, n_recordings: int) -> int:
+    """Number of parameters with a derivative, of all recordings."""
+    return len(amplitudes(effect)) * len(whose_parameters(effect, n_recordings))

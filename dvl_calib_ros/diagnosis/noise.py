@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.signal import lfilter
+from scipy.stats import median_abs_deviation
 
 from ..calibration.frames import Array
 
@@ -21,7 +21,8 @@ HUBER = 2.5
 # Time constant, s, of the slowest noise of a receiver; an effect that comes and goes within a run is slower
 LONGEST_S = 15.0
 ORDERS = ((0, 0), (1, 0), (1, 1))
-_STARTS = (0.0, 0.9)
+# of a periodogram, after averaging neighbours
+MAX_FREQUENCIES = 300
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,11 @@ class Arma:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of M samples on three axes.
+    """Noise of M samples on A axes.
 
-    segments: the stretches without a gap. rotation: (M, 3, 3), frame of the noise from body, None if it is the body.
-    level: (M, 3), relative standard deviation. axes: one ARMA each. memory: largest partial autocorrelation: what lasts
-    longer than that is no noise.
+    segments: the stretches without a gap. rotation: (M, A, A), frame of the noise from that of the residual, None if
+    it is that. level: (M, A), relative standard deviation. axes: one ARMA each. memory: largest autocorrelation of
+    neighbours: what lasts longer than that is no noise.
     """
 
     segments: tuple[slice, ...]
@@ -63,7 +64,7 @@ class Noise:
     memory: float = 0.998
 
     def whiten(self, values: Array) -> Array:
-        """Body-frame values (M, 3, ...) as white noise of unit variance would be, flattened to (3 M, ...)."""
+        """Values (M, A, ...) as white noise of unit variance would be, flattened to (M A, ...)."""
         scaled = self._scaled(values)
         white = np.empty_like(scaled)
         for part in self.segments:
@@ -72,8 +73,8 @@ class Noise:
         return white.reshape(-1, *values.shape[2:])
 
     def unwhiten(self, white: Array) -> Array:
-        """Inverse of `whiten` for one series: (3 M,) -> (M, 3)."""
-        innovations = white.reshape(-1, 3)
+        """Inverse of `whiten` for one series: (M A,) -> (M, A)."""
+        innovations = white.reshape(self.level.shape)
         scaled = np.empty_like(innovations)
         for part in self.segments:
             for axis, arma in enumerate(self.axes):
@@ -87,22 +88,10 @@ class Noise:
         return values / self.level.reshape(*self.level.shape, *[1] * (values.ndim - 2))
 
     def refitted(self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS) -> Noise:
-        """The same with the ARMA of each axis fitted to a residual (M, 3), of the order that BIC takes."""
+        """The same with the ARMA of each axis fitted to a residual (M, A), of the order that BIC takes."""
         scaled = self._scaled(residual)
-        return replace(
-            self, axes=tuple(_fit_arma(scaled[:, axis], self.segments, self.memory, orders) for axis in range(3))
-        )
-
-    def updated(self, residual: Array) -> Noise:
-        """`refitted` at the orders as they are."""
-        scaled = self._scaled(residual)
-        return replace(
-            self,
-            axes=tuple(
-                _fit_arma(scaled[:, axis], self.segments, self.memory, [(len(arma.ar), int(arma.ma != 0.0))], arma)
-                for axis, arma in enumerate(self.axes)
-            ),
-        )
+        axes = tuple(_fit_arma(column, self.segments, self.memory, orders) for column in scaled.T)
+        return replace(self, axes=axes)
 
     @property
     def is_coloured(self) -> bool:
@@ -125,19 +114,19 @@ class Noise:
         return replace(self, axes=axes)
 
     def deviance(self, residual: Array) -> float:
-        """-2 log likelihood of a residual (M, 3), but for a constant."""
+        """-2 log likelihood of a residual (M, A), but for a constant."""
         white = self.whiten(residual)
         logarithms = np.log(self.level).sum() + sum(np.log(arma.std) for arma in self.axes) * len(self.level)
         first = sum(np.log(arma.ratio) for arma in self.axes) * len(self.segments)
         return float(white @ white + 2.0 * (logarithms + first))
 
     def robust(self, residual: Array) -> Array:
-        """The residual (M, 3) with its innovations winsorised: what least squares then makes of it is Huber's.
+        """The residual (M, A) with its innovations winsorised: what least squares then makes of it is Huber's.
 
         Pseudo-values ψ(r) / E[ψ'] of the innovations r about zero; so it must be the residual of a good fit.
         """
-        white = self.whiten(residual).reshape(-1, 3)
-        scale = 1.4826 * np.median(np.abs(white), axis=0)
+        white = self.whiten(residual).reshape(residual.shape)
+        scale = median_abs_deviation(white, axis=0, scale="normal")
         pseudo = np.clip(white, -HUBER * scale, HUBER * scale)
         pseudo /= np.mean(np.abs(white) < HUBER * scale, axis=0)
         return self.unwhiten(pseudo.ravel())
@@ -157,49 +146,62 @@ def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:
 
 
 def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:
-    """White noise with the standard deviation per axis that a residual (M, 3) has, robustly. interval: s."""
+    """White noise with the standard deviation per axis that a residual (M, A) has, robustly. interval: s."""
     scaled = residual if rotation is None else np.einsum("mij,mj->mi", rotation, residual)
-    stds = np.maximum(1.4826 * np.median(np.abs(scaled), axis=0), 1e-9)
+    stds = np.maximum(median_abs_deviation(scaled, axis=0, scale="normal"), 1e-9)
     axes = tuple(Arma(np.zeros(0), 0.0, float(std), 1.0) for std in stds)
     return Noise(segments, rotation, np.ones_like(residual), axes, float(np.exp(-interval / LONGEST_S)))
 
 
-def _fit_arma(
-    series: Array,
-    segments: Sequence[slice],
-    memory: float,
-    orders: Sequence[tuple[int, int]],
-    start: Arma | None = None,
-) -> Arma:
-    """ARMA of the order with the smallest BIC, by conditional least squares."""
+def _fit_arma(series: Array, segments: Sequence[slice], memory: float, orders: Sequence[tuple[int, int]]) -> Arma:
+    """ARMA(1, 1) or less, of the order with the smallest BIC, by Whittle's likelihood.
+
+    With g the spectrum over that of its innovations, n log mean(periodogram / g) is the deviance.
+    """
     n = len(series)
-    best, best_bic = None, np.inf
+    frequency, power = _periodogram(series)
+    best = (np.inf, 0.0, 0.0)
     for p, q in orders:
-        if p + q == 0:
-            candidates: list[Array] = [np.zeros(0)]
-        else:
-            starts = [_encoded(start, q)] if start is not None else [_start(p, q, value) for value in _STARTS]
-            candidates = [_fitted(series, segments, memory, p, at) for at in starts]
-        for encoded in candidates:
-            ar, ma = _decoded(encoded, p)
-            squares = float(np.mean(_innovations(series, segments, ar, ma) ** 2))
-            bic = n * np.log(max(squares, 1e-30)) + (p + q) * np.log(n)
-            if bic < best_bic:
-                best_bic = bic
-                best = Arma(ar, ma, max(np.sqrt(squares), 1e-12), _ratio(ar, ma))
-    assert best is not None
-    return best
+        deviance, ar, ma = _searched(frequency, power, n, memory, p, q)
+        best = min(best, (deviance + (p + q) * np.log(n), ar, ma))
+    _, ar, ma = best
+    coefficients = np.array([ar]) if ar else np.zeros(0)
+    std = float(np.sqrt(np.mean(_innovations(series, segments, coefficients, ma) ** 2)))
+    return Arma(coefficients, ma, max(std, 1e-12), _ratio(coefficients, ma))
 
 
-def _fitted(series: Array, segments: Sequence[slice], memory: float, p: int, start: Array) -> Array:
-    std = float(np.std(series)) or 1.0
+def _periodogram(series: Array) -> tuple[Array, Array]:
+    """Angular frequency per sample (F,) and power, means over even parts of all frequencies."""
+    power = np.abs(np.fft.rfft(series)[1:]) ** 2 / len(series)
+    frequency = np.pi * np.arange(1, len(power) + 1) / max(len(power), 1)
+    # the lowest one by one, since colour is there
+    edges = np.unique(np.concatenate([np.arange(min(60, len(power))), np.linspace(0, len(power), MAX_FREQUENCIES)]))
+    starts = np.unique(edges.astype(int))[:-1]
+    counts = np.diff(np.append(starts, len(power)))
+    return np.add.reduceat(frequency, starts) / counts, np.stack([np.add.reduceat(power, starts) / counts, counts])
+
+
+def _searched(frequency: Array, power: Array, n: int, memory: float, p: int, q: int) -> tuple[float, float, float]:
+    """Deviance, ar and ma of the best ARMA(p, q), on a grid made finer about its best point."""
+    power, counts = power
     bound = float(np.arctanh(memory))
-    start = np.clip(start, -0.999 * bound, 0.999 * bound)
-
-    def residual(encoded: Array) -> Array:
-        return _innovations(series, segments, *_decoded(encoded, p)) / std
-
-    return np.asarray(least_squares(residual, start, xtol=1e-4, ftol=1e-6, max_nfev=25, bounds=(-bound, bound)).x)
+    centre, reach = np.zeros(2), np.array([bound if p else 0.0, 2.5 if q else 0.0])
+    best = (np.inf, 0.0, 0.0)
+    for _ in range(5):
+        axes = [np.unique(np.clip(np.linspace(c - r, c + r, 15), -b, b)) if r else np.zeros(1)
+                for c, r, b in zip(centre, reach, (bound, 2.5), strict=True)]  # fmt: skip
+        ar, ma = (each.ravel() for each in np.meshgrid(np.tanh(axes[0]), np.tanh(axes[1])))
+        wave = np.cos(frequency)
+        numerator = 1.0 + ma[:, None] ** 2 + 2.0 * ma[:, None] * wave
+        shape = numerator / (1.0 + ar[:, None] ** 2 - 2.0 * ar[:, None] * wave)
+        deviance = n * np.log(np.maximum(((power / shape) @ counts) / counts.sum(), 1e-300))
+        # no noise is quieter at low frequencies than at high ones: where it looks so, a fit has taken them in
+        deviance = np.where(ar + ma >= -1e-12, deviance, np.inf)
+        at = int(np.argmin(deviance))
+        best = min(best, (float(deviance[at]), float(ar[at]), float(ma[at])))
+        centre = np.arctanh(np.clip(best[1:], -0.9999, 0.9999))
+        reach = reach / 4.0
+    return best
 
 
 def _innovations(series: Array, segments: Sequence[slice], ar: Array, ma: float) -> Array:
@@ -212,34 +214,7 @@ def _innovations(series: Array, segments: Sequence[slice], ar: Array, ma: float)
     return out
 
 
-def _start(p: int, q: int, value: float) -> Array:
-    return np.concatenate([np.arctanh([value] + [0.0] * (p - 1)), np.full(q, np.arctanh(-0.8 * value))])
-
-
-def _encoded(arma: Arma, q: int) -> Array:
-    """Partial autocorrelations and ma, each through atanh: any real numbers are a stationary, invertible ARMA."""
-    ar = arma.ar.copy()
-    partial = np.zeros(len(ar))
-    for k in range(len(ar) - 1, -1, -1):
-        partial[k] = ar[k]
-        if k:
-            ar = (ar[:k] + partial[k] * ar[:k][::-1]) / (1.0 - partial[k] ** 2)
-    return np.clip(np.arctanh(np.clip(np.concatenate([partial, [arma.ma] * q]), -0.998, 0.998)), -3.49, 3.49)
-
-
-def _decoded(encoded: Array, p: int) -> tuple[Array, float]:
-    values = np.tanh(encoded)
-    ar = np.zeros(0)
-    for partial in values[:p]:
-        ar = np.concatenate([ar - partial * ar[::-1], [partial]])
-    return ar, float(values[p]) if len(values) > p else 0.0
-
-
 def _ratio(ar: Array, ma: float) -> float:
-    """Standard deviation of the noise over that of its innovations, from the impulse response."""
-    if not len(ar) and ma == 0.0:
-        return 1.0
-    impulse = np.zeros(2000)
-    impulse[0] = 1.0
-    response = lfilter([1.0, ma], np.concatenate([[1.0], -ar]), impulse)
-    return float(np.sqrt(response @ response))
+    """Standard deviation of the noise over that of its innovations."""
+    a = float(ar[0]) if len(ar) else 0.0
+    return float(np.sqrt(1.0 + (a + ma) ** 2 / (1.0 - a**2)))

@@ -6,13 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binomtest, chi2, norm
+from scipy.stats import binomtest, chi2, median_abs_deviation, norm
 
 from ..calibration.frames import Array
+from .closure import claimed_std, high_frequency_variance
+from .composed import Problem
 from .fitting import Fit, Fitter
+from .holm import holm
 from .levels import SIGNIFICANT, fit_level
 from .noise import Arma, Noise
-from .problem import Problem
 
 LEVEL = 0.01
 OUTLIER_SIGMA = 6.0
@@ -33,32 +35,32 @@ class NoiseFinding:
 
 def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
     """Findings that are significant, the clearest first; p is Holm's over all."""
-    from statsmodels.stats.multitest import multipletests
-
     problem = fitter.problem
-    explained = fitter.residual - fit.residual
-    raw = problem.residual - explained
-    innovations = fit.noise.whiten(raw).reshape(-1, 3)
+    raw = fit.residual + fitter.outliers
+    innovations = fit.noise.whiten(raw).reshape(raw.shape)
     candidates = [
-        _outliers(innovations),
+        _outliers(innovations, problem),
         _stale(problem),
         _coloured(fit.noise, fit.residual, problem),
-        *_inflation(problem, raw, innovations, fit.noise),
+        *_inflation(problem, fit, innovations),
     ]
     found = [each for each in candidates if each is not None]
     if not found:
         return []
-    adjusted = multipletests([each.p for each in found], method="holm")[1]
+    adjusted = holm([each.p for each in found])
     findings = [
         NoiseFinding(each.name, each.parameters, float(p)) for each, p in zip(found, adjusted, strict=True) if p < LEVEL
     ]
     return sorted(findings, key=lambda each: each.p)
 
 
-def _outliers(innovations: Array) -> NoiseFinding | None:
-    scale = 1.4826 * np.median(np.abs(innovations), axis=0)
+def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
+    scale = median_abs_deviation(innovations, axis=0, scale="normal")
     far = (np.abs(innovations) > OUTLIER_SIGMA * scale).any(axis=1)
     count, n = int(np.count_nonzero(far)), len(innovations)
+    spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
+    if spikes > count:
+        count, n = spikes, received
     if count < 3:
         return None
     test = binomtest(count, n, 6.0 * norm.sf(OUTLIER_SIGMA), "greater")
@@ -85,7 +87,7 @@ def _coloured(noise: Noise, residual: Array, problem: Problem) -> NoiseFinding |
     interval = problem.interval
     constant = _time_constant(clearest, interval)
     if constant < 2.0 * interval:
-        return None  # neighbours share samples of the reference, which is the pairing's doing
+        return None  # neighbours share samples of the reference by interpolation
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
     parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
     return NoiseFinding("coloured_reference_noise", parameters, float(chi2.sf(max(drop, 0.0), dof)))
@@ -97,19 +99,21 @@ def _time_constant(arma: Arma, interval: float) -> float:
     return interval / -np.log(slowest) if 0.0 < slowest < 1.0 else interval
 
 
-def _inflation(problem: Problem, raw: Array, innovations: Array, noise: Noise) -> list[NoiseFinding | None]:
+def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFinding | None]:
     found: list[NoiseFinding | None] = []
-    if all(recording.reported_variance is not None for recording in problem.recordings):
-        reported = problem.joined([r.averaged(r.reported_variance) for r in problem.recordings])  # type: ignore[arg-type]
-        ratio = np.median(np.abs(raw)) / (0.6745 * np.sqrt(np.median(reported)))
-        error = 0.8 / np.sqrt(raw.size)
+    claimed = claimed_std(problem)
+    if claimed is not None:
+        errors = problem.errors(fit.seen)
+        variance, error = high_frequency_variance(problem.sample_time, errors)
+        ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in claimed])))
+        error = 0.5 * error
         if ratio > INFLATION:
             p = float(2.0 * norm.sf(np.log(ratio) / error))
             low, high = float(ratio * np.exp(-1.96 * error)), float(ratio * np.exp(1.96 * error))
-            found.append(NoiseFinding("noise_inflation", {"factor": (float(ratio), low, high)}, p))
-    level = fit_level(problem, innovations * noise.level)
+            found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
+    level = fit_level(problem, fit.seen, innovations * fit.noise.level)
     if level is not None and level.p < SIGNIFICANT:
-        units = {"speed": "log_per_mps", "turn_rate": "log_per_radps", "reported": "log_per_log_reported"}
+        units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}
         z = norm.isf(np.maximum(level.p_of, 1e-300) / 2.0)
         parameters = {
             units[name]: (
@@ -118,7 +122,7 @@ def _inflation(problem: Problem, raw: Array, innovations: Array, noise: Noise) -
                 float(slope + 1.96 * abs(slope) / z_of),
             )
             for name, slope, z_of, p in zip(level.names, level.slopes, z, level.p_of, strict=True)
-            if p < LEVEL and name != "reported"
+            if p < LEVEL
         }
         if parameters:
             found.append(NoiseFinding("noise_inflation", parameters, level.p))

@@ -1,109 +1,59 @@
-"""What a diagnosis looks at: recordings as aligned arrays on the DVL's stamps."""
+"""What a diagnosis looks at: of each recording the streams as they are, each with stamps of its own."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, reduce
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dst, idst
 from scipy.interpolate import make_interp_spline
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.signal import savgol_filter
+from scipy.stats import median_abs_deviation
 
-from ..calibration.clocks import SECOND_NS
-from ..calibration.frames import Array, rotation_from_quaternion
-from ..calibration.models import Needs as Partners
-from ..calibration.observe import Observer
+from ..bags.reader import BagReader
+from ..calibration.clocks import Clocks
+from ..calibration.findings import Finding
+from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.parameters import Parameters
-from ..calibration.samples import AlignedBlock, VelocityFrame
+from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
+from ..calibration.screening import SMALLEST_VARIANCE
 from ..effects.base import Needs
 from ..errors import InputError
-from ..replay.replay import Topics, replay
+from ..messages.columns import sample_streams
+from ..messages.decode import MessageDecoder
+from ..messages.drivers import KNOWN_DEFINITIONS
+from ..replay.replay import Topics, _check_topics, _of_types
+from .settings import SETTINGS
 
-# Samples are thinned to the first and averaged to the second to test hypotheses: what the effects do lies below 1 Hz,
-# and five hours must fit. Traces are computed at the third at least, so that delays and lags are exact.
-MAX_RATE_HZ = 10.0
-MAX_TEST_RATE_HZ = 5.0
-# Samples of one recording that hypotheses are tested on: 40 minutes at the rate above; longer ones are averaged more
-MAX_TEST_SAMPLES = 12_000
-MIN_TRACE_RATE_HZ = 8.0
-# Share of the DVL's samples that must have attitude and angular velocity for them to be used at all
-MIN_ORIENTED_SHARE = 0.5
+SECOND_NS = 1_000_000_000
+# Shorter stretches have too few frequencies to tell motion from noise, whose power is averaged over so many bands
+MIN_SPECTRUM, BANDS = 60, 40
+# Power of a band over that of noise up to which it is noise alone, and from which all of it is kept
+NOISE_ALONE, SOME_MOTION = 1.4, 2.5
+# Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out
+SPIKE, SPIKE_PASSES = 12.0, 3
+# Streams slower than this show turns and waves barely; they have no frequencies to spare
+FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 
 
-@dataclass(frozen=True)
-class Recording:
-    """One recording, N samples in order of time, which are averaged to M before hypotheses are tested.
-
-    name: of the bag. time: (N,) s since its first sample. velocity_dvl: (N, 3) m/s, DVL frame, at the reference point.
-    reference_body: (N, 3) m/s. bins: (M + 1,) where the groups of samples begin and end that are averaged.
-    reported_variance: (N, 3) (m/s)² of the difference, DVL frame, or None where the messages give none.
-    rotation_enu_from_body: (N, 3, 3) and angular_velocity: (N, 3) rad/s, body, or None. reference_around: (N, 2) s, as
-    in `Observations`. reference_frame: in which the reference was recorded. repeats: of `received` DVL samples, how
-    many have the very velocity of the one before.
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One stream as a function of time: cubic between samples. time: (N,) s, increasing. values: (N, k). claimed:
+    (k,) standard deviation that messages claim. like: a curve of the same stream, without made-up noise, that tells
+    what is noise.
     """
 
-    name: str
     time: Array
-    velocity_dvl: Array
-    reference_body: Array
-    bins: NDArray[np.intp]
-    reported_variance: Array | None = None
-    rotation_enu_from_body: Array | None = None
-    angular_velocity: Array | None = None
-    reference_around: Array | None = None
-    reference_frame: VelocityFrame = VelocityFrame.ENU
-    repeats: int = 0
-    received: int = 0
-
-    @property
-    def available(self) -> frozenset[Needs]:
-        """What effects may need and this recording has."""
-        has = {Needs.ATTITUDE: self.rotation_enu_from_body, Needs.ANGULAR_VELOCITY: self.angular_velocity}
-        return frozenset(need for need, values in has.items() if values is not None)
-
-    def averaged(self, values: Array) -> Array:
-        """Means (M, ...) of values (N, ...) over the bins."""
-        if len(self.bins) == len(values) + 1:
-            return values
-        return _means(values, self.bins)
-
-    @property
-    def every(self) -> int:
-        """Number of samples in an ordinary bin."""
-        return int(np.median(np.diff(self.bins)))
-
-    @property
-    def finer(self) -> int:
-        """How many times to compute traces at for each sample."""
-        return max(1, int(np.ceil(MIN_TRACE_RATE_HZ * self.interval)))
-
-    @cached_property
-    def fine_time(self) -> Array:
-        """(F,) s: times with `finer` - 1 more between each two samples."""
-        n = len(self.time)
-        return np.interp(np.arange((n - 1) * self.finer + 1) / self.finer, np.arange(n), self.time)
-
-    @cached_property
-    def fine_rotation_enu_from_body(self) -> Array | None:
-        """(F, 3, 3) at the fine times, None without attitude."""
-        if self.rotation_enu_from_body is None:
-            return None
-        rotations: Array = Slerp(self.time, Rotation.from_matrix(self.rotation_enu_from_body))(
-            self.fine_time
-        ).as_matrix()
-        return rotations
-
-    @cached_property
-    def fine_angular_velocity(self) -> Array | None:
-        """(F, 3) rad/s at the fine times, None without."""
-        if self.angular_velocity is None:
-            return None
-        rates: Array = make_interp_spline(self.time, self.angular_velocity, k=1)(self.fine_time)
-        return rates
+    values: Array
+    claimed: Array | None = None
+    like: Curve | None = None
 
     @cached_property
     def interval(self) -> float:
@@ -111,148 +61,245 @@ class Recording:
         return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
 
     @cached_property
-    def bin_time(self) -> Array:
-        """(M,) s, mean time of each bin."""
-        return self.averaged(self.time)
+    def _spline(self) -> Any:
+        return make_interp_spline(self.time, self.values, k=min(3, len(self.time) - 1))
+
+    def __call__(self, at: Array) -> Array:
+        """(M, k) at times (M,) s; before the first and after the last as there."""
+        values: Array = self._spline(np.clip(at, self.time[0], self.time[-1]))
+        return values
+
+    @cached_property
+    def quiet(self) -> Curve:
+        """The same without those frequencies in which there is next to nothing but noise, stretch by stretch.
+
+        So a stream is as noisy between its samples as at them, and a delay does not gain by the noise. On sines about
+        the line from end to end, so that nothing rings there. What holds any motion is left as it is: turns are rare,
+        and a filter that is best on average would bend them.
+        """
+        values = self.values.copy()
+        for part in self.stretches:
+            if part.stop - part.start < MIN_SPECTRUM or self.interval > FAST_ENOUGH_S:
+                continue
+            spectrum, _ = _sines((self.like or self).values[part])
+            gain = np.column_stack(
+                [_gain(column**2, std**2) for column, std in zip(spectrum.T, self.noise, strict=True)]
+            )
+            own, line = _sines(self.values[part])
+            values[part] = line + idst(gain * own, type=2, axis=0, norm="ortho")
+        return Curve(self.time, values)
+
+    @cached_property
+    def smooth(self) -> Curve:
+        """The same for regressors: `quiet`, or of a slow stream each sample on the cubic through those around it."""
+        if self.interval <= FAST_ENOUGH_S or len(self.time) <= SMOOTH_SAMPLES:
+            return self.quiet
+        return Curve(self.time, savgol_filter(self.values, SMOOTH_SAMPLES, 3, axis=0))
+
+    @cached_property
+    def stretches(self) -> list[slice]:
+        """Parts without a gap."""
+        breaks = np.flatnonzero(np.diff(self.time) > SETTINGS.max_gap_intervals * self.interval) + 1
+        edges = [0, *breaks.tolist(), len(self.time)]
+        return [slice(start, end) for start, end in pairwise(edges)]
+
+    @cached_property
+    def derivative(self) -> Any:
+        """(M,) -> (M, k) per s, of the curve as it is."""
+        return self._spline.derivative()
+
+    @cached_property
+    def roughness(self) -> Array:
+        """(k,) what neighbours do not tell of a sample, std: its noise, and what it is too far from them to show.
+
+        Of fourth differences, to which turns are nothing and white noise is √70 times itself.
+        """
+        if self.like is not None:
+            return self.like.roughness
+        if len(self.time) < 10:
+            return np.zeros(self.values.shape[1])
+        differences = np.diff(self.values, 4, axis=0)
+        return np.asarray(median_abs_deviation(differences, axis=0, scale="normal") / np.sqrt(70.0))
+
+    def without_spikes(self) -> Curve:
+        """The same without samples far from where their neighbours are, which would bend the curve about them.
+
+        Of a fast stream only: between the samples of a slow one a vehicle can turn.
+        """
+        curve = self
+        for _ in range(SPIKE_PASSES):
+            x = curve.values
+            if curve.interval > FAST_ENOUGH_S or len(x) < 10:
+                return curve
+            off = np.zeros_like(x)
+            off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
+            scale = np.maximum(np.asarray(median_abs_deviation(off, axis=0, scale="normal")), 1e-9)
+            far = (np.abs(off) / scale).max(axis=1)
+            beside = np.maximum(np.append(far[1:], 0.0), np.append(0.0, far[:-1]))
+            kept = (far < SPIKE) | (far < beside)  # what a spike does to its neighbours is not theirs
+            if kept.all():
+                return curve
+            curve = Curve(curve.time[kept], x[kept], curve.claimed)
+        return curve
+
+    @cached_property
+    def noise(self) -> Array:
+        """(k,) standard deviation of what is noise: no more than the roughness, and than is claimed."""
+        if self.like is not None:
+            return self.like.noise
+        return self.roughness if self.claimed is None else np.minimum(self.roughness, self.claimed)
+
+    def shaken(self, rng: np.random.Generator) -> Curve:
+        """The same with as much noise again."""
+        return Curve(self.time, self.values + self.noise * rng.standard_normal(self.values.shape), like=self)
+
+    def covers(self, at: Array) -> NDArray[np.bool_]:
+        """(M,) whether samples stand on both sides, not too far apart."""
+        after = np.clip(np.searchsorted(self.time, at), 1, len(self.time) - 1)
+        apart = self.time[after] - self.time[after - 1]
+        inside = (at >= self.time[0]) & (at <= self.time[-1])
+        return inside & (apart <= SETTINGS.max_gap_intervals * self.interval)
+
+    def averaged(self, rate_hz: float) -> Curve:
+        """Means over groups of samples, so that they come at no more than a rate."""
+        every = int(np.ceil(1.0 / (rate_hz * self.interval) - 0.05))
+        if every <= 1:
+            return self
+        group = np.floor((self.time - self.time[0]) / (every * self.interval) + 1e-6)
+        starts = np.flatnonzero(np.diff(group, prepend=-1.0))
+        counts = np.diff(np.append(starts, len(self.time)))
+        time = np.add.reduceat(self.time, starts) / counts
+        claimed = None if self.claimed is None else self.claimed / np.sqrt(every)
+        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed)
+
+
+def _sines(values: Array) -> tuple[Array, Array]:
+    """Coefficients (N, k) of sines of values (N, k) about the line from their first to their last, and that line."""
+    line = np.linspace(values[0], values[-1], len(values))
+    return dst(values - line, type=2, axis=0, norm="ortho"), line
+
+
+def _gain(power: Array, noise: float) -> Array:
+    """(N,) zero where the power (N,) of sines is that of noise, one where it is more; low bands are narrow."""
+    n = len(power)
+    edges = np.unique(np.concatenate([[0], np.geomspace(1.0, n, BANDS), [n]]).astype(int))
+    mean = np.add.reduceat(power, edges[:-1]) / np.diff(edges)
+    over = np.clip((mean / max(noise, 1e-300) - NOISE_ALONE) / (SOME_MOTION - NOISE_ALONE), 0.0, 1.0)
+    beside = np.maximum(over, np.maximum(np.append(over[1:], 0.0), np.append(0.0, over[:-1])))
+    gain: Array = np.repeat(beside, np.diff(edges))
+    return gain
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The streams of one recording. Times in s since its first DVL stamp (first_ns).
+
+    name: of the bag. dvl: (N, 3) m/s, DVL frame. reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
+    attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of neighbours alike in sign. rates: (G, 3) rad/s,
+    body. dvl_std, reference_std: (3,) m/s that the messages claim, the reference's in its frame; None where they do
+    not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many have the
+    very velocity of the one before; spikes: how many were far off and are left out.
+    """
+
+    name: str
+    dvl: Curve
+    reference: Curve
+    frame: VelocityFrame = VelocityFrame.ENU
+    attitude: Curve | None = None
+    rates: Curve | None = None
+    dvl_std: Array | None = None
+    reference_std: Array | None = None
+    measured: tuple[bool, bool, bool] = (True, True, True)
+    repeats: int = 0
+    received: int = 0
+    spikes: int = 0
+    first_ns: int = 0
+    _kept: dict[Any, Any] = field(default_factory=dict)
+
+    @property
+    def available(self) -> frozenset[Needs]:
+        """What effects may need and this recording has."""
+        has = {
+            Needs.ATTITUDE: self.attitude is not None,
+            Needs.ANGULAR_VELOCITY: self.attitude is not None or self.rates is not None,
+        }
+        return frozenset(need for need, there in has.items() if there)
 
     @property
     def seconds(self) -> float:
-        """Length, s."""
-        return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
+        """Length of the DVL's stream, s."""
+        return float(self.dvl.time[-1] - self.dvl.time[0]) if len(self.dvl.time) else 0.0
+
+    def rotation_enu_from_body(self, at: Array) -> Array:
+        """(M, 3, 3)."""
+        if self.attitude is None:
+            raise ValueError(f"{self.name}: no attitude")
+        q = self.attitude(at)
+        return rotation_from_quaternion(q / np.linalg.norm(q, axis=1)[:, None])
+
+    def angular_velocity(self, at: Array) -> Array:
+        """(M, 3) rad/s, body: of the IMU's own rates, or of its attitude where these are too slow."""
+        rates, attitude = self.rates, self.attitude
+        if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
+            return rates(at)
+        if attitude is None:
+            raise ValueError(f"{self.name}: no angular velocity")
+        q, dq = attitude(at), attitude.derivative(np.clip(at, attitude.time[0], attitude.time[-1]))
+        square = (q * q).sum(axis=1)[:, None]
+        # vector part of 2 q* dq/dt, with q = (x, y, z, w)
+        xyz = q[:, 3:] * dq[:, :3] - dq[:, 3:] * q[:, :3] - np.cross(q[:, :3], dq[:, :3])
+        return np.asarray(2.0 * xyz / square)
 
 
 def make_recording(
     name: str,
-    time: Array,
-    velocity_dvl: Array,
-    reference_body: Array,
-    reported_variance: Array | None = None,
-    rotation_enu_from_body: Array | None = None,
-    angular_velocity: Array | None = None,
-    reference_around: Array | None = None,
-    reference_frame: VelocityFrame = VelocityFrame.ENU,
-    reference_rate: float = np.inf,
+    dvl: tuple[Array, Array],
+    reference: tuple[Array, Array],
+    *,
+    frame: VelocityFrame = VelocityFrame.ENU,
+    attitude: tuple[Array, Array] | None = None,
+    rates: tuple[Array, Array] | None = None,
+    dvl_std: Array | None = None,
+    reference_std: Array | None = None,
+    axes: str = "auto",
+    first_ns: int = 0,
 ) -> Recording:
-    """A recording, thinned by averaging to rates that the diagnosis needs. reference_rate: Hz, of its own samples."""
-    interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    received, repeats = len(time), int((np.diff(velocity_dvl, axis=0) == 0.0).all(axis=1).sum())
-    thin = _bins(time, interval, MAX_RATE_HZ)
-    if len(thin) < len(time) + 1:
-        time, velocity_dvl, reference_body = (_means(each, thin) for each in (time, velocity_dvl, reference_body))
-        if reported_variance is not None:
-            reported_variance = _means(reported_variance, thin) / np.diff(thin)[:, None]
-        if rotation_enu_from_body is not None:
-            u, _, vt = np.linalg.svd(_means(rotation_enu_from_body, thin))  # the mean, back on the rotations
-            rotation_enu_from_body = u @ vt
-        angular_velocity = None if angular_velocity is None else _means(angular_velocity, thin)
-        reference_around = None if reference_around is None else _means(reference_around, thin)
-        interval = float(np.median(np.diff(time)))
+    """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4). axes: as gnss_axes."""
+    time, velocity = dvl
+    repeats = int((np.diff(velocity, axis=0) == 0.0).all(axis=1).sum())
+    spikes = len(time) - len(Curve(time, velocity).without_spikes().time) if len(time) > 1 else 0
+
+    def curve(stream: tuple[Array, Array] | None, claimed: Array | None = None) -> Curve | None:
+        if stream is None or len(stream[0]) < 2:
+            return None
+        return Curve(*stream, claimed).without_spikes().averaged(SETTINGS.max_stream_rate)
+
+    if attitude is not None:
+        attitude = attitude[0], _alike_in_sign(attitude[1])
+    dvl_curve, reference_curve = curve(dvl, dvl_std), curve(reference, reference_std)
+    if dvl_curve is None or reference_curve is None:
+        raise InputError(f"{name}: fewer than two samples of DVL or reference")
     return Recording(
-        name=name,
-        time=time,
-        velocity_dvl=velocity_dvl,
-        reference_body=reference_body,
-        bins=_bins(time, interval, _test_rate(time, reference_around, reference_rate)),
-        reported_variance=reported_variance,
-        rotation_enu_from_body=rotation_enu_from_body,
-        angular_velocity=angular_velocity,
-        reference_around=reference_around,
-        reference_frame=reference_frame,
-        repeats=repeats,
-        received=received,
-    )
+        name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), dvl_std, reference_std,
+        _measured_axes(reference[1], reference_std, axes), repeats, len(time), spikes, first_ns,
+    )  # fmt: skip
 
 
-def _test_rate(time: Array, reference_around: Array | None, reference_rate: float) -> float:
-    """Rate, Hz, of the means that hypotheses are tested on."""
-    enough = MAX_TEST_SAMPLES / max(float(time[-1] - time[0]), 1.0)
-    return min(MAX_TEST_RATE_HZ, enough, _independent_rate(reference_around, reference_rate))
+def _alike_in_sign(quaternions: Array) -> Array:
+    turned = np.sign(np.einsum("ni,ni->n", quaternions[1:], quaternions[:-1]))
+    signs = np.cumprod(np.concatenate([[1.0], np.where(turned == 0.0, 1.0, turned)]))
+    return quaternions * signs[:, None]
 
 
-def _independent_rate(reference_around: Array | None, reference_rate: float) -> float:
-    """Rate, Hz, at which means of the reference have noise of their own.
-
-    Between two samples it is a mean of both, so neighbours share their noise, in a way that has next to none at the
-    reference's own rate; a whitened residual would then hold little else than what was neglected there.
-    """
-    interpolated = reference_around is not None and reference_around.any()
-    return reference_rate / 2.0 if interpolated else reference_rate
+def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool, bool, bool]:
+    if axes != "auto":
+        return True, True, axes == "xyz"
+    measured = np.ones(3, dtype=bool) if std is None else std < SETTINGS.unmeasured_std
+    measured[2] &= bool(velocity[:, 2].any())
+    return bool(measured[0]), bool(measured[1]), bool(measured[2])
 
 
-def _means(values: Array, bins: NDArray[np.intp]) -> Array:
-    counts = np.diff(bins).reshape(-1, *[1] * (values.ndim - 1))
-    mean: Array = np.add.reduceat(values, bins[:-1], axis=0) / counts
-    return mean
-
-
-def _bins(time: Array, interval: float, rate: float) -> NDArray[np.intp]:
-    """Where groups begin (and the last ends) whose means come at no more than a rate, or at the samples' own rate."""
-    every = int(np.ceil(1.0 / (rate * interval) - 0.05))
-    if every <= 1:
-        return np.arange(len(time) + 1)
-    index = np.floor((time - time[0]) / (every * interval) + 1e-6)
-    starts = np.flatnonzero(np.diff(index, prepend=-1.0))
-    return np.append(starts, len(time))
-
-
-class _Collector:
-    """Keeps the paired rows that a calibrator aligns."""
-
-    def __init__(self, parameters: Parameters) -> None:
-        self._observer = Observer(parameters)
-        self._paired: list[tuple[NDArray[Any], ...]] = []
-
-    @property
-    def has_paired(self) -> bool:
-        """Whether any sample had a reference."""
-        return bool(self._paired)
-
-    def forget(self) -> None:
-        """The calibration starts anew."""
-        self._paired.clear()
-
-    def take(self, block: AlignedBlock) -> None:
-        """Aligned rows, in order."""
-        block = block.part(block.paired)
-        if not len(block):
-            return
-        seen = self._observer.observe(block, Partners.REFERENCE, np.zeros(2))
-        assert seen.reference_body is not None
-        variance = np.broadcast_to(np.diagonal(seen.noise, axis1=1, axis2=2), (len(block), 3))
-        self._paired.append(
-            (
-                block.stamps_ns,
-                seen.velocity_at_reference,
-                seen.reference_body,
-                variance,
-                block.around_s,
-                block.oriented,
-                rotation_from_quaternion(block.attitude[:, :4]),
-                block.attitude[:, 4:],
-            )
-        )
-
-    def recording(self, name: str, parameters: Parameters, reference_rate: float, frame: VelocityFrame) -> Recording:
-        """What was collected."""
-        columns = [np.concatenate(parts) for parts in zip(*self._paired, strict=True)]
-        oriented = columns[5]
-        has_attitude = np.count_nonzero(oriented) >= MIN_ORIENTED_SHARE * len(oriented)
-        if has_attitude:
-            columns = [values[oriented] for values in columns]
-        stamps, velocity, reference, variance, around, _, rotation, rate = columns
-        assumed = np.allclose(variance, parameters.gnss_aided_std**2, rtol=1e-12)
-        return make_recording(
-            name,
-            (stamps - stamps[0]) / SECOND_NS,
-            velocity,
-            reference,
-            None if assumed else variance,
-            rotation if has_attitude else None,
-            rate if has_attitude else None,
-            around,
-            frame,
-            reference_rate,
-        )
+# ------------------------------------------------------------------ from bags
 
 
 @dataclass(frozen=True)
@@ -266,7 +313,7 @@ class Loaded:
 def load_recordings(
     paths: Sequence[Path], parameters: Parameters, topics: Topics, on_progress: Callable[[float], None] = lambda _: None
 ) -> Loaded:
-    """Replay every bag and keep its paired samples. Raises InputError, also for a bag without any."""
+    """Read every bag. Raises InputError, also for a bag without a reference velocity."""
     if len(set(paths)) < len(paths):
         raise InputError(f"{', '.join(map(str, paths))}: a bag is named twice")
     recordings: list[Recording] = []
@@ -284,23 +331,114 @@ def load_recordings(
 
 def _load(
     path: Path, parameters: Parameters, topics: Topics, on_progress: Callable[[float], None]
-) -> tuple[Recording, tuple[str, ...]]:
-    collector = _Collector(parameters)
-    replayed = replay([path], parameters, topics, on_progress, on_rows=collector.take, on_restart=collector.forget)
-    result = replayed.result
-    received, paired = result.counts["reference"]["received"], result.counts["pairing"]["paired"]
-    if not received:
+) -> tuple[Recording, list[str]]:
+    found: list[Finding] = []
+    with BagReader([path], KNOWN_DEFINITIONS) as bag:
+        chosen = topics.found_in(bag.topics)
+        _check_topics(bag, [path], chosen, found)
+        decoder = MessageDecoder(_of_types(bag, chosen, parameters))
+        streams = _read(bag, chosen, decoder, on_progress)
+        notes = [*bag.notes, *map(str, found), *map(str, decoder.problems.values())]
+    if not len(streams.reference):
         raise InputError(
             f"{path}: no reference velocity to compare the DVL with: no messages on {topics.gnss}; set --gnss-topic"
         )
-    if not paired or not collector.has_paired:
-        lost = ", ".join(f"{value} {key}" for key, value in result.counts["reference"].items() if value)
+    return _recording(path.name, streams, parameters, notes), notes
+
+
+def _read(bag: BagReader, topics: Topics, decoder: MessageDecoder, on_progress: Callable[[float], None]) -> Streams:
+    start_ns, end_ns = bag.span_ns
+    parts: list[Streams] = []
+    named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
+    for stretch in sample_streams(bag, named, decoder):
+        parts.append(stretch.streams)
+        on_progress((stretch.log_ns - start_ns) / max(end_ns - start_ns, 1))
+    blocks = [reduce(lambda one, other: one.joined(other), each) for each in zip(*parts, strict=True)]
+    return Streams(*blocks)
+
+
+def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[str]) -> Recording:
+    clocks = Clocks.of(parameters)
+    dvl = _in_order(_valid(streams.dvl, parameters), parameters, notes)
+    if not len(dvl):
+        lost = Counter(streams.dvl.reasons[code - 1] for code in streams.dvl.refused.tolist() if code)
+        listing = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "all invalid"
+        raise InputError(f"{name}: no valid DVL sample of {len(streams.dvl)}: {listing}")
+    first_ns = int(dvl.stamps_ns[0])
+    reference = _in_order(_valid(streams.reference, parameters), parameters, notes)
+    if not len(reference):
+        raise InputError(f"{name}: no valid reference velocity of {len(streams.reference)}; see gnss_frame, max_speed")
+    code = int(reference.frames[0])
+    reference = reference.part(np.flatnonzero(reference.frames == code))
+    velocity, std, frame = reference.values, _std(reference.covariances), FRAMES[code]
+    if frame is VelocityFrame.NED:
+        velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[[1, 0, 2]], VelocityFrame.ENU
+    imu = _in_order(streams.imu.part(streams.imu.refused == 0), parameters, notes)
+    length = np.linalg.norm(imu.orientation, axis=1)
+    oriented = imu.part(np.flatnonzero((length > 0.5) & (length < 2.0)))
+    rated = imu.part(np.flatnonzero(np.isfinite(imu.angular_velocity).all(axis=1)))
+    if frame is VelocityFrame.ENU and len(oriented) < 2:
         raise InputError(
-            f"{path}: no DVL sample has a reference velocity at its time (reference: {lost}); do the stamps of "
-            f"{topics.dvl} and {topics.gnss} overlap, and is attitude on {topics.imu} for a reference in an earth "
-            "frame?"
+            f"{name}: the reference is in an earth frame and there is no attitude to turn it into the body; "
+            "set --imu-topic, or record sensor_msgs/Imu with orientation"
         )
-    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
-    rate = received / seconds if seconds else np.inf
-    frame = replayed.reference_frame or VelocityFrame.ENU
-    return collector.recording(path.name, parameters, rate, frame), replayed.notes
+    at = clocks.dvl(dvl.stamps_ns, first_ns)
+    imu_ns = clocks.imu_ns
+    return make_recording(
+        name,
+        _stream(at, dvl.values, first_ns),
+        _stream(reference.stamps_ns - clocks.reference_ns, velocity, first_ns),
+        frame=frame,
+        attitude=_stream(oriented.stamps_ns - imu_ns, oriented.orientation, first_ns) if len(oriented) > 1 else None,
+        rates=_stream(rated.stamps_ns - imu_ns, rated.angular_velocity, first_ns) if len(rated) > 1 else None,
+        dvl_std=_std(dvl.covariances),
+        reference_std=std,
+        axes=getattr(parameters, "gnss_axes", "auto"),
+        first_ns=first_ns,
+    )
+
+
+def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple[Array, Array]:
+    time = 1e-9 * (stamps_ns - first_ns)
+    later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])  # a jump taken off may cross two
+    return time[later], values[later]
+
+
+def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
+    """Rows that are samples, finite, no faster than max_speed, without a negative variance but for -1."""
+    speed = np.linalg.norm(block.values, axis=1)
+    valid = (block.refused == 0) & np.isfinite(speed) & (speed <= parameters.max_speed)
+    if block.stream is Stream.DVL:
+        negative = np.array([bool((np.diag(c) < 0.0).any()) for c in block.covariances.distinct] + [False])
+        valid &= ~negative[block.covariances.index]
+    return block.part(valid)
+
+
+def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> SampleBlock:
+    """Rows of the longest stretch without a restart, in strictly increasing order of stamps."""
+    stamps = block.stamps_ns
+    jump_ns = round(parameters.max_time_jump * SECOND_NS)
+    stray = np.zeros(len(stamps), dtype=bool)
+    if len(stamps) > 2:
+        before, after = stamps[1:-1] - stamps[:-2], stamps[2:] - stamps[1:-1]
+        far = (np.abs(before) > jump_ns) & (np.abs(after) > jump_ns) & (np.sign(before) != np.sign(after))
+        stray[1:-1] = far & (np.abs(stamps[2:] - stamps[:-2]) <= jump_ns)
+    kept = np.flatnonzero(~stray)
+    parts = np.split(kept, np.flatnonzero(np.diff(stamps[kept]) < -jump_ns) + 1)
+    longest = max(parts, key=len)
+    if len(parts) > 1:
+        notes.append(
+            f"{block.stream.value}: stamps went back {len(parts) - 1} times; the longest stretch between is diagnosed"
+        )
+    order = longest[np.argsort(stamps[longest], kind="stable")]
+    fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
+    return block.part(order[fresh])
+
+
+def _std(covariances: Covariances) -> Array | None:
+    """(3,) median standard deviation per axis that messages claim; infinite where -1 or more; None where not given."""
+    if not len(covariances.index) or (covariances.index < 0).any():
+        return None
+    variance = np.diagonal(covariances.distinct, axis1=1, axis2=2)[covariances.index]
+    variance = np.median(np.where(variance < 0.0, np.inf, variance), axis=0)
+    return None if (variance < SMALLEST_VARIANCE).any() else np.asarray(np.sqrt(variance))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -26,7 +26,8 @@ class Verdict(str, Enum):
 @dataclass(frozen=True)
 class FoundEffect:
     """An effect that was found. equivalent_to: others that this data cannot tell from it. parameters: value, low, high
-    (95 per cent) by name. closure: of the gap by this effect alone. p: adjusted over the library.
+    (95 per cent) by name; of the day's, in several recordings, their weighted mean, and by_recording the values of
+    each. closure: of the gap by this effect alone. p: adjusted over the library.
     """
 
     name: str
@@ -34,11 +35,15 @@ class FoundEffect:
     parameters: Mapping[str, tuple[float, float, float]]
     closure: float
     p: float
+    by_recording: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any."""
+    """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any.
+    calibration: value, low, high of φ (rad) and δk, three of each, beside the effects. compared_axes: in words.
+    recordings: names and first stamps (ns).
+    """
 
     verdict: Verdict
     sentence: str
@@ -51,6 +56,9 @@ class Diagnosis:
     next_manoeuvre: str
     notes: tuple[str, ...]
     series: DiagnosisSeries | None = None
+    calibration: tuple[tuple[float, float, float], ...] = ()
+    compared_axes: str = "xyz"
+    recordings: tuple[tuple[str, int], ...] = ()
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -62,9 +70,16 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
             "before_mps": gap.before,
             "after_mps": gap.after,
             "noise_floor_mps": gap.noise_floor,
+            "not_explained_mps": gap.not_explained,
+            "reported_noise_mps": gap.reported,
             "closure": gap.closure,
             "closure_ci95": list(gap.interval),
             "held_out": True,
+            **(
+                {"by_recording": {n: {"before_mps": b, "after_mps": a} for n, (b, a) in gap.by_recording.items()}}
+                if gap.by_recording
+                else {}
+            ),
         },
         "effects": [
             {
@@ -73,6 +88,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
                 "parameters": _parameters(effect.parameters),
                 "closure": effect.closure,
                 "p_adjusted": effect.p,
+                **_by_recording(effect),
             }
             for effect in diagnosis.effects
         ],
@@ -94,8 +110,25 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
         "untestable": [{"name": name, "needs": needs} for name, needs in diagnosis.untestable.items()],
         "minimum_detectable": {name: dict(sizes) for name, sizes in diagnosis.minimum_detectable.items()},
         "next_manoeuvre": diagnosis.next_manoeuvre,
+        "calibration": {
+            "phi_rad": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[:3], strict=False)},
+            "delta_k": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[3:], strict=False)},
+        },
+        "compared_axes": diagnosis.compared_axes,
+        "notes": list(diagnosis.notes),
     }
 
 
+def _by_recording(effect: FoundEffect) -> dict[str, Any]:
+    if not effect.by_recording:
+        return {}
+    return {"by_recording": {name: _parameters(values) for name, values in effect.by_recording.items()}}
+
+
 def _parameters(parameters: Mapping[str, tuple[float, float, float]]) -> dict[str, Any]:
-    return {name: {"value": value, "ci95": [low, high]} for name, (value, low, high) in parameters.items()}
+    return {name: _value(each) for name, each in parameters.items()}
+
+
+def _value(each: tuple[float, float, float]) -> dict[str, Any]:
+    value, low, high = each
+    return {"value": value, "ci95": [low, high]}

@@ -1,42 +1,59 @@
-"""Which effects the data calls for: forward selection with backward check, and what could stand in for each."""
+"""Which effects the data calls for.
+
+Columns propose: about the best fit so far, every effect's derivatives make one Gram matrix, in which all combinations
+of up to three effects are small least squares problems. The composed model decides: the best proposals are fitted in
+it until they stand still, and compared by what they explain less what so many parameters explain by chance. About the
+winner it is asked again, with the noise that is left by everything together: so that no effect is taken for noise.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from ..calibration.frames import Array
-from ..effects.base import ActsOn, Effect
-from .dictionary import WINDOW_STEPS, Candidate, Dictionary, Seen, is_time_of_run, log_p_value
-from .fitting import Fit, Fitter
+from ..effects.base import Effect
+from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
+from .first_fit import FirstGuess, first_guess
+from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
+from .least_squares import WhitenedLeastSquares
 from .levels import estimated
-from .noise import Noise
-from .problem import Problem
+from .noise import Noise, white_noise
+from .recordings import Recording
+from .settings import SETTINGS
 
-# Family-wise level of the claim that there is any effect at all
-LEVEL = 0.008
-MAX_EFFECTS = 3
-# Share of what is explained already that a further effect must add: the ghosts of a strong effect whose trace is not
-# exact to the last per cent add less
-GHOST_SHARE = 0.05
-# Effects whose evidence (log p) is within this of the best could be the cause as well: with truth j and a rival that it
-# takes for better by d = 2 · this, the odds are at most those of a normal variable beyond √d.
-INDISTINGUISHABLE = 3.0
-# Deviance behind the best at which no noise of its own will bring a rival back
-OUT_OF_THE_QUESTION = 40.0
-# Share of an effect's drop in deviance that its rivals may look worse by for being linear
-LINEAR_SHARE = 0.05
-# Effects that are tested in earnest in one step, of each of two looks
-MAX_TESTED = 3
-MAX_SWAPS = 2
-# Times that the noise is estimated anew from what a fit leaves
-ROUNDS = 2
-# A time of the run is told to this share of it
-FINEST = 500.0
-# log p beyond which a hypothesis is worth an estimate of its own noise
-WORTH_A_LOOK = -3.0
+# What a vehicle with a gap has most often; the first fit starts with all of these
+START = ("lever_arm", "dvl_time_offset", "reference_time_offset")
+# Parts of the run at whose ends effects that come and go are tried to begin or end, and how many of these are kept
+WINDOW_STEPS, KEPT_VARIANTS = 10, 2
+# Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
+SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
+ROUNDS = 4
+# Deviance within which the usual is preferred
+AS_WELL = 2.0
+# Fits with outliers drawn in about the one before, from the first guess on
+ROBUST_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Variant:
+    """An effect with its times of the run. tried: how many there are of its kind."""
+
+    effect: Effect
+    values: tuple[Values, ...]
+    columns: Array
+    tried: float
+
+    @property
+    def p(self) -> int:
+        """Number of columns."""
+        return self.columns.shape[2]
 
 
 @dataclass(frozen=True)
@@ -50,247 +67,438 @@ class Selected:
 
 @dataclass(frozen=True)
 class Selection:
-    """Outcome of a selection: the effects, strongest first, the fits without and with them, the fitter, and all effects
-    through the noise that is left.
+    """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
+    fitter; all columns (M, A, n), of calibration and effects, about the fit; guesses per recording.
     """
 
     selected: tuple[Selected, ...]
     base: Fit
     fit: Fit
     fitter: Fitter
-    seen: Seen
+    all_columns: Array
+    guesses: tuple[FirstGuess, ...]
 
     def withdrawn(self) -> Selection:
         """Without any effect."""
         return replace(self, selected=(), fit=self.base)
 
 
-def first_noise(problem: Problem) -> tuple[Noise, Array]:
-    """Noise of a problem's residual in the frame where it is simplest, and the residual without its outliers."""
-    rotations = {id(rotation): rotation for rotation in (problem.rotation_enu_from_body, None)}.values()
-    found = [estimated(problem, problem.residual, rotation) for rotation in rotations]
-    return min(found, key=lambda each: each[0].deviance(each[1]))
+def started(
+    recordings: Sequence[Recording], rotation_dvl_from_body: Array, lever_arm: Array, effects: Mapping[str, Effect]
+) -> tuple[Problem, Hypothesis, tuple[FirstGuess, ...]]:
+    """The problem about the first guess of each recording, and a hypothesis with what it holds."""
+    guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
+    problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+    lever = np.median([guess.lever_arm for guess in guesses], axis=0)
+    found: dict[str, tuple[Values, ...]] = {
+        "lever_arm": ({"x_m": float(lever[0]), "y_m": float(lever[1]), "z_m": float(lever[2])},) * len(guesses),
+        "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
+        "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
+    }
+    present = [effects[name] for name in START if name in effects]
+    start = no_effect(np.median([guess.phi for guess in guesses], axis=0)).with_effects(present, len(guesses), found)
+    return problem, start, guesses
 
 
-def select(problem: Problem, effects: Mapping[str, Effect]) -> Selection:
-    """Forward selection among testable effects, each step with a check of what is in already: whether it is called for
-    any more, and whether another effect explains more in its place.
-    """
-    noise, robust = first_noise(problem)
-    fitter = Fitter(problem, robust)
-    start = fit = fitter.fit_with_noise([], noise, {})
-    dictionary = Dictionary(problem, effects)
-    threshold = log_threshold(dictionary)
-    while len(fit.effects) < MAX_EFFECTS:
-        tested = _best_added(fitter, fit, dictionary)
-        if tested is None or tested.log_p > threshold or tested.drop < GHOST_SHARE * (start.deviance - fit.deviance):
+def select(
+    recordings: Sequence[Recording], rotation_dvl_from_body: Array, lever_arm: Array, effects: Mapping[str, Effect]
+) -> Selection:
+    """Select among testable effects."""
+    problem, start, guesses = started(recordings, rotation_dvl_from_body, lever_arm, effects)
+    fitter, fit = _first_fit(problem, start)
+    fitter, fit, columns = _about(fitter, fit, effects)
+    best = fit
+    seen_before: set[frozenset[str]] = set()
+    for _ in range(ROUNDS):
+        candidates = _proposed(fitter, fit, effects)
+        fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
+        finer = _finer_steps(problem)
+        fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
+        best = fitter.refined(_best(fits, effects), finer[3:])
+        best = _called_for(fitter, best, len(effects))
+        names = frozenset(effect.name for effect in best.effects)
+        fitter, fit, columns = _about(fitter, best, effects)
+        if names in seen_before:
             break
-        before = fit.effects
-        fitter, fit = about(fitter.problem, _called_for(fitter, tested.fit, threshold, tested.fit.effects[:-1]))
-        dictionary = dictionary_about(fitter, fit, effects)
-        for _ in range(MAX_SWAPS):
-            swapped = _swapped(fitter, fit, dictionary)
-            if swapped is None:
-                break
-            fitter, fit = about(fitter.problem, swapped)
-            dictionary = dictionary_about(fitter, fit, effects)
-        if set(fit.effects) == set(before):
-            break
-    while (kept := _called_for(fitter, fit, threshold, fit.effects)).effects != fit.effects:
-        # with the noise that is left in the end, and about the end's calibration
-        fitter, fit = about(fitter.problem, kept)
-        dictionary = dictionary_about(fitter, fit, effects)
-    seen = dictionary.seen(fit.noise, fitter.residual)
-    selected = [_selected(fitter, fit, number, seen) for number in range(len(fit.effects))]
-    base = fitter.fit([], fit.noise, {})
-    return Selection(tuple(sorted(selected, key=lambda each: each.log_p)), base, fit, fitter, seen)
+        seen_before.add(names)
+    fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
+    fitter, fit, columns = _about(fitter, fit, effects)
+    base = fitter.fit(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
+    selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
+    ordered = tuple(sorted(selected, key=lambda each: each.log_p))
+    return Selection(ordered, base, fit, fitter, columns, guesses)
 
 
-def log_threshold(dictionary: Dictionary) -> float:
-    """log p below which an effect is called for, having looked at all of the dictionary."""
-    return float(np.log(LEVEL / len(dictionary.effects)))
+# ------------------------------------------------------------------ noise
 
 
-def selected_again(seen: Seen) -> list[int]:
-    """Variants that forward selection takes from a dictionary, with the noise as it is and traces as they are there."""
-    chosen: list[int] = []
-    explained = 0.0
-    while len(chosen) < MAX_EFFECTS:
-        candidates = seen.candidates(chosen).values()
-        best = min(candidates, key=lambda candidate: candidate.log_p, default=None)
-        if best is None or best.log_p > log_threshold(seen.dictionary) or best.drop < GHOST_SHARE * explained:
-            break
-        chosen.append(best.index)
-        explained += best.drop
-    return chosen
+def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
+    """Robust fit of the first hypothesis, with white noise as large as the best fit so far leaves."""
+    fitter = Fitter(problem)
+    _, residual = fitter.evaluated(start)
+    fit = fitter.fit(start, white_noise(residual, problem.segments, None, problem.interval))
+    for _ in range(ROBUST_ROUNDS):
+        raw = fit.residual + fitter.outliers
+        noise = white_noise(raw, problem.segments, None, problem.interval)
+        fitter = Fitter(problem, raw - noise.robust(raw))
+        fit = fitter.fit(fit.hypothesis, noise)
+    return fitter, fit
 
 
-def dictionary_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Dictionary:
-    """Variants of all effects, those in a fit about its values first."""
-    present = [fitter.variant(effect, fit.values[effect.name]) for effect in fit.effects]
-    return Dictionary(fitter.problem, effects, present)
+def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit, Array]:
+    """A fit once more with the noise that everything together leaves, and outliers about that; and all columns."""
+    problem = fitter.problem
+    columns = np.concatenate(
+        [fit.columns, *(v.columns for v in _variants(fitter, fit, effects) if v.tried == 1.0)], axis=2
+    )
+    noise = fit.noise
+    raw = fit.residual + fitter.outliers
+    for _ in range(2):
+        explained = _explained(noise, columns, raw - fitter.outliers)
+        left = raw - explained
+        noise, robust = min(
+            (estimated(problem, fit.seen, left, rotation) for rotation in _frames(problem)),
+            key=lambda each: each[0].deviance(each[1]),
+        )
+        fitter = Fitter(problem, left - robust)
+    n, p = columns.shape[0] * columns.shape[1], np.linalg.matrix_rank(columns.reshape(-1, columns.shape[2]))
+    grown = float(np.sqrt(n / max(n - int(p), 1)))
+    noise = replace(noise, axes=tuple(replace(arma, std=arma.std * grown) for arma in noise.axes))
+    return fitter, fitter.fit(fit.hypothesis, noise), columns
+
+
+def _frames(problem: Problem) -> list[Array | None]:
+    return [None] if problem.earth_from_compared is None else [problem.earth_from_compared, None]
+
+
+def _explained(noise: Noise, columns: Array, residual: Array) -> Array:
+    """(M, A) what all columns explain of a residual, with a ridge that keeps those apart that are alike."""
+    size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
+    white = noise.whiten(columns / size)
+    ridge = np.full(columns.shape[2], 10.0 * np.sqrt(float((noise.whiten(residual) ** 2).sum())) / np.sqrt(len(white)))
+    solution = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge)).solution()
+    return np.asarray((columns / size) @ solution)
+
+
+# ------------------------------------------------------------------ proposals
+
+
+def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
+    """Times of the run, by name, that are tried: none at all first, then every part of the grid."""
+    times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
+    if not times:
+        return [{}]
+    grid = np.linspace(0.0, seconds, WINDOW_STEPS + 1).tolist()
+    if len(times) == 1:
+        return [{times[0]: at} for at in grid[1:-1]]
+    whole = {name: effect.defaults[name] for name in times}
+    parts = [dict(zip(times, part, strict=True)) for part in itertools.combinations(grid, len(times))]
+    return [whole, *(part for part in parts if part != {times[0]: 0.0, times[-1]: seconds})]
+
+
+def _variants(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
+    """Of every effect that is not in the fit, its columns about the fit, at every window that is tried."""
+    problem, present = fitter.problem, {effect.name for effect in fit.effects}
+    n = len(problem.recordings)
+    seconds = max(recording.seconds for recording in problem.recordings)
+    found = []
+    for effect in effects.values():
+        if effect.name in present:
+            continue
+        parts = windows(effect, seconds)
+        for part in parts:
+            values = (effect.defaults | part,) * n
+            columns = problem.columns(fit.hypothesis, fit.seen, effect, values)
+            tried = 1.0 if len(parts) == 1 else 2.0 if part is parts[0] and len(part) > 1 else 2.0 * len(parts)
+            found.append(Variant(effect, values, columns, tried))
+    return found
 
 
 @dataclass(frozen=True)
-class Tested:
-    """An effect tested on top of a fit: log p, the drop in deviance, and the fit with it."""
+class _Table:
+    """Everything that can be combined, in one Gram matrix. blocks: columns of each variant."""
 
-    log_p: float
-    drop: float
-    fit: Fit
+    variants: list[Variant]
+    blocks: list[NDArray[np.intp]]
+    system: WhitenedLeastSquares
+
+    def drop(self, chosen: Sequence[int]) -> float:
+        """Misfit that a combination leaves."""
+        part = self.system.part(np.concatenate([np.arange(6), *(self.blocks[index] for index in chosen)]))
+        return part.misfit(part.solution())
 
 
-def _best_added(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Tested | None:
-    """The most significant effect on top of a fit, of those that look like it; None if none does.
+def _table(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> _Table:
+    problem, noise, hypothesis = fitter.problem, fit.noise, fit.hypothesis
+    own: list[Variant] = []
+    at = 6
+    for effect in fit.effects:
+        p = len(hypothesis.parameters_of(effect))
+        own.append(Variant(effect, hypothesis.values[effect.name], fit.columns[:, :, at : at + p], 1.0))
+        at += p
+    variants = [*own, *_variants(fitter, fit, effects)]
+    # the residual as it would be without the fit's effects, as far as straight lines tell
+    vector = hypothesis.vector()
+    defaults = [0.0] * 6 + [each.spec.default for each in hypothesis.parameters()]
+    target = -(fit.residual - fit.columns @ (vector - np.array(defaults)))
+    blocks, start = [], 6
+    for variant in variants:
+        blocks.append(np.arange(start, start + variant.p))
+        start += variant.p
+    columns = np.concatenate([fit.columns[:, :, :6], *(variant.columns for variant in variants)], axis=2)
+    n = len(problem.recordings)
+    std = np.concatenate([prior_std(no_effect()), *(_std(variant.effect, variant.p, n) for variant in variants)])
+    system = WhitenedLeastSquares.of(noise.whiten(columns), noise.whiten(target), std, np.zeros_like(std))
+    return _Table(variants, blocks, system)
 
-    They are looked for with the noise that the fit leaves, with that which all effects together leave, and as if it
-    had no colour: the noise may have taken an effect's colour, which then looks small.
+
+def _std(effect: Effect, p: int, n_recordings: int) -> Array:
+    sizes = [PRIOR_IN_TYPICAL * s.typical for s in effect.parameters if not is_time_of_run(s)]
+    return np.array(sizes * (p // len(sizes)))
+
+
+def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
+    """Deviance that an effect explains by chance, once in 1 / level data sets, having looked at all of them."""
+    dof = n_amplitudes(effect, n_recordings)
+    return float(chi2.isf(SETTINGS.level / n_effects / tried, dof))
+
+
+def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """Hypotheses worth fitting, by their straight lines about a fit; the fit's own among them."""
+    table = _table(fitter, fit, effects)
+    n = len(fitter.problem.recordings)
+    cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
+    own = list(range(len(fit.effects)))
+    usable = _shortlisted(table, own, cost)
+    scored: list[tuple[float, tuple[int, ...]]] = []
+    for size in range(SETTINGS.max_effects):
+        for chosen in itertools.combinations(usable, size):
+            names = {table.variants[index].effect.name for index in chosen}
+            if len(names) == size:
+                scored.append((table.drop(chosen) + sum(cost[index] for index in chosen), chosen))
+    scored.sort()
+    for _, chosen in scored[:3]:  # and one more on top of the best
+        names = {table.variants[index].effect.name for index in chosen}
+        scored += [
+            (table.drop((*chosen, index)) + sum(cost[i] for i in (*chosen, index)), (*chosen, index))
+            for index in usable
+            if table.variants[index].effect.name not in names and len(chosen) < SETTINGS.max_effects
+        ]
+    scored.sort()
+    scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
+    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
+    if tuple(own) not in worth:
+        worth.append(tuple(own))
+    return [_hypothesis(fitter, fit, table, chosen) for chosen in worth] + _told_by_other_clocks(fit, effects)
+
+
+CLOCKS = ("dvl_time_offset", "reference_time_offset", "attitude_time_offset")
+
+
+def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
+    """Of three clocks only two differences matter: what any two say is told by those of DVL and reference."""
+    names = {table.variants[index].effect.name for index in chosen}
+    return CLOCKS[2] not in names or len(names & set(CLOCKS)) == 1
+
+
+def _told_by_other_clocks(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The fit's offsets said by fewer clocks, and by all that can say them: for large ones no straight line would."""
+    n, values = len(fit.seen), fit.values
+    if not set(CLOCKS) & set(values):
+        return []
+    dvl, reference, attitude = (
+        np.array([each["seconds"] for each in values[name]]) if name in values else np.zeros(n) for name in CLOCKS
+    )
+    dvl, reference = dvl - attitude, reference - attitude
+    rest = [effect for effect in fit.effects if effect.name not in CLOCKS]
+    told = [
+        {CLOCKS[2]: -0.5 * (dvl + reference)}, {CLOCKS[0]: dvl - reference}, {CLOCKS[1]: reference - dvl},
+        {CLOCKS[0]: dvl, CLOCKS[1]: reference},
+    ]  # fmt: skip
+    found = []
+    for one in told:
+        if set(one) <= set(effects) and len(rest) + len(one) <= SETTINGS.max_effects:
+            start = {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
+            found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
+    return found
+
+
+def _shortlisted(table: _Table, own: Sequence[int], cost: Sequence[float]) -> list[int]:
+    """Variants that promise most, alone or on top of the fit's own; all of the fit's own."""
+    alone, none = table.drop(own), table.drop([])
+    gains: dict[int, float] = {}
+    for index, variant in enumerate(table.variants):
+        if index in own:
+            continue
+        by_itself = none - table.drop([index]) - cost[index]
+        on_top = alone - table.drop([*own, index]) - cost[index]
+        instead = max(
+            (table.drop([i for i in own if i != out]) - table.drop([*(i for i in own if i != out), index]) - cost[index]
+             for out in own),
+            default=-np.inf,
+        )  # fmt: skip
+        # of what explains much by itself, strong effects make all look alike: what it adds counts more
+        gains[index] = max(on_top, 0.1 * instead, 0.01 * by_itself)
+        del variant
+    kept: list[int] = []
+    of_effect: dict[str, int] = {}
+    for index in sorted(gains, key=lambda i: -gains[i]):
+        name = table.variants[index].effect.name
+        if of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < SHORTLIST:
+            kept.append(index)
+            of_effect[name] = of_effect.get(name, 0) + 1
+    return [*own, *kept]
+
+
+def _hypothesis(fitter: Fitter, fit: Fit, table: _Table, chosen: Sequence[int]) -> Hypothesis:
+    """A combination with the values that the table gives it to start from; effects of the fit start at theirs."""
+    part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
+    solution = part.solution()[6:]
+    n = len(fitter.problem.recordings)
+    start: dict[str, tuple[Values, ...]] = {}
+    at = 0
+    for index in chosen:
+        variant = table.variants[index]
+        step = solution[at : at + variant.p]
+        at += variant.p
+        if variant.effect in fit.effects:
+            start[variant.effect.name] = variant.values
+            continue
+        empty = no_effect().with_effects([variant.effect], n, {variant.effect.name: variant.values})
+        moved = empty.moved(np.concatenate([np.zeros(6), step]))
+        start[variant.effect.name] = moved.values[variant.effect.name]
+    effects = [table.variants[index].effect for index in chosen]
+    return fit.hypothesis.with_effects(effects, n, start)
+
+
+def _finer_steps(problem: Problem) -> list[float]:
+    seconds = max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
+    steps: list[float] = []
+    while seconds > 0.7 * problem.interval and len(steps) < 8:
+        seconds /= 2.0
+        steps.append(seconds)
+    return steps
+
+
+# ------------------------------------------------------------------ decisions
+
+
+def _best(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
+    """The fit that explains most for its price; of those that do as well, that of the most usual effects.
+
+    These come first in the library.
     """
-    chosen = list(range(dictionary.n_present))
-    own = dictionary.seen(fit.noise, fitter.residual)
-    others = [fit.noise.like(own.beyond()), *([fit.noise.white] if fit.noise.is_coloured else [])]
-    looks = [(fit.noise, own), *((noise, dictionary.seen(noise, fitter.residual)) for noise in others)]
-    worth: dict[str, tuple[float, Candidate, Noise]] = {}
-    for noise, seen in looks:
-        for candidate in sorted(seen.candidates(chosen).values(), key=lambda c: c.log_p)[:MAX_TESTED]:
-            name = candidate.effect.name
-            if candidate.log_p < WORTH_A_LOOK and (name not in worth or candidate.log_p < worth[name][0]):
-                worth[name] = candidate.log_p, candidate, noise
-    tested = [_added(fitter, fit, candidate, noise) for _, candidate, noise in worth.values()]
-    return min(tested, key=lambda each: each.log_p, default=None)
+    scores = [_criterion(fit, len(effects)) for fit in fits]
+    rank = {name: index for index, name in enumerate(effects)}
+    alike = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
+    return min(alike, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
 
 
-def _added(fitter: Fitter, fit: Fit, candidate: Candidate, noise: Noise) -> Tested:
-    """Test an effect on top of a fit, each with the noise of its own."""
-    effects = [*fit.effects, candidate.effect]
-    best = fitter.fit(effects, noise, {**fit.values, candidate.effect.name: candidate.values})
-    best = fitter.fit_with_noise(effects, fit.noise.like(best.residual), best.values, rounds=1)
-    # a better optimum of the noise must not count for the effect
-    without = fitter.fit_with_noise(fit.effects, best.noise, fit.values, rounds=1)
-    drop = min(fit.deviance, without.deviance) - best.deviance
-    drop -= own_doing(fitter, best, candidate.effect)
-    return Tested(log_p_value(drop, best.dof - fit.dof, candidate.tried), drop, best)
+def _criterion(fit: Fit, n_effects: int) -> float:
+    """Deviance and the price of every effect."""
+    n = len(fit.seen)
+    return fit.deviance + sum(price(effect, n_effects, n, _tried(effect)) for effect in fit.effects)
 
 
-def own_doing(fitter: Fitter, fit: Fit, effect: Effect) -> float:
-    """Drop in deviance that an effect owes to noise which is in the residual and, through the motion, in its trace.
-
-    Samples do not tell their own velocity, but whitening mixes neighbours. Found with noise that is made up. A delay
-    owes it nothing (`problem`).
-    """
-    if effect.delay(fit.values[effect.name]):
-        return 0.0
-    problem, values, noise = fitter.problem, fit.values[effect.name], fit.noise
-    still = problem.trace(effect, values)
-    drops = []
-    for in_residual, shaken in problem.shaken:
-        moved = noise.whiten(shaken.trace(effect, values) - still)
-        drops.append(2.0 * float(noise.whiten(in_residual) @ moved) - float(moved @ moved))
-    return max(0.0, float(np.mean(drops)))
+def _tried(effect: Effect) -> float:
+    return 2.0 * len(windows(effect, 1.0)) if any(is_time_of_run(s) for s in effect.parameters) else 1.0
 
 
 def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
     rest = [other for other in fit.effects if other is not effect]
-    return fitter.fit_with_noise(rest, fit.noise, fit.values)
+    return fitter.fit(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
 
 
-def _called_for(fitter: Fitter, fit: Fit, threshold: float, of: Sequence[Effect]) -> Fit:
-    """A fit without those of some effects that are not called for (any more), given all others."""
-    for effect in of:
-        rest = _without(fitter, fit, effect)
-        if log_p_value(rest.deviance - fit.deviance, fit.dof - rest.dof) > threshold:
-            fit = rest
+def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
+    """log p of a drop in deviance, times how many alternatives were tried."""
+    return min(0.0, float(chi2.logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
+
+
+def _log_p(fit: Fit, rest: Fit, effect: Effect) -> float:
+    return log_p_value(fit.gain_over(rest), fit.dof - rest.dof, _tried(effect))
+
+
+def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """A fit without those effects that are not called for given all others, or add next to nothing to a strong one."""
+    threshold = float(np.log(SETTINGS.level / n_effects))
+    while fit.effects:
+        base = fitter.fit(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
+        explained = base.deviance - fit.deviance
+        rests = [(effect, _without(fitter, fit, effect)) for effect in fit.effects]
+        weak = [
+            (rest.deviance, rest)
+            for effect, rest in rests
+            if _log_p(fit, rest, effect) > threshold or rest.deviance - fit.deviance < SETTINGS.ghost_share * explained
+        ]
+        if not weak:
+            return fit
+        fit = min(weak, key=lambda each: each[0])[1]
     return fit
 
 
-def _swapped(fitter: Fitter, fit: Fit, dictionary: Dictionary) -> Fit | None:
-    """A fit with one effect replaced by another that is clearly more significant in its place; None without one."""
-    seen = dictionary.seen(fit.noise, fitter.residual)
-    chosen = list(range(dictionary.n_present))
-    best, best_gain = None, INDISTINGUISHABLE
-    for number, effect in enumerate(fit.effects):
-        candidates = seen.candidates(chosen, instead_of=number)
-        own = candidates.pop(effect.name).log_p
-        other = min(candidates.values(), key=lambda candidate: candidate.log_p, default=None)
-        if other is not None and own - other.log_p > best_gain:
-            best, best_gain = (effect, other), own - other.log_p
-    if best is None:
-        return None
-    out, into = best
-    effects = [into.effect if effect is out else effect for effect in fit.effects]
-    swapped = fitter.fit_with_noise(effects, fit.noise, {**fit.values, into.effect.name: into.values})
-    return swapped if fit.deviance - swapped.deviance > 2.0 * (swapped.dof - fit.dof) else None
+def _borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """A fit without effects that the scatter of the blocks does not bear out, whatever the noise's colour."""
+    block = blocks_of(fitter.problem)
+    while fit.effects:
+        p_values = {effect.name: _robust_p(fit, effect, block) for effect in fit.effects}
+        worst = max(p_values, key=lambda name: p_values[name])
+        if p_values[worst] < SETTINGS.robust_level:
+            return fit
+        fit = _without(fitter, fit, next(effect for effect in fit.effects if effect.name == worst))
+    return fit
 
 
-def _selected(fitter: Fitter, fit: Fit, number: int, seen: Seen) -> Selected:
+def _robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp]) -> float:
+    """p of a Wald test with the covariance that blocks show."""
+    at, start = np.zeros(0, dtype=int), 6
+    for other in fit.effects:
+        p = len(fit.hypothesis.parameters_of(other))
+        if other is effect:
+            at = np.arange(start, start + p)
+        start += p
+    defaults = np.array([each.spec.default for each in fit.hypothesis.parameters_of(effect)])
+    values = fit.hypothesis.vector()[at] - defaults
+    covariance = fit.covariance(block)[np.ix_(at, at)]
+    wald = float(values @ np.linalg.solve(covariance, values)) / len(at)
+    blocks = int(block.max()) + 1
+    return float(f_distribution.sf(wald, len(at), max(blocks - len(at), 2)))
+
+
+def blocks_of(problem: Problem) -> NDArray[np.intp]:
+    """(M,) block of each bin, from 0: stretches of time, half of those of hold-out."""
+    index = np.floor(problem.time / (0.5 * SETTINGS.block)).astype(int)
+    keys = problem.recording_of * (index.max() + 2) + index - index.min()
+    return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)
+
+
+def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
     One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
     that fits worse could be if it needs fewer.
     """
-    effect = fit.effects[number]
     rest = _without(fitter, fit, effect)
+    log_p = _log_p(fit, rest, effect)
     drop = rest.deviance - fit.deviance
-    # with the noise that is left when the cause is known: it is the same for all that could be the cause
-    candidates = seen.candidates(list(range(len(fit.effects))), number)
-    own = candidates.pop(effect.name)
-    log_p = log_p_value(drop, fit.dof - rest.dof, own.tried)
+    table = _table(fitter, rest, effects)
+    n = len(fit.seen)
+    own = list(range(len(rest.effects)))
     found: list[tuple[float, str]] = []
-    for name, candidate in candidates.items():
-        if own.drop - candidate.drop > OUT_OF_THE_QUESTION + LINEAR_SHARE * own.drop:
+    best_of: dict[str, int] = {}
+    drops = {i: table.drop(own) - table.drop([*own, i]) for i in range(len(own), len(table.variants))}
+    for index in sorted(drops, key=lambda i: -drops[i]):
+        best_of.setdefault(table.variants[index].effect.name, index)
+    straight = drops.get(best_of.get(effect.name, -1), drop)
+    for name, index in best_of.items():
+        if name == effect.name or drops[index] < 0.7 * min(straight, drop) - 4.0 * SETTINGS.indistinguishable:
             continue
-        effects = [*rest.effects, candidate.effect]
-        rival = fitter.fit_with_noise(effects, fit.noise, {**fit.values, name: candidate.values}, rounds=1)
+        rival = fitter.fit(_hypothesis(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
-        rival_log_p = log_p_value(drop - behind, rival.dof - rest.dof, candidate.tried)
-        if rival_log_p - log_p < INDISTINGUISHABLE or behind < 2.0 * INDISTINGUISHABLE:
-            found.append((rival_log_p, name))
+        fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
+        if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * fewer):
+            found.append((behind, name))
+    del base
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
-def about(problem: Problem, fit: Fit) -> tuple[Fitter, Fit]:
-    """A fit once more, with the problem about its own calibration and motion, and the noise that is left then.
-
-    What was drawn in as an outlier before may have been the effect.
-    """
-    problem = relinearised(problem, fit)
-    fitter = Fitter(problem, problem.residual)
-    fit = fitter.fit(fit.effects, fit.noise, fit.values)
-    for _ in range(ROUNDS):
-        fit = refined(fitter, fit)
-        explained = fitter.residual - fit.residual
-        noise, left = estimated(problem, problem.residual - explained, fit.noise.rotation)
-        fitter = fitter.with_residual(explained + left)
-        fit = fitter.fit_with_noise(fit.effects, noise, fit.values, rounds=1)
-    return fitter, fit
-
-
-def refined(fitter: Fitter, fit: Fit) -> Fit:
-    """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
-    seconds = max(recording.seconds for recording in fitter.problem.recordings)
-    moving = [
-        (effect.name, spec.name)
-        for effect in fit.effects
-        for spec in effect.parameters
-        if is_time_of_run(spec) and np.isfinite(fit.values[effect.name][spec.name])
-    ]
-    step = seconds / WINDOW_STEPS
-    while moving and step > seconds / FINEST:
-        step /= 2.0
-        for name, time in moving:
-            for sign in (-1.0, 1.0):
-                at = float(np.clip(fit.values[name][time] + sign * step, 0.0, seconds))
-                trial = fitter.fit(fit.effects, fit.noise, {**fit.values, name: {**fit.values[name], time: at}})
-                if trial.deviance < fit.deviance:
-                    fit = trial
-    return fit
-
-
-def relinearised(problem: Problem, fit: Fit) -> Problem:
-    """The problem about the calibration of a fit, its motion without what the fit's effects add to the DVL."""
-    added = {
-        effect.name: tuple(problem.traces(effect, fit.values[effect.name]))
-        for effect in fit.effects
-        if effect.acts_on is not ActsOn.REFERENCE
-    }
-    return replace(problem, calibration=problem.calibration.changed(fit.change), added=added)
+__all__ = ["Offsets", "Selected", "Selection", "blocks_of", "log_p_value", "select"]

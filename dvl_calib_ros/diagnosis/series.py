@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
-from .closure import HeldOutResiduals, held_out
-from .fitting import Fit, Fitter
+from .closure import HeldOutResiduals
+from .noise import segments_of
 from .selection import Selection
 from .unexplained import Unexplained
 from .where import regimes
@@ -18,12 +18,13 @@ from .where import regimes
 
 @dataclass(frozen=True)
 class DiagnosisSeries:
-    """M averaged samples of all recordings, body frame.
+    """F samples of all recordings, ahead, to port and up; zero on an axis that is not measured.
 
-    recordings: names. recording_of: (M,) index into them. time: (M,) s since the recording's start. segments: stretches
-    without a gap. held_out: residuals before and after the effects, and the noise. regimes: name -> (M,) bool.
-    traces: by effect (M, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
+    recordings: names. recording_of: (F,) index into them. time: (F,) s since the recording's start. segments: stretches
+    without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool.
+    traces: by effect (F, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
     the calibration beside the effects, DVL frame; calibration_std: (6,) of both. rest: what is left after them.
+    measured: (3,) axes that the reference measures.
     """
 
     recordings: tuple[str, ...]
@@ -37,32 +38,35 @@ class DiagnosisSeries:
     scale: Array
     calibration_std: Array
     rest: Unexplained
+    measured: tuple[bool, bool, bool] = (True, True, True)
 
 
-def collect_series(selection: Selection, rest: Unexplained) -> DiagnosisSeries:
-    """The series of what was selected and of what it leaves."""
+def collect_series(
+    selection: Selection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
+) -> DiagnosisSeries:
+    """The series of what was selected and of what it leaves. covariance: (6 + p, 6 + p) of the fit."""
     fitter, fit = selection.fitter, selection.fit
-    problem = fitter.problem
-    calibration = problem.calibration.changed(fit.change)
-    traces = {effect.name: problem.trace(effect, fit.values[effect.name]) for effect in fit.effects}
+    problem, n = fitter.problem, len(fit.seen)
+    errors = problem.errors(fit.seen)
+    traces = {}
+    for effect in fit.effects:
+        others = [other for other in fit.effects if other is not effect]
+        # the calibration takes in what it can of the trace, so it is fitted anew without the effect
+        without = fitter.fit(fit.hypothesis.with_effects(others, n, {}), fit.noise)
+        traces[effect.name] = problem.errors(without.seen) - errors
+    recording_of = problem.recording_of[problem.bin_of]
+    times = [problem.sample_time[recording_of == recording] for recording in range(n)]
     return DiagnosisSeries(
         recordings=tuple(recording.name for recording in problem.recordings),
-        recording_of=problem.recording_of,
-        time=problem.time,
-        segments=problem.segments,
-        held_out=held_out(selection, rest.columns),
-        regimes=regimes(problem),
-        traces={name: _not_absorbed(fitter, fit, trace) for name, trace in traces.items()},
-        phi=calibration.phi,
-        scale=calibration.scale,
-        calibration_std=fit.change_std,
+        recording_of=recording_of,
+        time=problem.sample_time,
+        segments=segments_of(times),
+        held_out=residuals,
+        regimes=regimes(problem, fit.seen, per_sample=True),
+        traces=traces,
+        phi=fit.hypothesis.phi,
+        scale=fit.hypothesis.scale,
+        calibration_std=np.sqrt(np.diag(covariance)[:6]),
         rest=rest,
+        measured=problem.measured,
     )
-
-
-def _not_absorbed(fitter: Fitter, fit: Fit, trace: Array) -> Array:
-    """A trace (M, 3) less the change of calibration that explains most of it."""
-    base = fitter.problem.base
-    taken = np.linalg.lstsq(fit.noise.whiten(base), fit.noise.whiten(trace), rcond=None)[0]
-    rest: Array = trace - base @ taken
-    return rest

@@ -10,15 +10,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..calibration.frames import Array
+from .composed import Grid, Problem, Seen
 from .fitting import Fit, Fitter
 from .noise import Noise
-from .problem import Problem
 
 LEVEL = 0.001
 TIME_KNOTS = 7
+SPEED_KNOTS = 7
+STEPS = 11
+# Time constants, s, in which a turn may go on acting
+FADES_S = (4.0, 12.0, 40.0)
+# Of these one is enough, and is looked for by itself
+ALTERNATIVES = ("a step in time", "a band of speeds", "turns before")
 HEADING_HARMONICS = 4
 # Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
@@ -29,7 +36,7 @@ INDEPENDENT = 1e-3
 @dataclass(frozen=True)
 class Unexplained:
     """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
-    variance, beyond what chance brings. about: what the rest follows. columns: (M, 3, f), the dictionary; empty if
+    variance, beyond what chance brings. about: what the rest follows. columns: (M, A, f), the dictionary; empty if
     nothing is left, since it would only explain noise.
     """
 
@@ -44,24 +51,28 @@ class Unexplained:
         return self.log_p < np.log(LEVEL)
 
 
-def dictionary(problem: Problem) -> dict[str, Array]:
+def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
     """Name -> (M, c) functions of motion or time, without unit."""
-    parts = [_of_motion(problem, index) for index in range(len(problem.recordings))]
-    return {name: problem.joined([part[name] for part in parts]) for name in parts[0]}
+    parts = [_of_motion(grid, each) for grid, each in zip(problem.grids, seen, strict=True)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _of_motion(problem: Problem, index: int) -> dict[str, Array]:
-    recording, motion = problem.recordings[index], problem.motions[index]
+def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
+    motion = seen.motion
     velocity, speed = motion.velocity_body, motion.speed
     acceleration = np.gradient(velocity[:, 0], motion.time)
     typical = max(float(np.median(speed)), 0.1)
-    hats = _hats(motion.time, TIME_KNOTS)
+    hats = _hats(motion.time, np.linspace(motion.time[0], motion.time[-1], TIME_KNOTS))
     s = speed / typical
     found: dict[str, Array] = {
         "speed": np.column_stack([np.ones_like(s), s, s**2, s**3, np.maximum(s - 1.0, 0.0)]),
+        "a band of speeds": _hats(
+            speed, np.quantile(speed, 0.01) + np.linspace(0.0, 1.0, SPEED_KNOTS) * _spread(speed)
+        ),
         "acceleration": np.column_stack([acceleration, np.abs(acceleration)]),
         "sway and heave": np.column_stack([velocity[:, 1:], np.abs(velocity[:, 1:])]),
         "time": np.column_stack([hats, hats * s[:, None]]),
+        "a step in time": _steps(motion.time, STEPS),
     }
     if motion.rotation_enu_from_body is not None:
         rotation = motion.rotation_enu_from_body
@@ -71,29 +82,47 @@ def _of_motion(problem: Problem, index: int) -> dict[str, Array]:
         more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
         found["heading"] = np.column_stack([once, once * s[:, None], *more])
         found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
-        steps = np.diff(motion.time, prepend=motion.time[0])
+        steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
         up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
         found["depth"] = np.cumsum(up * steps)[:, None]
     if motion.angular_velocity is not None:
         rate = motion.angular_velocity
         turning = rate[:, 2]
         found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
+        found["turns before"] = np.column_stack([_faded(motion.time, turning, seconds) for seconds in FADES_S])
         found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
-    return {name: recording.averaged(values[:: recording.finer]) for name, values in found.items()}
+    return {name: grid.averaged(values) for name, values in found.items()}
 
 
-def _hats(time: Array, knots: int) -> Array:
+def _spread(speed: Array) -> float:
+    return max(float(np.quantile(speed, 0.99) - np.quantile(speed, 0.01)), 1e-3)
+
+
+def _steps(time: Array, count: int) -> Array:
+    """(N, count) functions that step from zero to one at even parts of the time."""
+    at = np.linspace(time[0], time[-1], count + 2)[1:-1]
+    return (time[:, None] >= at).astype(float)
+
+
+def _faded(time: Array, values: Array, seconds: float) -> Array:
+    """(N,) what values (N,) were, fading with a time constant."""
+    steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
+    decay = np.exp(-steps / seconds)
+    out = np.zeros_like(values)
+    for i in range(1, len(values)):
+        out[i] = decay[i] * out[i - 1] + (1.0 - decay[i]) * values[i]
+    return out
+
+
+def _hats(values: Array, knots: Array) -> Array:
     """Piecewise linear functions (N, knots) that are one at one knot and zero at the others."""
-    at = np.linspace(time[0], time[-1], knots)
-    return np.column_stack([np.interp(time, at, row) for row in np.eye(knots)])
+    return np.column_stack([np.interp(values, knots, row) for row in np.eye(len(knots))])
 
 
 def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """Look for what the residual of a fit still follows."""
     problem, noise = fitter.problem, fit.noise
-    known = np.concatenate(
-        [problem.base, *(fitter.jacobian(effect, fit.values[effect.name])[1] for effect in fit.effects)], axis=2
-    )
+    known = fit.columns
     q = _orthonormal(noise.whiten(known))
     white = noise.whiten(fit.residual)
     white = white - q @ (q.T @ white)
@@ -101,19 +130,20 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     tests: list[tuple[float, str]] = []
     recoloured: list[tuple[float, str]] = []
     columns, energies = [], [0.0]
-    for name, functions in dictionary(problem).items():
-        raw = _along_axes(functions)
+    for name, functions in dictionary(problem, fit.seen).items():
+        raw = _along_axes(functions, problem.axes)
         columns.append(raw)
-        for block in _per_axis(raw):
-            tests.append((explained(q, noise.whiten(block), white, variance)[0], name))
+        whitened = noise.whiten(raw)
+        for at in _looks(name, functions.shape[1], problem.axes):
+            tests.append((explained(q, whitened[:, at], white, variance)[0], name))
         if noise.is_coloured and name != "time":  # what changes with time alone may as well be noise
             log_p, energy = _recoloured(noise, known, raw, fit.residual)
             recoloured.append((log_p, name))
             energies.append(energy)
-    for line in lines(problem, white.reshape(-1, 3) / np.sqrt(variance)):
+    for line in lines(problem, white.reshape(-1, problem.axes) / np.sqrt(variance)):
         tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
         if line.log_p < np.log(LEVEL):  # the best of many would always explain some of the noise
-            columns.append(_along_axes(line.waves))
+            columns.append(_along_axes(line.waves, problem.axes))
     raw = np.concatenate(columns, axis=2)
     log_p, energy = explained(q, noise.whiten(raw), white, variance)
     looked_at = float(np.log(len(tests) + len(recoloured) + 1))
@@ -137,7 +167,7 @@ class Line:
 
 
 def lines(problem: Problem, innovations: Array) -> list[Line]:
-    """Lines in the innovations (M, 3), of unit variance, of each recording that is long enough.
+    """Lines in the innovations (M, A), of unit variance, of each recording that is long enough.
 
     Noise of the sky has no period, coloured as it may be. Waves have: what is left of them at the pairing of two
     sensors is no finding, so only periods longer than theirs count.
@@ -154,7 +184,7 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
         inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
         if not inside.any():
             continue
-        log_p = np.vstack([chi2.logsf(power, 2), chi2.logsf(power.sum(axis=0), 6)])[:, inside]
+        log_p = np.vstack([chi2.logsf(power, 2), chi2.logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, inside]
         best = int(np.argmin(log_p.min(axis=0)))
         period = 1.0 / float(frequency[inside][best])
         phase = 2.0 * np.pi * problem.time / period
@@ -164,7 +194,7 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
 
 
 def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:
-    """As `explained`, with the noise estimated anew from what the columns (M, 3, c) leave: else it has their colour."""
+    """As `explained`, with the noise estimated anew from what the columns (M, A, c) leave: else it has their colour."""
     joined = np.concatenate([known, raw], axis=2)
     joined = joined / np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
     left, colour = residual, noise.white
@@ -177,15 +207,17 @@ def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tupl
     return float(chi2.logsf(max(drop, 0.0), max(rank, 1))), drop - rank
 
 
-def _along_axes(functions: Array) -> Array:
-    """(M, c) -> (M, 3, 3 c): every function on every body axis."""
+def _along_axes(functions: Array, axes: int) -> Array:
+    """(M, c) -> (M, A, A c): every function on every axis."""
     m, c = functions.shape
-    return np.einsum("mc,ij->mijc", functions, np.eye(3)).reshape(m, 3, 3 * c)
+    return np.einsum("mc,ij->mijc", functions, np.eye(axes)).reshape(m, axes, axes * c)
 
 
-def _per_axis(raw: Array) -> Sequence[Array]:
-    c = raw.shape[2] // 3
-    return [raw, *(raw[:, :, axis * c : (axis + 1) * c] for axis in range(3))]
+def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
+    """Columns of `_along_axes` that are tested together: all, each axis, and each of those that are alternatives."""
+    index = np.arange(axes * c).reshape(axes, c)
+    looks = [index.ravel(), *index]
+    return [*looks, *index.T] if name in ALTERNATIVES else looks
 
 
 def _orthonormal(white: Array) -> Array:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
-from ..effects.base import Needs
+from ..effects.base import EffectInput, Needs
+from .composed import Problem, Seen
 from .fitting import Fit, Fitter
+from .holm import holm
+from .least_squares import WhitenedLeastSquares
 from .noise import Noise
-from .problem import Problem
 from .unexplained import explained
 
 LEVEL = 0.01
@@ -36,13 +39,21 @@ class Place:
     p: float
 
 
-def regimes(problem: Problem) -> dict[str, Mask]:
-    """(M,) bool each: where the vehicle goes straight, turns, changes speed, is slow or fast (terciles)."""
-    speeds = problem.sampled(lambda motion: motion.speed)
-    change = problem.sampled(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
+def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) -> dict[str, Mask]:
+    """(M,) bool each, or of every sample (F,): where the vehicle goes straight, turns, changes speed, is slow or fast
+    (terciles).
+    """
+
+    def of(function: Callable[[EffectInput], Array]) -> Array:
+        if per_sample:
+            return np.concatenate([function(each.motion) for each in seen])
+        return problem.sampled(seen, function)
+
+    speeds = of(lambda motion: motion.speed)
+    change = of(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
     found = {"accelerating": np.abs(change) > ACCELERATING_MPS2}
     if Needs.ANGULAR_VELOCITY in problem.available:
-        found["turning"] = np.abs(problem.sampled(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
+        found["turning"] = np.abs(of(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
         found["straight"] = ~found["turning"]
     slow, fast = np.quantile(speeds, [1 / 3, 2 / 3])
     if fast - slow > 0.1 * fast:
@@ -53,39 +64,38 @@ def regimes(problem: Problem) -> dict[str, Mask]:
 def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[Place]:
     """Places where the residual of the calibration alone is more than noise, those with most of the gap first.
 
-    columns: (M, 3, p) that make up the gap: traces of the effects, or the dictionary where no effect explains it.
+    columns: (M, A, p) that make up the gap: traces of the effects, or the dictionary where no effect explains it.
     """
-    from statsmodels.stats.multitest import multipletests
-
     problem, noise = fitter.problem, fit.noise
-    gap = _signal(fitter, base, fit, columns)
+    gap = _signal(base, fit, columns)
     total = float((gap**2).sum())
     if total <= 0.0:
         return []
     white = noise.whiten(base.residual)
-    q = np.linalg.qr(noise.whiten(problem.base))[0]
+    q = np.linalg.qr(noise.whiten(base.columns))[0]
     white = white - q @ (q.T @ white)
-    functions = _simplest(problem)
+    functions = _simplest(problem, fit.seen)
     seconds = max(recording.seconds for recording in problem.recordings)
-    nyquist = 0.5 / float(np.median(np.diff(problem.recordings[0].bin_time)))
+    nyquist = 0.5 / problem.interval
+    names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
     everywhere = np.ones(len(gap), dtype=bool)
-    cells = [(axis, name, (0.0, seconds), mask) for name, mask in ({ALL: everywhere} | regimes(problem)).items()
-             for axis in range(3)]  # fmt: skip
+    masks = {ALL: everywhere} | regimes(problem, fit.seen)
+    cells = [(axis, name, (0.0, seconds), mask) for name, mask in masks.items() for axis in range(problem.axes)]
     edges = np.linspace(0.0, seconds, STRETCHES + 1)
     for start, end in itertools.pairwise(edges.tolist()):
         within = (problem.time >= start) & (problem.time <= end)
-        cells += [(axis, ALL, (float(start), float(end)), within) for axis in range(3)]
+        cells += [(axis, ALL, (float(start), float(end)), within) for axis in range(problem.axes)]
     found: list[Place] = []
     for axis, name, segment, mask in cells:
         p = float(np.exp(_log_p(noise, functions, q, white, axis, mask)))
         share = float((gap[mask, axis] ** 2).sum()) / total
-        found.append(Place("xyz"[axis], name, segment, (0.0, nyquist), share, p))
+        found.append(Place(names[axis], name, segment, (0.0, nyquist), share, p))
         if name == ALL and segment == (0.0, seconds):
             found += [
-                Place("xyz"[axis], ALL, segment, (low, min(high, nyquist)), part / total, p)
+                Place(names[axis], ALL, segment, (low, min(high, nyquist)), part / total, p)
                 for low, high, part in _bands(gap[:, axis], nyquist)
             ]
-    adjusted = multipletests([place.p for place in found], method="holm")[1]
+    adjusted = holm([place.p for place in found])
     kept = [
         Place(place.axis, place.regime, place.segment_s, place.band_hz, place.share, float(p))
         for place, p in zip(found, adjusted, strict=True)
@@ -94,30 +104,28 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[Place]:
     return sorted(kept, key=lambda place: -place.share)
 
 
-def _signal(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> Array:
-    """(M, 3): the gap, as far as it is known: what the columns say beyond the calibration."""
-    noise, problem = fit.noise, fitter.problem
+def _signal(base: Fit, fit: Fit, columns: Array) -> Array:
+    """(M, A): the gap, as far as it is known: what the columns say beyond the calibration."""
+    noise = fit.noise
     size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
-    raw = np.concatenate([problem.base, columns / size], axis=2)
-    a = noise.whiten(raw)
-    a = np.concatenate([a, 0.1 * np.eye(a.shape[1])])
-    series = noise.whiten(base.residual)
-    solution = np.linalg.lstsq(a, np.concatenate([series, np.zeros(raw.shape[2])]), rcond=None)[0]
-    return np.asarray(raw @ solution)
+    raw = np.concatenate([base.columns, columns / size], axis=2)
+    ridge = np.full(raw.shape[2], 10.0)
+    system = WhitenedLeastSquares.of(noise.whiten(raw), noise.whiten(base.residual), ridge, np.zeros_like(ridge))
+    return np.asarray(raw @ system.solution())
 
 
-def _simplest(problem: Problem) -> Array:
+def _simplest(problem: Problem, seen: Sequence[Seen]) -> Array:
     """(M, c): one, speed, and turn rate where it is known."""
-    speed = problem.sampled(lambda motion: motion.speed)
+    speed = problem.sampled(seen, lambda motion: motion.speed)
     functions = [np.ones_like(speed), speed]
     if Needs.ANGULAR_VELOCITY in problem.available:
-        functions.append(problem.sampled(lambda motion: motion.turn_rate[:, 2]))
+        functions.append(problem.sampled(seen, lambda motion: motion.turn_rate[:, 2]))
     return np.column_stack(functions)
 
 
 def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, mask: Mask) -> float:
     """log p of what functions of motion (M, c), within a place, explain of the whitened residual."""
-    columns = np.zeros((len(mask), 3, functions.shape[1]))
+    columns = np.zeros((*noise.level.shape, functions.shape[1]))
     columns[mask, axis] = functions[mask]
     return explained(q, noise.whiten(columns), white, 1.0)[0]
 

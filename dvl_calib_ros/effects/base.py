@@ -25,7 +25,8 @@ class EffectInput:
     time: (N,) s, increasing. velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
     rotation_dvl_from_body: (3, 3) T. rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame;
     None where the bag has none. reference_frame: the frame in which the reference velocity was recorded; what delays or
-    filters it there turns with the vehicle only if that is the body.
+    filters it there turns with the vehicle only if that is the body. start: s, when the recording began; None: with
+    the first time.
     """
 
     time: Array
@@ -34,6 +35,7 @@ class EffectInput:
     rotation_enu_from_body: Array | None = None
     angular_velocity: Array | None = None
     reference_frame: VelocityFrame = VelocityFrame.ENU
+    start: float | None = None
 
     @property
     def attitude(self) -> Array:
@@ -61,8 +63,8 @@ class EffectInput:
 
     @property
     def elapsed(self) -> Array:
-        """(N,) s since the first time."""
-        return self.time - self.time[0]
+        """(N,) s since the start."""
+        return self.time - (self.time[0] if self.start is None else self.start)
 
 
 class Needs(Enum):
@@ -73,17 +75,22 @@ class Needs(Enum):
 
 
 class ActsOn(Enum):
-    """Where an effect comes in, with D = (I + diag(δk)) (I + [φ×]) the calibration and traces in the body frame.
+    """Where an effect stands in the order of physics, in which these follow each other.
 
-        v_dvl = D T (v_reference + traces on MOTION + traces on REFERENCE) + T (traces on DVL)
+    MOTION: the velocity at which the DVL is moved, at the time of measurement. DVL: what it makes of that, beside the
+    calibration D = (I + diag(δk)) (I + [φ×]). DVL_CLOCK: when it says that was. REFERENCE: the simulator takes the
+    trace off the reference velocity. REFERENCE_CLOCK, ATTITUDE_CLOCK: when these say that was. Traces are in the body
+    frame:
 
-    MOTION: the velocity at which the DVL is moved. DVL: what it makes of it. REFERENCE: the simulator takes the trace
-    off the reference velocity.
+        u = v + traces on MOTION(v)        v_dvl = D T u + T traces on DVL(u)        stamped s + late on DVL_CLOCK
     """
 
     MOTION = "motion"
     DVL = "dvl"
+    DVL_CLOCK = "clock of the dvl"
     REFERENCE = "reference"
+    REFERENCE_CLOCK = "clock of the reference"
+    ATTITUDE_CLOCK = "clock of the attitude"
 
 
 @dataclass(frozen=True)
@@ -142,19 +149,19 @@ class AnyEffect:
 class Effect(AnyEffect, ABC):
     """A systematic effect: the same motion always gives the same trace.
 
-    manoeuvre: what to fly to see it and to tell it from what it is confounded with.
+    manoeuvre: what to fly to see it and to tell it from what it is confounded with. of_the_day: whether its size is
+    another in every recording; else it belongs to the vehicle. relative_to_first: whether it is a change against the
+    first of several recordings.
     """
 
     manoeuvre: ClassVar[str]
+    of_the_day: ClassVar[bool] = False
+    relative_to_first: ClassVar[bool] = False
 
     @property
     def linear(self) -> bool:
         """Whether the trace is linear in all parameters together."""
         return all(parameter.linear for parameter in self.parameters)
-
-    def delay(self, values: Mapping[str, float]) -> float:
-        """Seconds by which the effect delays what it acts on, beside all else that it does."""
-        return 0.0
 
     @abstractmethod
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -163,6 +170,16 @@ class Effect(AnyEffect, ABC):
         values: every parameter by name. (N, 3) m/s in the nominal body frame, at `motion.time`; where it comes in is
         told by `ActsOn`. An effect on the reference returns minus what it adds to the reference velocity.
         """
+
+
+class ClockEffect(Effect):
+    """A systematic effect on the stamps of one stream."""
+
+    of_the_day = True
+
+    @abstractmethod
+    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
+        """(N,) s by which what is measured at times (N,) s since the start is stamped late."""
 
 
 class NoiseEffect(AnyEffect, ABC):

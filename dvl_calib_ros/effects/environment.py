@@ -25,6 +25,7 @@ class WaterLock(Effect):
         ParameterSpec("from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False),
         ParameterSpec("to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False),
     )
+    of_the_day = True
     acts_on = ActsOn.MOTION
     needs = frozenset({Needs.ATTITUDE})
     confounded_with = ("heading_error", "velocity_bias")

@@ -22,11 +22,13 @@ from .sensor import (
     AxisNonorthogonality,
     MisalignmentDrift,
     MountFlexure,
+    MountingMoved,
     QuadraticScale,
     ScaleDrift,
+    SoundSpeedMoved,
     VelocityBias,
 )
-from .timing import DvlTimeOffset, ReferenceLag, ReferenceTimeOffset
+from .timing import AttitudeTimeOffset, ClockDrift, DvlTimeOffset, ReferenceLag, ReferenceTimeOffset, TimeOffsetJump
 
 ENTRY_POINTS = "dvl_calib_ros.effects"
 
@@ -34,6 +36,9 @@ OWN: tuple[type[AnyEffect], ...] = (
     LeverArm,
     DvlTimeOffset,
     ReferenceTimeOffset,
+    AttitudeTimeOffset,
+    TimeOffsetJump,
+    ClockDrift,
     ReferenceLag,
     VelocityBias,
     QuadraticScale,
@@ -45,6 +50,8 @@ OWN: tuple[type[AnyEffect], ...] = (
     HeadingError,
     Sideslip,
     TiltCoupling,
+    MountingMoved,
+    SoundSpeedMoved,
     Outliers,
     StaleSamples,
     NoiseInflation,

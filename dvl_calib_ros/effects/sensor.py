@@ -51,6 +51,7 @@ class ScaleDrift(Effect):
     summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
     parameters = (ParameterSpec("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),)
+    of_the_day = True
     acts_on = ActsOn.DVL
     confounded_with = ("misalignment_drift",)
 
@@ -68,6 +69,7 @@ class MisalignmentDrift(Effect):
     parameters = along_axes(
         "rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour", linear=False
     )
+    of_the_day = True
     acts_on = ActsOn.DVL
     confounded_with = ("scale_drift",)
 
@@ -91,6 +93,39 @@ class MountFlexure(Effect):
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Tᵀ (Exp(speed · flexure) - I) T v."""
         return _turned(motion, motion.speed[:, None] * vector(values, "rad_per_mps"))
+
+
+class MountingMoved(Effect):
+    """The DVL was mounted otherwise than in the first of several recordings."""
+
+    name = "mounting_moved"
+    summary = "the mounting is turned against that of the first of several recordings"
+    manoeuvre = "straight legs that speed up and slow down, in each recording"
+    parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
+    acts_on = ActsOn.DVL
+    of_the_day = True
+    relative_to_first = True
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Tᵀ (Exp(φ) - I) T v."""
+        angles = np.tile(vector(values, "rad"), (len(motion.time), 1))
+        return _turned(motion, angles)
+
+
+class SoundSpeedMoved(Effect):
+    """The speed of sound was off by another amount than in the first of several recordings."""
+
+    name = "sound_speed_moved"
+    summary = "the scale-factor error is another than in the first of several recordings: ratio · v"
+    manoeuvre = "straight legs, in each recording"
+    parameters = (ParameterSpec("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
+    acts_on = ActsOn.DVL
+    of_the_day = True
+    relative_to_first = True
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """ratio · v."""
+        return values["ratio"] * motion.velocity_body
 
 
 def _turned(motion: EffectInput, rotation_vectors: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Effects of time: stamps that are late, a reference that is filtered."""
+"""Effects of time: stamps that are late, jump or drift; a reference that is filtered."""
 
 from __future__ import annotations
 
@@ -6,49 +6,121 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
-from .base import ActsOn, Effect, EffectInput, ParameterSpec
+from .base import ActsOn, ClockEffect, Effect, EffectInput, Needs, ParameterSpec
+
+# Half of what pairing can bridge by its parameters
+LONGEST_OFFSET_S = 8.0
 
 
-class DvlTimeOffset(Effect):
+def _seconds(what: str) -> tuple[ParameterSpec]:
+    return (ParameterSpec("seconds", "s", 0.1, -LONGEST_OFFSET_S, LONGEST_OFFSET_S, what, linear=False),)
+
+
+class _DvlClock(ClockEffect):
+    acts_on = ActsOn.DVL_CLOCK
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """v(t - late) - v(t), body frame."""
+        late = self.late(motion.elapsed, values)
+        return delayed(motion.time, motion.velocity_body, late) - motion.velocity_body
+
+
+class DvlTimeOffset(_DvlClock):
     """The DVL's stamps are late: what is stamped t was measured before."""
 
     name = "dvl_time_offset"
     summary = "the DVL's stamps are late by τ: v(t - τ) - v(t), body frame"
     manoeuvre = "straight legs that speed up and slow down, in waves or with quick changes of speed"
-    parameters = (ParameterSpec("seconds", "s", 0.1, -2.0, 2.0, "how late a stamp is; positive: late", linear=False),)
-    acts_on = ActsOn.MOTION
-    confounded_with = ("reference_time_offset", "reference_lag")
+    parameters = _seconds("how late a stamp is; positive: late")
+    confounded_with = ("reference_time_offset", "reference_lag", "attitude_time_offset")
 
-    def delay(self, values: Mapping[str, float]) -> float:
+    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
         """τ."""
-        return values["seconds"]
-
-    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """v(t - τ) - v(t), body frame."""
-        return delayed(motion.time, motion.velocity_body, values["seconds"]) - motion.velocity_body
+        return np.full(len(elapsed), values["seconds"])
 
 
-class ReferenceTimeOffset(Effect):
+class TimeOffsetJump(_DvlClock):
+    """The DVL's clock is set at some instant: from then on its stamps are later (or earlier)."""
+
+    name = "time_offset_jump"
+    summary = "the DVL's stamps are later by τ from at_s on, as after its clock was set"
+    manoeuvre = "turns and changes of speed before and after"
+    parameters = (
+        *_seconds("how much later a stamp is from then on"),
+        ParameterSpec("at_s", "s", 0.0, 0.0, np.inf, "when, since the start", linear=False),
+    )
+    confounded_with = ("dvl_time_offset", "clock_drift")
+
+    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
+        """τ from at_s on."""
+        return np.where(elapsed >= values["at_s"], values["seconds"], 0.0)
+
+
+class ClockDrift(_DvlClock):
+    """The DVL's clock runs fast (or slow)."""
+
+    name = "clock_drift"
+    summary = "the DVL's clock runs fast: its stamps get later by so many seconds per hour"
+    manoeuvre = "turns and changes of speed at the beginning, in the middle and at the end"
+    parameters = (
+        ParameterSpec("seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False),
+    )
+    confounded_with = ("dvl_time_offset", "time_offset_jump")
+
+    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
+        """rate · (t - t_0)."""
+        return values["seconds_per_hour"] / 3600.0 * elapsed
+
+
+class ReferenceTimeOffset(ClockEffect):
     """The reference's stamps are late. Recorded in ENU it then is turned by an attitude that is too new."""
 
     name = "reference_time_offset"
     summary = "the reference's stamps are late by τ: -(g(t - τ) - g(t)), in the frame it was recorded in"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
-    parameters = DvlTimeOffset.parameters
-    acts_on = ActsOn.REFERENCE
-    confounded_with = ("dvl_time_offset", "reference_lag", "sideslip", "lever_arm")
+    parameters = _seconds("how late a stamp is; positive: late")
+    acts_on = ActsOn.REFERENCE_CLOCK
+    confounded_with = ("dvl_time_offset", "reference_lag", "attitude_time_offset", "sideslip", "lever_arm")
 
-    def delay(self, values: Mapping[str, float]) -> float:
+    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
         """τ."""
-        return values["seconds"]
+        return np.full(len(elapsed), values["seconds"])
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """g(t) - g(t - τ), in the frame in which the reference was recorded, turned into the body."""
         reference = _in_reference_frame(motion)
-        return _in_body(motion, reference - delayed(motion.time, reference, values["seconds"]))
+        late = self.late(motion.elapsed, values)
+        return _in_body(motion, reference - delayed(motion.time, reference, late))
+
+
+class AttitudeTimeOffset(ClockEffect):
+    """The stamps of attitude and angular velocity are late, so a reference in an earth frame is turned wrongly."""
+
+    name = "attitude_time_offset"
+    summary = "the IMU's stamps are late by τ: v - R(t - τ)ᵀ R(t) v, with R its attitude"
+    manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
+    parameters = _seconds("how late a stamp is; positive: late")
+    acts_on = ActsOn.ATTITUDE_CLOCK
+    needs = frozenset({Needs.ATTITUDE})
+    confounded_with = ("dvl_time_offset", "reference_time_offset", "sideslip", "lever_arm")
+
+    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
+        """τ."""
+        return np.full(len(elapsed), values["seconds"])
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """v - R(t - τ)ᵀ R(t) v; a reference in the body frame needs no attitude, but for a lever arm."""
+        attitude, late = motion.attitude, self.late(motion.elapsed, values)
+        if motion.reference_frame is VelocityFrame.BODY or len(motion.time) < 2 or not late.any():
+            return np.zeros_like(motion.velocity_body)
+        at = np.clip(motion.time - late, motion.time[0], motion.time[-1])
+        then = Slerp(motion.time, Rotation.from_matrix(attitude))(at).as_matrix()
+        earth = np.einsum("nij,nj->ni", attitude, motion.velocity_body)
+        return motion.velocity_body - np.einsum("nji,nj->ni", then, earth)
 
 
 class ReferenceLag(Effect):
@@ -61,22 +133,18 @@ class ReferenceLag(Effect):
     acts_on = ActsOn.REFERENCE
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 
-    def delay(self, values: Mapping[str, float]) -> float:
-        """T: what is slow comes so much later."""
-        return values["time_constant_s"]
-
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """g - (g filtered), turned into the body."""
         reference = _in_reference_frame(motion)
         return _in_body(motion, -lag_error(motion.time, reference, values["time_constant_s"]))
 
 
-def delayed(time: Array, values: Array, delay: float) -> Array:
-    """What `values` (N, 3) were `delay` s before; before the first and after the last, as there.
+def delayed(time: Array, values: Array, delay: float | Array) -> Array:
+    """What `values` (N, 3) were `delay` s before, one or (N,); before the first and after the last, as there.
 
     Cubic between samples: a straight line would cut the crests of waves sampled at 1 Hz by a seventh.
     """
-    if delay == 0.0 or len(time) < 2:
+    if not np.any(delay) or len(time) < 2:
         return values
     curve = CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
     return np.asarray(curve(np.clip(time - delay, time[0], time[-1])))

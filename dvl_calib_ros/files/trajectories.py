@@ -136,7 +136,7 @@ def read_reference(path: Path, start_ns: int, frame: str, std: float) -> list[Re
 def read_attitude(path: Path, start_ns: int) -> list[ImuSample]:
     """Roll, pitch, yaw of a forward-right-down body in north-east-down, with the angular velocity they imply.
 
-    The angular velocity is that of the rotation from each sample to the next (at the last, from the one before).
+    The angular velocity is that of a smooth curve through the attitudes.
     """
     time, rpy = read_columns(path, "rad")
     rotations = attitude_enu_flu_from_ned_frd(rpy)
@@ -148,14 +148,17 @@ def read_attitude(path: Path, start_ns: int) -> list[ImuSample]:
 
 
 def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
-    """Angular velocity (N, 3) rad/s in the body frame of a run of attitudes (N, 3, 3) at times (N,) s."""
-    from scipy.spatial.transform import Rotation
+    """Angular velocity (N, 3) rad/s in the body frame of a run of attitudes (N, 3, 3) at times (N,) s.
+
+    That of a smooth curve through them, at the times themselves: the mean rate from each to the next is half an
+    interval late, which at 1 Hz costs a lever arm of 2 m 3 cm/s in turns.
+    """
+    from scipy.spatial.transform import Rotation, RotationSpline
 
     if len(time) < 2:
         return np.zeros((len(time), 3))
-    steps = Rotation.from_matrix(np.swapaxes(rotation_enu_from_body[:-1], 1, 2) @ rotation_enu_from_body[1:])
-    rates = steps.as_rotvec() / np.diff(time)[:, None]
-    return np.vstack([rates, rates[-1:]])
+    rates: Array = RotationSpline(time, Rotation.from_matrix(rotation_enu_from_body))(time, 1)
+    return rates
 
 
 @dataclass(frozen=True)

@@ -125,16 +125,18 @@ def _numbers(d: Diagnosis) -> Iterable[dict[str, str]]:
     gap = d.gap
     if not math.isfinite(gap.before):
         return
-    yield {"name": "Gap", "value": _mm(gap.before), "note": "beyond the noise, held-out rms"}
+    yield {"name": "Error", "value": _mm(gap.before), "note": "held-out rms, noise included"}
     if d.effects:
         low, high = gap.interval
-        yield {"name": "With the effects", "value": _mm(gap.after), "note": "held-out rms"}
+        yield {"name": "With the effects", "value": _mm(gap.after), "note": "held-out rms, noise included"}
         yield {
             "name": "Closed",
             "value": _per_cent(gap.closure),
-            "note": f"{_per_cent(low)} to {_per_cent(high)} (95 %)",
+            "note": f"of the gap beyond the noise, {_per_cent(low)} to {_per_cent(high)} (95 %)",
         }
-    yield {"name": "Noise floor", "value": _mm(gap.noise_floor), "note": "of the difference, all axes"}
+    claimed = "" if gap.reported is None else f"; the messages claim {_mm(gap.reported)}"
+    yield {"name": "Noise", "value": _mm(gap.noise_floor), "note": f"as high frequencies show it{claimed}"}
+    yield {"name": "Not explained", "value": _mm(gap.not_explained), "note": "left beyond the noise"}
 
 
 def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
@@ -145,10 +147,19 @@ def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
     held = "whole recordings in turn" if len(series.recordings) > 1 else "a fifth of the run in turn"
     return [
         ("Recordings", ", ".join(f"{n} ({s:.0f} s)" for n, s in zip(series.recordings, lengths, strict=True))),
-        ("Samples tested", f"{len(series.time)}, averaged to at most 5 Hz"),
+        ("Samples compared", f"{len(series.time)}, on the axes {''.join(_axes(series))}"),
         ("Held out", held),
         ("Calibration beside", f"misalignment {angles}; scale error {scales} (1σ)"),
     ]
+
+
+def _axes(series: DiagnosisSeries) -> dict[str, str]:
+    """Axes that the reference measures, with what they are called."""
+    return {
+        axis: where
+        for (axis, where), measured in zip(BODY_AXES.items(), series.measured, strict=True)
+        if measured
+    }
 
 
 def _with_std(values: Array, std: Array, unit: str) -> str:
@@ -160,7 +171,10 @@ def _left(d: Diagnosis) -> str:
     gap, series = d.gap, d.series
     if not math.isfinite(gap.after):
         return "Not known: this data says nothing of the gap."
-    amount = f"{_mm(gap.after)} rms over a noise floor of {_mm(gap.noise_floor)}, on held-out data."
+    amount = (
+        f"{_mm(gap.after)} rms, noise of {_mm(gap.noise_floor)} included, on held-out data: {_mm(gap.not_explained)} "
+        "are not explained."
+    )
     if series is None:
         return amount
     rest = series.rest
@@ -269,7 +283,7 @@ def _pictures(d: Diagnosis, series: DiagnosisSeries) -> dict[str, Any]:
         ],
         "residuals": list(_residuals(residuals, series, time, stamps_ns, points)),
         "residual_note": (
-            "DVL velocity, calibrated, minus the reference, in the body frame, on held-out data, outliers pulled in. "
+            "DVL velocity, calibrated, minus the reference, in the body frame, on held-out data. "
             f"Lines over time are means over {seconds:.0f} s, which still hold noise of the reference."
         ),
     }
@@ -291,7 +305,8 @@ def _residuals(
     residuals: Mapping[str, Array], series: DiagnosisSeries, time: TimeAxis, stamps_ns: Array, points: int
 ) -> Iterable[Picture]:
     """Of each axis over time and by frequency."""
-    for axis, where in enumerate(BODY_AXES.values()):
+    for name_of_axis, where in _axes(series).items():
+        axis = "xyz".index(name_of_axis)
         lines = {name: values[:, axis] for name, values in residuals.items()}
         yield picture(
             f"Residual {where} over time", f"Held-out residual {where}, {' and '.join(lines)}, running mean in mm/s",
@@ -366,7 +381,8 @@ def _trace_pictures(
     measured = series.held_out.after + trace
     energy = (trace**2).sum(axis=0)
     smooth = [float(np.nansum(running_mean(stamps_ns, each, points)[1] ** 2)) for each in trace.T]
-    for axis, where in enumerate(BODY_AXES.values()):
+    for name_of_axis, where in _axes(series).items():
+        axis = "xyz".index(name_of_axis)
         if smooth[axis] > AXIS_SHARE * sum(smooth):
             lines = {"measured": measured[:, axis], name: trace[:, axis]}
             yield picture(

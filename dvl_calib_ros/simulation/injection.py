@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..calibration.frames import Array
-from ..effects.base import ActsOn, AnyEffect, Effect, EffectInput, NoiseEffect
+from ..effects.base import ActsOn, AnyEffect, EffectInput, NoiseEffect
+from ..effects.composition import Injection
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
 
 FORM = "NAME:PARAMETER=VALUE,PARAMETER=VALUE"
-
-
-@dataclass(frozen=True)
-class Injection:
-    """An effect and the value of each of its parameters."""
-
-    effect: AnyEffect
-    values: Mapping[str, float]
 
 
 def injection(text: str) -> Injection:
@@ -81,15 +73,6 @@ def _listed(effect: AnyEffect) -> str:
 def _meant(name: str, names: Sequence[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1)
     return f", did you mean {close[0]!r}?" if close else ""
-
-
-def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn) -> Array:
-    """Sum (N, 3) m/s, body frame, of what the systematic effects add there."""
-    total = np.zeros_like(motion.velocity_body)
-    for each in injections:
-        if isinstance(each.effect, Effect) and each.effect.acts_on is acts_on:
-            total += each.effect.trace(motion, each.values)
-    return total
 
 
 def disturbed(

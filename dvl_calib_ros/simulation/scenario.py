@@ -15,8 +15,9 @@ from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..effects.base import ActsOn, EffectInput
+from ..effects.composition import Injection, at_dvl, late, traces
 from ..messages.encode import SampleWriter
-from .injection import Injection, disturbed, injection_document, traces
+from .injection import disturbed, injection_document
 from .recorded import Recording, recorded_motion
 from .sensors import (
     DvlErrors,
@@ -155,14 +156,15 @@ def truth_document(scenario: Scenario) -> dict[str, Any]:
 
 def _simulate_dvl(scenario: Scenario, world: _World, rng: np.random.Generator) -> list[DvlSample]:
     at = _times(world.seconds, scenario.dvl_rate, 0.0)
-    motion, rotation_dvl_from_body = world.motion, world.input.rotation_dvl_from_body
-    velocity = motion.velocity_body + traces(scenario.effects, world.input, ActsOn.MOTION)
-    measured = measure_dvl(_interpolate(at, motion.time, velocity), scenario.errors, rotation_dvl_from_body, rng)
-    added = traces(scenario.effects, world.input, ActsOn.DVL) @ rotation_dvl_from_body.T
-    measured = measured + _interpolate(at, motion.time, added)
+    moved = at_dvl(scenario.effects, world.input)
+    velocity = _interpolate(at, moved.time, moved.velocity_body)
+    measured = measure_dvl(velocity, scenario.errors, moved.rotation_dvl_from_body, rng)
+    added = traces(scenario.effects, moved, ActsOn.DVL) @ moved.rotation_dvl_from_body.T
+    measured = measured + _interpolate(at, moved.time, added)
     measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.DVL)
     covariance = axis_covariance(scenario.errors.beam_std) if scenario.errors.beam_std else None
-    return [DvlSample(stamp, (x, y, z), covariance) for stamp, (x, y, z) in _stamped(at, measured)]
+    stamped = at + late(scenario.effects, ActsOn.DVL_CLOCK, at)
+    return [DvlSample(stamp, (x, y, z), covariance) for stamp, (x, y, z) in _stamped(stamped, measured)]
 
 
 def _simulate_gnss(scenario: Scenario, world: _World, rng: np.random.Generator) -> list[ReferenceSample]:
@@ -176,9 +178,10 @@ def _simulate_gnss(scenario: Scenario, world: _World, rng: np.random.Generator) 
     measured = measure_gnss(_interpolate(at, motion.time, velocity), scenario.gnss_std, rng)
     measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.REFERENCE)
     covariance = np.eye(3) * scenario.gnss_std**2 if scenario.gnss_std else None
+    stamped = at + late(scenario.effects, ActsOn.REFERENCE_CLOCK, at)
     return [
         ReferenceSample(stamp, (x, y, z), covariance, scenario.gnss_frame)
-        for (stamp, (x, y, z)), t in zip(_stamped(at, measured), at, strict=True)
+        for (stamp, (x, y, z)), t in zip(_stamped(stamped, measured), at, strict=True)
         if not any(start <= t < end for start, end in scenario.outages)
     ]
 
@@ -187,12 +190,15 @@ def _simulate_imu(scenario: Scenario, motion: Motion, rng: np.random.Generator) 
     if not scenario.imu_rate:
         return []
     every = max(1, round(MOTION_RATE_HZ / scenario.imu_rate))
-    attitudes, rates = motion.rotation_enu_from_body[::every], motion.angular_velocity[::every]
+    at, attitudes, rates = (
+        each[::every] for each in (motion.time, motion.rotation_enu_from_body, motion.angular_velocity)
+    )
     if scenario.imu_errors != ImuErrors():
         attitudes, rates = measure_imu(attitudes, rates, scenario.imu_errors, rng)
+    stamped = at + late(scenario.effects, ActsOn.ATTITUDE_CLOCK, at)
     return [
         ImuSample(stamp, quaternion_from_rotation(rotation), (x, y, z))
-        for (stamp, (x, y, z)), rotation in zip(_stamped(motion.time[::every], rates), attitudes, strict=True)
+        for (stamp, (x, y, z)), rotation in zip(_stamped(stamped, rates), attitudes, strict=True)
     ]
 
 

@@ -65,6 +65,20 @@ CASES = {
         {"seconds": LATE},
         steady(SPEED * (1 - np.cos(RATE * LATE)), SPEED * np.sin(RATE * LATE)),
     ),
+    # an attitude that is too old turns the reference too little, as one that is too new turns it too much
+    "attitude_time_offset": (
+        circle(),
+        {"seconds": LATE},
+        steady(SPEED * (1 - np.cos(RATE * LATE)), -SPEED * np.sin(RATE * LATE)),
+    ),
+    "time_offset_jump": (
+        circle(acceleration=0.01),
+        {"seconds": LATE, "at_s": 40.0},
+        np.where(TIME >= 40.0, 1.0, 0.0)[:, None] * steady(-0.01 * LATE),
+    ),
+    "clock_drift": (circle(acceleration=0.01), {"seconds_per_hour": 20.0}, steady(-0.01 * 20.0 * HOURS)),
+    "mounting_moved": (circle(), {"x_rad": 1e-3, "z_rad": 2e-3}, steady(0, 2e-3 * SPEED, -1e-3 * SPEED)),
+    "sound_speed_moved": (circle(), {"ratio": 0.01}, steady(0.01 * SPEED)),
     "reference_lag": (circle(), {"time_constant_s": LAG}, steady(SPEED - FILTERED.real, -FILTERED.imag)),
     # x to port, y astern
     "velocity_bias": (circle(), {"x_mps": 0.1, "y_mps": 0.2, "z_mps": 0.3}, steady(-0.2, 0.1, 0.3)),
@@ -163,7 +177,7 @@ def test_an_effect_works_without_what_it_does_not_need_and_refuses_without_what_
 
 def test_every_effect_describes_itself():
     names = {**OWN_EFFECTS, **OWN_NOISE}
-    assert len(OWN_EFFECTS) == 14 and len(OWN_NOISE) == 4
+    assert len(OWN_EFFECTS) == 19 and len(OWN_NOISE) == 4
     for effect in names.values():
         assert effect.summary and set(effect.confounded_with) <= set(names), effect.name
         assert effect.name in OWN_NOISE or effect.manoeuvre, effect.name

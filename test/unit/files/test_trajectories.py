@@ -92,7 +92,7 @@ def test_attitude_of_marine_instruments_becomes_that_of_ros(tmp_path):
         [np.cos(np.radians(10)) * 0.5, np.cos(np.radians(10)) * 3**0.5 / 2, np.sin(np.radians(10))]
     )
     # turning to starboard is a negative rate about up
-    assert second.angular_velocity == first.angular_velocity
+    assert second.angular_velocity == pytest.approx(first.angular_velocity, abs=1e-12)
     assert Rotation.from_quat(first.orientation).apply(first.angular_velocity) == pytest.approx([0, 0, -np.radians(2)])
 
 

@@ -17,11 +17,12 @@ from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import ImuSample, VelocityFrame
-from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput
+from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput
+from dvl_calib_ros.effects.composition import Injection
 from dvl_calib_ros.effects.registry import EFFECTS, OWN
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.replay.replay import replay
-from dvl_calib_ros.simulation.injection import Injection, injection
+from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.recorded import Recording, recorded_motion
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors, ImuErrors, equivalent_error_terms
@@ -61,7 +62,7 @@ def true_motion(scenario: Scenario) -> EffectInput:
 # ------------------------------------------------------------------ effects
 
 
-@pytest.mark.parametrize("name", OWN_EFFECTS)
+@pytest.mark.parametrize("name", [name for name in OWN_EFFECTS if not isinstance(EFFECTS[name], ClockEffect)])
 def test_a_noise_free_run_with_an_effect_differs_by_that_effect_alone(name):
     plain, given = Scenario(**QUIET), typical(name)
     before, after = simulate(plain), simulate(Scenario(**QUIET, effects=(given,)))
@@ -78,6 +79,42 @@ def test_a_noise_free_run_with_an_effect_differs_by_that_effect_alone(name):
     np.testing.assert_allclose(difference, expected, atol=1e-9)
     assert np.abs(expected).max() > 1e-4
     assert getattr(before, unchanged) == getattr(after, unchanged) and before.imu == after.imu
+
+
+@pytest.mark.parametrize(
+    ("text", "stream"),
+    [
+        ("dvl_time_offset:seconds=0.3", "dvl"), ("clock_drift:seconds_per_hour=30", "dvl"),
+        ("time_offset_jump:seconds=2.5,at_s=20", "dvl"), ("reference_time_offset:seconds=-0.7", "gnss"),
+        ("attitude_time_offset:seconds=0.2", "imu"),
+    ],
+)  # fmt: skip
+def test_a_clock_that_is_wrong_changes_nothing_but_the_stamps_of_its_stream(text, stream):
+    before, after = simulate(Scenario(**QUIET)), simulate(Scenario(**QUIET, effects=effects(text)))
+    for name in ("dvl", "gnss", "imu"):
+        plain, late = getattr(before, name), getattr(after, name)
+        assert [sample[1:] for sample in plain] == [sample[1:] for sample in late]
+        assert (plain == late) == (name != stream)
+    given = effects(text)[0]
+    at = times(getattr(before, stream))
+    np.testing.assert_allclose(times(getattr(after, stream)) - at, given.effect.late(at, given.values), atol=1e-6)
+
+
+def test_a_late_dvl_with_a_lever_arm_was_moved_when_it_measured():
+    """The order of physics: lever arm at the time of measurement, then the stamp; they do not add up at one stamp."""
+    both = simulate(Scenario(**QUIET, effects=effects("lever_arm:x_m=-1.9", "dvl_time_offset:seconds=1.4")))
+    alone = simulate(Scenario(**QUIET, effects=effects("lever_arm:x_m=-1.9")))
+    np.testing.assert_array_equal(velocities(both.dvl), velocities(alone.dvl))
+    np.testing.assert_allclose(times(both.dvl), times(alone.dvl) + 1.4, atol=1e-6)
+
+
+def test_what_the_dvl_makes_of_its_velocity_it_makes_of_that_which_the_lever_arm_gives_it():
+    texts = ["lever_arm:x_m=-1.9,y_m=3", "quadratic_scale:coefficient_s_per_m=0.1"]
+    scenario = Scenario(**QUIET, effects=effects(*texts))
+    motion = true_motion(scenario)
+    at_dvl = motion.velocity_body + np.cross(motion.angular_velocity, [-1.9, 3.0, 0.0])
+    expected = at_dvl * (1.0 + 0.1 * np.linalg.norm(at_dvl, axis=1)[:, None]) @ motion.rotation_dvl_from_body.T
+    np.testing.assert_allclose(velocities(simulate(scenario).dvl), expected[::20][: len(times(simulate(scenario).dvl))])
 
 
 def test_misalignment_and_scale_turn_what_moves_the_dvl_but_not_what_the_dvl_adds():

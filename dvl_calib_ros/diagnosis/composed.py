@@ -1,0 +1,489 @@
+"""The composed model: what is left of the difference between DVL and reference, with any effects, at any size.
+
+The physics of `effects.composition`, gone backwards. At a true time s, with the stamps that each clock gives it,
+
+    u = D⁻¹ (v_dvl - T traces on DVL(u))        v = u - traces on MOTION(v)        e = v - g - traces on REFERENCE(v)
+
+with D = (I + diag(δk)) Exp(φ) T the calibration and g the reference velocity in the body frame. Exp(φ) is the rotation
+that I + [φ×] stands for. Nothing is paired: every stream is a curve of its own, so a delay of seconds is a change of
+argument, and e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
+
+Regressors are made of the smoothed DVL velocity, whose noise is small; those made from the reference would pull
+estimates towards zero (errors in variables).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..calibration.frames import Array, skew
+from ..calibration.samples import VelocityFrame
+from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, Needs, ParameterSpec
+from ..effects.composition import Injection, late, traces
+from .noise import segments_of
+from .recordings import Curve, Recording
+from .settings import SETTINGS
+
+Values = Mapping[str, float]
+# Passes in which an effect is undone that acts on the very motion it changes: it is small against that motion
+_PASSES = 3
+_KEPT = 12
+
+
+def is_time_of_run(spec: ParameterSpec) -> bool:
+    """Whether a parameter is a time at which an effect begins or ends."""
+    return spec.unit == "s" and not np.isfinite(spec.high)
+
+
+def amplitudes(effect: Effect) -> list[ParameterSpec]:
+    """Parameters with a derivative: all but times of the run."""
+    return [spec for spec in effect.parameters if not is_time_of_run(spec)]
+
+
+def whose_parameters(effect: Effect, n_recordings: int) -> list[int | None]:
+    """Recordings that have parameters of their own for an effect; [None] if all share them."""
+    if not effect.of_the_day or n_recordings == 1:
+        return [None]
+    return list(range(1 if effect.relative_to_first else 0, n_recordings))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that is fitted. recording: whose, None for all (of the vehicle)."""
+
+    effect: Effect
+    spec: ParameterSpec
+    recording: int | None
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A calibration and effects with their values, per recording. phi: (3,) rad, scale: (3,), DVL frame."""
+
+    phi: Array
+    scale: Array
+    effects: tuple[Effect, ...] = ()
+    values: Mapping[str, tuple[Values, ...]] = field(default_factory=dict)
+
+    def injections(self, recording: int) -> list[Injection]:
+        """The effects as one recording has them."""
+        return [Injection(effect, self.values[effect.name][recording]) for effect in self.effects]
+
+    def parameters(self) -> list[Parameter]:
+        """What is fitted beside the calibration, in order."""
+        return [each for effect in self.effects for each in self.parameters_of(effect)]
+
+    def parameters_of(self, effect: Effect) -> list[Parameter]:
+        """Those of one effect: of the vehicle once, of the day for every recording."""
+        each = self.values[effect.name]
+        whose = whose_parameters(effect, len(each))
+        return [Parameter(effect, spec, recording) for recording in whose for spec in amplitudes(effect)]
+
+    def value(self, parameter: Parameter) -> float:
+        """The value of one."""
+        return self.values[parameter.effect.name][parameter.recording or 0][parameter.spec.name]
+
+    def vector(self) -> Array:
+        """(6 + p,) φ, δk and all values."""
+        return np.concatenate([self.phi, self.scale, [self.value(each) for each in self.parameters()]])
+
+    def moved(self, step: Array) -> Hypothesis:
+        """A step (6 + p,) on, within the bounds of each parameter."""
+        phi = (Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec(self.phi)).as_rotvec()
+        values = {name: [dict(each) for each in per] for name, per in self.values.items()}
+        for parameter, change in zip(self.parameters(), step[6:].tolist(), strict=True):
+            spec = parameter.spec
+            per = values[parameter.effect.name]
+            for recording in range(len(per)) if parameter.recording is None else [parameter.recording]:
+                per[recording][spec.name] = float(np.clip(per[recording][spec.name] + change, spec.low, spec.high))
+        return replace(
+            self, phi=phi, scale=self.scale + step[3:6], values={name: tuple(per) for name, per in values.items()}
+        )
+
+    def with_effects(self, effects: Sequence[Effect], n: int, start: Mapping[str, tuple[Values, ...]]) -> Hypothesis:
+        """Of other effects, with values of `start`, else their own, else the defaults; of n recordings."""
+        values = {
+            effect.name: start.get(effect.name) or self.values.get(effect.name) or (effect.defaults,) * n
+            for effect in effects
+        }
+        return replace(self, effects=tuple(effects), values=values)
+
+    def body_from_measured(self, rotation_dvl_from_body: Array) -> Array:
+        """D⁻¹ (3, 3)."""
+        turned = Rotation.from_rotvec(self.phi).as_matrix() @ rotation_dvl_from_body
+        matrix: Array = turned.T / (1.0 + self.scale)
+        return matrix
+
+
+def no_effect(phi: Array | None = None, scale: Array | None = None) -> Hypothesis:
+    """A calibration alone, by default none."""
+    return Hypothesis(np.zeros(3) if phi is None else phi, np.zeros(3) if scale is None else scale)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
+    (F, 3) m/s smoothed DVL velocity, its frame. rate_of_change: (F, 3) m/s² of it. error: (F, 3) e, body frame.
+    """
+
+    motion: EffectInput
+    at_dvl: EffectInput
+    measured: Array
+    rate_of_change: Array
+    error: Array
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where a recording is looked at: at its rougher stream's own samples, which so need no interpolation.
+
+    What is interpolated is as noisy at one phase as at another only if it has next to no noise, and is as it was
+    between its samples only if these are close. clock: that of the rougher stream, DVL_CLOCK or REFERENCE_CLOCK.
+    stamps: (M * per_bin,) s, by that clock. late: s, by a first guess.
+    """
+
+    clock: ActsOn
+    stamps: Array
+    per_bin: int
+    late: float = 0.0
+
+    @property
+    def bin_time(self) -> Array:
+        """(M,) s, middles, as true as the first guess."""
+        return self.stamps.reshape(-1, self.per_bin).mean(axis=1) - self.late
+
+    def averaged(self, values: Array) -> Array:
+        """(F, ...) -> (M, ...)."""
+        mean: Array = values.reshape(-1, self.per_bin, *values.shape[1:]).mean(axis=1)
+        return mean
+
+    def true_time(self, injections: Sequence[Injection]) -> Array:
+        """(F,) s at which what is stamped so was measured."""
+        time = self.stamps
+        for _ in range(_PASSES):
+            time = self.stamps - late(injections, self.clock, time)
+        return time
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare."""
+
+    recordings: tuple[Recording, ...]
+    rotation_dvl_from_body: Array
+    lever_arm: Array
+    grids: tuple[Grid, ...]
+    of_axes: tuple[bool, bool, bool] = (True, True, True)
+    _kept: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    # ------------------------------------------------------------------ the data
+
+    @cached_property
+    def available(self) -> frozenset[Needs]:
+        """What effects may need and every recording has."""
+        return frozenset.intersection(*(recording.available for recording in self.recordings))
+
+    @cached_property
+    def measured(self) -> tuple[bool, bool, bool]:
+        """Axes that are compared, of those that the reference measures in all recordings."""
+        x, y, z = (
+            self.of_axes[axis] and all(recording.measured[axis] for recording in self.recordings) for axis in range(3)
+        )
+        return x, y, z
+
+    @property
+    def axes(self) -> int:
+        """Number of axes that are compared."""
+        return sum(self.measured)
+
+    @cached_property
+    def time(self) -> Array:
+        """(M,) s of all bins, since the beginning of the bin's recording."""
+        return np.concatenate([grid.bin_time for grid in self.grids])
+
+    @cached_property
+    def recording_of(self) -> NDArray[np.intp]:
+        """(M,) index of the recording that a bin belongs to."""
+        return np.repeat(np.arange(len(self.grids)), [len(grid.bin_time) for grid in self.grids])
+
+    @cached_property
+    def segments(self) -> tuple[slice, ...]:
+        """Stretches of the M bins without a gap."""
+        return segments_of([grid.bin_time for grid in self.grids])
+
+    @cached_property
+    def interval(self) -> float:
+        """Median time, s, between neighbours of the M bins."""
+        return float(np.median(np.concatenate([np.diff(grid.bin_time) for grid in self.grids])))
+
+    @cached_property
+    def earth_from_compared(self) -> Array | None:
+        """(M, A, A) from the frame of the residual to the earth's, None without attitude."""
+        if Needs.ATTITUDE not in self.available:
+            return None
+        parts = []
+        for recording, grid in zip(self.recordings, self.grids, strict=True):
+            rotation = recording.rotation_enu_from_body(grid.bin_time)
+            parts.append(rotation @ np.swapaxes(self.projection(recording, rotation), 1, 2))
+        return np.concatenate(parts)[:, [axis for axis in range(3) if self.measured[axis]]]
+
+    def projection(self, recording: Recording, rotation_enu_from_body: Array | None) -> Array:
+        """(F, A, 3) from the body frame to the axes that are compared: those of the body, or of it held level."""
+        if all(self.measured):
+            return np.eye(3)[None]
+        rows = [axis for axis in range(3) if self.measured[axis]]
+        if recording.frame is VelocityFrame.BODY or rotation_enu_from_body is None:
+            return np.eye(3)[None, rows]
+        if self.measured != (True, True, False):
+            return rotation_enu_from_body[:, rows]
+        ahead = rotation_enu_from_body[:, :2, 0]
+        c, s = (ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]).T
+        level = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
+        projected: Array = level @ rotation_enu_from_body[:, :2]
+        return projected
+
+    @cached_property
+    def shaken(self) -> tuple[Problem, ...]:
+        """The problem with made-up noise, like its own, in one velocity and then in the other.
+
+        Not in that of the reference where it is looked at its own samples: there its noise is the same for all.
+        """
+        rng = np.random.default_rng(0)
+        dvl = [replace(one, dvl=one.dvl.shaken(rng)) for one in self.recordings]
+        reference = [replace(one, reference=one.reference.shaken(rng)) for one in self.recordings]
+        by_dvl = any(grid.clock is ActsOn.DVL_CLOCK for grid in self.grids)
+        each = [dvl, reference] if by_dvl else [dvl]
+        return tuple(replace(self, recordings=tuple(recordings), _kept={}) for recordings in each)
+
+    # ------------------------------------------------------------------ the model
+
+    def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:
+        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid."""
+        stream, injections = self.recordings[recording], hypothesis.injections(recording)
+        time = self.grids[recording].true_time(injections) if at is None else at
+        dvl, reference, attitude = (
+            time + late(injections, clock, time)
+            for clock in (ActsOn.DVL_CLOCK, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
+        )
+        by_dvl = self.grids[recording].clock is ActsOn.DVL_CLOCK
+        rotation, rates = self._kept_at("attitude", recording, attitude, lambda: self._oriented(stream, attitude))
+        g = self._kept_at(
+            "reference",
+            recording,
+            reference,
+            lambda: (stream.reference.quiet if by_dvl else stream.reference)(reference),
+        )
+        if stream.frame is not VelocityFrame.BODY:
+            g = np.einsum("nji,nj->ni", rotation, g)
+        raw, smooth, change = self._kept_at("dvl", recording, dvl, lambda: _measured(stream.dvl, dvl, by_dvl))
+        matrix = hypothesis.body_from_measured(self.rotation_dvl_from_body)
+        from_nominal = (matrix @ self.rotation_dvl_from_body).T
+        lever = np.zeros(3) if rates is None or not self.lever_arm.any() else np.cross(rates, self.lever_arm)
+        at_dvl = EffectInput(time, smooth @ matrix.T, self.rotation_dvl_from_body, rotation, rates, stream.frame, 0.0)
+        at_dvl, of_dvl = _undone(injections, at_dvl, ActsOn.DVL, from_nominal)
+        motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
+        motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
+        error = raw @ matrix.T - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
+        return Seen(motion, at_dvl, smooth, change, error)
+
+    def _oriented(self, stream: Recording, at: Array) -> tuple[Array | None, Array | None]:
+        rotation = stream.rotation_enu_from_body(at) if Needs.ATTITUDE in self.available else None
+        return rotation, stream.angular_velocity(at) if Needs.ANGULAR_VELOCITY in self.available else None
+
+    def _kept_at(self, what: str, recording: int, at: Array, make: Callable[[], Any]) -> Any:
+        key = what, recording, len(at), float(at[0]), float(at[-1]), float(at[len(at) // 2]), float(at.sum())
+        if key not in self._kept:
+            while len(self._kept) > _KEPT * len(self.recordings):
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = make()
+        return self._kept[key]
+
+    def all_seen(self, hypothesis: Hypothesis) -> list[Seen]:
+        """Every recording through a hypothesis."""
+        return [self.seen(hypothesis, recording) for recording in range(len(self.recordings))]
+
+    def residual(self, seen: Sequence[Seen]) -> Array:
+        """e (M, A) m/s in the frame that is compared."""
+        return self.binned([each.error for each in seen], seen)
+
+    def binned(self, bodies: Sequence[Array], seen: Sequence[Seen]) -> Array:
+        """(F, 3, ...) of each recording, body frame, -> (M, A, ...) means, in the frame that is compared."""
+        parts = []
+        for recording, grid, body, each in zip(self.recordings, self.grids, bodies, seen, strict=True):
+            if not all(self.measured):
+                projection = self.projection(recording, each.motion.rotation_enu_from_body)
+                body = np.einsum("nij,nj...->ni...", np.broadcast_to(projection, (len(body), self.axes, 3)), body)
+            parts.append(grid.averaged(body))
+        return np.concatenate(parts)
+
+    @cached_property
+    def bin_of(self) -> NDArray[np.intp]:
+        """(F,) bin of every sample of all recordings."""
+        per_bin = np.concatenate([np.full(len(grid.bin_time), grid.per_bin) for grid in self.grids])
+        return np.repeat(np.arange(len(per_bin)), per_bin)
+
+    @cached_property
+    def sample_time(self) -> Array:
+        """(F,) s of every sample, since the beginning of its recording, as true as the first guess."""
+        return np.concatenate([grid.stamps - grid.late for grid in self.grids])
+
+    def errors(self, seen: Sequence[Seen]) -> Array:
+        """(F, 3) m/s, e of every sample, not averaged, ahead, to port and up; zero on an axis that is not measured."""
+        parts = []
+        for recording, each in zip(self.recordings, seen, strict=True):
+            error = each.error
+            if not all(self.measured):
+                projection = self.projection(recording, each.motion.rotation_enu_from_body)
+                error = np.zeros_like(error)
+                error[:, list(self.measured)] = np.einsum(
+                    "nij,nj->ni", np.broadcast_to(projection, (len(error), self.axes, 3)), each.error
+                )
+            parts.append(error)
+        return np.concatenate(parts)
+
+    def sampled(self, seen: Sequence[Seen], of: Callable[[EffectInput], Array]) -> Array:
+        """A function of the motion (F, ...) at the M bins."""
+        return np.concatenate([grid.averaged(of(each.motion)) for grid, each in zip(self.grids, seen, strict=True)])
+
+    # ------------------------------------------------------------------ its derivatives
+
+    def calibration_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
+        """(M, A, 6) d e / d (φ, δk)."""
+        turned = Rotation.from_rotvec(hypothesis.phi).as_matrix() @ self.rotation_dvl_from_body
+        parts = []
+        for each in seen:
+            y = each.measured / (1.0 + hypothesis.scale)
+            columns = np.concatenate([skew(y), -(y / (1.0 + hypothesis.scale))[:, :, None] * np.eye(3)], axis=2)
+            parts.append(np.einsum("ji,njk->nik", turned, columns))
+        return self.binned(parts, seen)
+
+    def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
+        """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
+        per_recording = [
+            self._derivatives(hypothesis, each, effect, values[recording]) for recording, each in enumerate(seen)
+        ]
+        joined = self.binned(per_recording, seen)
+        if not effect.of_the_day or len(seen) == 1:
+            return joined
+        whose = whose_parameters(effect, len(seen))
+        blocks = [np.where((self.recording_of == r)[:, None, None], joined, 0.0) for r in whose]
+        return np.concatenate(blocks, axis=2)
+
+    def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
+        """(M, A) m/s that an effect adds to the residual of a hypothesis that has not got it."""
+        without = [other for other in hypothesis.effects if other is not effect]
+        n = len(self.recordings)
+        plain = hypothesis.with_effects(without, n, {})
+        with_it = plain.with_effects([*without, effect], n, {effect.name: tuple(values)})
+        return self.residual(self.all_seen(plain)) - self.residual(self.all_seen(with_it))
+
+    def _derivatives(self, hypothesis: Hypothesis, seen: Seen, effect: Effect, values: Values) -> Array:
+        """(F, 3, p), body frame."""
+        specs = amplitudes(effect)
+        if isinstance(effect, ClockEffect):
+            by_late = self._by_late(hypothesis, seen, effect.acts_on)
+            slopes = [_difference(spec, values, lambda at: effect.late(seen.motion.time, at)) for spec in specs]
+            return np.stack([by_late * slope[:, None] for slope in slopes], axis=2)
+        motion = seen.at_dvl if effect.acts_on is ActsOn.DVL else seen.motion
+        slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
+        stacked = -np.stack(slopes, axis=2)
+        if effect.acts_on is not ActsOn.DVL:
+            return stacked
+        matrix = hypothesis.body_from_measured(self.rotation_dvl_from_body) @ self.rotation_dvl_from_body
+        return np.einsum("ij,njk->nik", matrix, stacked)
+
+    def _by_late(self, hypothesis: Hypothesis, seen: Seen, clock: ActsOn) -> Array:
+        """(F, 3) d e / d lateness of a clock, m/s per s, body frame."""
+        if clock is ActsOn.DVL_CLOCK:
+            matrix = hypothesis.body_from_measured(self.rotation_dvl_from_body)
+            changed: Array = seen.rate_of_change @ matrix.T
+            return changed
+        motion = seen.motion
+        turning = np.zeros_like(motion.velocity_body)
+        if motion.angular_velocity is not None and motion.reference_frame is not VelocityFrame.BODY:
+            turning = np.cross(motion.angular_velocity, motion.velocity_body)
+        if clock is ActsOn.ATTITUDE_CLOCK:
+            return turning
+        gradient = np.gradient(motion.velocity_body, motion.time, axis=0)
+        return -gradient - turning
+
+
+def _measured(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array, Array]:
+    smooth = curve.smooth
+    clipped = np.clip(at, curve.time[0], curve.time[-1])
+    raw = curve if at_samples else curve.quiet
+    return raw(at), smooth(at), np.asarray(smooth.derivative(clipped))
+
+
+def _undone(
+    injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn, turned: Array | None
+) -> tuple[EffectInput, Array]:
+    """The motion before the effects of one stage have acted on it, and what they have added (F, 3)."""
+    after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
+    if not any(each.effect.acts_on is acts_on for each in injections):
+        return motion, added
+    for _ in range(_PASSES):
+        added = traces(injections, motion, acts_on)
+        added = added if turned is None else added @ turned
+        motion = replace(motion, velocity_body=after - added)
+    return motion, added
+
+
+def _difference(spec: ParameterSpec, values: Values, of: Callable[[Values], Array]) -> Array:
+    """d of / d parameter, by central differences, within its bounds."""
+    step = 0.05 * spec.typical
+    low, high = max(values[spec.name] - step, spec.low), min(values[spec.name] + step, spec.high)
+    slope: Array = (of({**values, spec.name: high}) - of({**values, spec.name: low})) / (high - low)
+    return slope
+
+
+def make_problem(
+    recordings: Sequence[Recording], rotation_dvl_from_body: Array, lever_arm: Array, offsets: Sequence[Offsets]
+) -> Problem:
+    """The problem on bins where all streams are known, with offsets (about which hypotheses lie) and without."""
+    grids = tuple(_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
+    return Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Lateness, s, of the DVL's and the reference's stamps against the attitude's: a first guess."""
+
+    dvl: float = 0.0
+    reference: float = 0.0
+
+
+# Offsets of hypotheses may lie so far from the first guess without leaving what is known, s
+MARGIN_S = 0.5
+
+
+def _grid(recording: Recording, offsets: Offsets) -> Grid:
+    settings = SETTINGS
+    by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
+    base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)
+    base_late = offsets.dvl if by_dvl else offsets.reference
+    seconds = max(base.time[-1] - base.time[0], base.interval)
+    width = max(settings.bins_per_interval * base.interval, settings.shortest_bin, seconds / settings.max_bins)
+    per_bin = max(2, round(width / base.interval))
+    true = base.time - base_late
+    known = np.ones(len(true), dtype=bool)
+    for curve, own_late in ((recording.dvl, offsets.dvl), (recording.reference, offsets.reference)):
+        if curve is not base:
+            for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
+                known &= curve.covers(true + own_late + at)
+    for oriented in (recording.attitude, recording.rates):
+        for at in (base_late, -MARGIN_S, MARGIN_S):
+            known &= True if oriented is None else oriented.covers(true + at)
+    breaks = np.flatnonzero(np.diff(base.time) > settings.max_gap_intervals * base.interval) + 1
+    kept = []
+    for part in np.split(np.arange(len(true)), np.unique(np.concatenate([breaks, np.flatnonzero(np.diff(known)) + 1]))):
+        if len(part) and known[part[0]]:
+            kept.append(part[: len(part) // per_bin * per_bin])
+    return Grid(clock, base.time[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_late)

@@ -1,0 +1,57 @@
+"""Whitened least squares with a prior: the one place where the diagnosis solves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve
+
+from ..calibration.frames import Array
+
+
+@dataclass(frozen=True)
+class WhitenedLeastSquares:
+    """Minimise ‖target - columns x‖² + Σ ((x - centre) / std)², all of it whitened.
+
+    gram: (n + 1, n + 1) of columns and target, in this order. std, centre: (n,), the prior.
+    """
+
+    gram: Array
+    std: Array
+    centre: Array
+
+    @staticmethod
+    def of(columns: Array, target: Array, std: Array, centre: Array) -> WhitenedLeastSquares:
+        """From whitened columns (m, n) and target (m,)."""
+        joined = np.column_stack([columns, target])
+        return WhitenedLeastSquares(joined.T @ joined, std, centre)
+
+    def part(self, at: NDArray[np.intp]) -> WhitenedLeastSquares:
+        """With these columns only; the others are zero."""
+        rows = np.append(at, len(self.std))
+        return WhitenedLeastSquares(self.gram[np.ix_(rows, rows)], self.std[at], self.centre[at])
+
+    @property
+    def _normal(self) -> Array:
+        normal: Array = self.gram[:-1, :-1] + np.diag(self.std**-2.0)
+        return normal
+
+    def solution(self) -> Array:
+        """x (n,)."""
+        right = self.gram[:-1, -1] + self.centre / self.std**2
+        return np.asarray(solve(self._normal, right, assume_a="pos"))
+
+    def misfit(self, x: Array) -> float:
+        """What is minimised, at x (n,)."""
+        extended = np.append(-x, 1.0)
+        return float(extended @ self.gram @ extended + np.sum(((x - self.centre) / self.std) ** 2))
+
+    def covariance(self) -> Array:
+        """(n, n) of the solution, for noise of unit variance."""
+        return np.asarray(np.linalg.inv(self._normal))
+
+    def freedom(self) -> Array:
+        """(n,) degrees of freedom that each parameter uses up: less than one where the prior has to hold it."""
+        return np.asarray(1.0 - np.diag(self.covariance()) / self.std**2)
