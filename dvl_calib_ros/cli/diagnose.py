@@ -64,6 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
     write_report = report_writer(arguments, "write_diagnosis_report")
     discovery = common.discovered(arguments, arguments.bags, parameters)
     parameters = discovery.parameters
+    common.print_warnings(discovery.doubts)
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(
             arguments.bags,

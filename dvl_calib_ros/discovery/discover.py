@@ -364,7 +364,7 @@ class _Search:
         self._values["mounting_rpy"] = rpy
         # of a level vehicle, a heading that counts from elsewhere looks the same
         quarter = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
-        self._found.append(
+        self._notes.append(
             f"mounting {_degrees(rpy)}, {why}: nothing in the bag says how the DVL is mounted (-p "
             f"mounting_rpy:={_option(rpy)}){quarter}"
         )
