@@ -27,6 +27,7 @@ from .parameters import XY, XYZ, Parameters
 from .rows import NO_DECISIONS, Decisions, Events, OrderedStreams, Rows, ScreenedStreams
 from .samples import (
     FRAME_CODES,
+    FRAMES,
     AlignedBlock,
     DvlSample,
     ImuSample,
@@ -87,6 +88,9 @@ class Aligner:
         self._prior_sway_heave = prior_sway_heave
         self._on_restart = on_restart
         self._clocks = Clocks.of(parameters)
+        east, north = parameters.reference_velocity_offset
+        offsets = {VelocityFrame.ENU: (east, north, 0.0), VelocityFrame.NED: (north, east, 0.0)}
+        self._velocity_offset = np.array([offsets.get(frame, (0.0, 0.0, 0.0)) for frame in FRAMES])
         self._has_lever_arm = any(parameters.lever_arm)
         self._needs_turn_rate = self._has_lever_arm or parameters.max_turn_rate > 0.0
         self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
@@ -293,6 +297,7 @@ class Aligner:
             values[:3] = sample.velocity
             values[3:] = math.nan if covariance.covariance is None else covariance.covariance.ravel()
             track.frames[slot] = FRAME_CODES[sample.frame]
+            values[:3] -= self._velocity_offset[track.frames[slot]]
             self._vertical_seen = self._vertical_seen or sample.velocity[2] != 0.0
             track.unmeasured[slot] = covariance.unmeasured | self._never_measured(self._vertical_seen)
         if slot % FORGET_EVERY == 0:
@@ -588,6 +593,7 @@ class Aligner:
             track.stamps_ns[slots] = chunk.reference_ns
             track.values[slots] = screened.reference_values[at]
             track.frames[slots] = reference.frames[at]
+            track.values[slots, :3] -= self._velocity_offset[reference.frames[at]]
             vertical = np.logical_or.accumulate(reference.values[at, 2] != 0.0) | self._vertical_seen
             self._vertical_seen = bool(vertical[-1])
             never = np.where(vertical, self._never_measured(True), self._never_measured(False)).astype(np.uint8)

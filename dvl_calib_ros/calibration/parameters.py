@@ -224,6 +224,14 @@ class Parameters:
         low=-10.0,
         high=10.0,
     )
+    reference_velocity_offset: tuple[float, ...] = _parameter(
+        (0.0, 0.0),
+        "East and north part by which a reference velocity in ENU or NED is off against what the DVL measures: of an "
+        "inertial navigation that drifts, or a current where the DVL tracks water. Taken off.",
+        unit="m/s",
+        low=-5.0,
+        high=5.0,
+    )
     imu_time_offset: float = _parameter(
         0.0,
         "Positive: IMU stamps (attitude and angular velocity) are late. Taken off before pairing.",

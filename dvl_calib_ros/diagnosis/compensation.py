@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import yaml
 
 from ..calibration.parameters import SCHEMA, Parameters
@@ -14,6 +15,10 @@ OFFSETS = {
     "reference_time_offset": "reference_time_offset",
     "attitude_time_offset": "imu_time_offset",
 }
+
+
+# A velocity that begins no later is there all the time
+WHOLE_RUN_S = 5.0
 
 
 def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | None = None) -> Parameters:
@@ -39,6 +44,9 @@ def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | N
         elif effect.name in OFFSETS:
             name = OFFSETS[effect.name]
             values[name] = values.get(name, getattr(parameters, name)) + found["seconds"]
+        elif effect.name == "water_lock" and found["from_s"] < WHOLE_RUN_S and np.isinf(found["to_s"]):
+            east, north = parameters.reference_velocity_offset
+            values["reference_velocity_offset"] = (east - found["east_mps"], north - found["north_mps"])
         elif effect.name == "clock_drift":
             values["dvl_clock_drift"] = parameters.dvl_clock_drift + found["seconds_per_hour"] / 3600.0
         elif effect.name == "time_offset_jump":

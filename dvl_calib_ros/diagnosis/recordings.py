@@ -373,6 +373,8 @@ def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[
     velocity, std, frame = reference.values, _std(reference.covariances), FRAMES[code]
     if frame is VelocityFrame.NED:
         velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[[1, 0, 2]], VelocityFrame.ENU
+    if frame is VelocityFrame.ENU:
+        velocity = velocity - np.array([*parameters.reference_velocity_offset, 0.0])
     imu = _in_order(streams.imu.part(streams.imu.refused == 0), parameters, notes)
     length = np.linalg.norm(imu.orientation, axis=1)
     oriented = imu.part(np.flatnonzero((length > 0.5) & (length < 2.0)))
@@ -393,7 +395,7 @@ def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[
         rates=_stream(rated.stamps_ns - imu_ns, rated.angular_velocity, first_ns) if len(rated) > 1 else None,
         dvl_std=_std(dvl.covariances),
         reference_std=std,
-        axes=getattr(parameters, "gnss_axes", "auto"),
+        axes=parameters.gnss_axes,
         first_ns=first_ns,
     )
 

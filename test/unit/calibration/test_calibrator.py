@@ -76,6 +76,22 @@ def test_streams_late_by_seconds_are_paired_once_that_is_said_even_beyond_the_la
         np.testing.assert_allclose(right.state("M1").x, expected.state("M1").x, atol=1e-9)
 
 
+@pytest.mark.parametrize("frame", [VelocityFrame.ENU, VelocityFrame.NED])
+def test_an_earth_fixed_error_of_the_reference_is_taken_off_in_its_own_frame(frame):
+    added = (0.3, -0.2, 0.0) if frame is VelocityFrame.ENU else (-0.2, 0.3, 0.0)
+    run = variant(EXACT, frame=frame, imu_every=1)
+    off = [
+        sample._replace(velocity=tuple(v + a for v, a in zip(sample.velocity, added, strict=True)))
+        if isinstance(sample, ReferenceSample)
+        else sample
+        for sample in make_samples(run)
+    ]
+    expected = calibrate(make_samples(run), WIDE)
+    right = calibrate(off, WIDE.replace(reference_velocity_offset=(0.3, -0.2)))
+    np.testing.assert_allclose(right.state("M1").x, expected.state("M1").x, atol=1e-9)
+    assert np.abs(calibrate(off, WIDE).state("M1").x - expected.state("M1").x).max() > 1e-3
+
+
 def test_a_dvl_clock_that_drifts_and_jumps_is_put_right():
     samples = make_samples(EXACT)
     first_ns = next(sample.stamp_ns for sample in samples if isinstance(sample, DvlSample))
