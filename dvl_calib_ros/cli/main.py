@@ -19,6 +19,18 @@ from . import apply, demo, diagnose, doctor, evaluate, import_, parameters, repl
 COMMANDS = (run, watch, doctor, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo)
 
 
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    """Folds the paragraphs of a description to the terminal's width; a command to copy stays in one line."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        import textwrap
+
+        paragraphs = text.split("\n\n")
+        return "\n\n".join(
+            each if each.startswith("example:") else textwrap.fill(" ".join(each.split()), width) for each in paragraphs
+        )
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say in one line what is wrong with the usage."""
@@ -42,7 +54,7 @@ def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
             help=module.HELP,
             description=(module.__doc__ or "").strip(),
             epilog=f"example: {module.EXAMPLE}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=_Formatter,
         )
         if module.NAME in argv:
             module.add_arguments(command)
