@@ -23,7 +23,8 @@ PAGE = """# How good the diagnosis is: the blind trial
 
 Written by a command; do not edit. Measured by version {version} with
 
-```
+<!-- not run: a trial takes hours of computing -->
+```bash
 {command}
 ```
 
