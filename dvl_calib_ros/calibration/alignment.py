@@ -60,6 +60,8 @@ DROPOUT_NS = SECOND_NS
 DROPOUT_INTERVALS = 3
 # How far a DVL may lag GNSS and IMU and still find its partners, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS
+# A DVL whose stamps are off by seconds, which G2 finds, lags others by as much, or they lag it.
+WRONG_CLOCK_NS = 4 * SECOND_NS
 NEVER_NS = 2**63 - 1
 # From so many messages on columns are faster.
 COLUMNS_FROM = 64
@@ -73,7 +75,9 @@ class Aligner:
     """Aligns three streams; `rows` are its outcome.
 
     n_judged, n_oriented, n_paired: numbers of the first row whose verdict, attitude or reference is not decided yet;
-    the verdict may wait for the angular velocity. given: by need, how many rows there are so far for models that have
+    the verdict may wait for the angular velocity. reference, imu: their samples of late. lag_ns: by how much (in
+    stamps) one stream may lag another, a wrong clock included. given: by need, how many rows there are so far for
+    models that have
     it. tally: by stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the DVL's stamps
     went back when all is to start anew; everything here has then been forgotten.
     """
@@ -105,12 +109,13 @@ class Aligner:
         self._first_stamp_ns: int | None = None
         # one stream that is stamped late lags the others by as much once that is put right
         latency_ns = round(p.max_latency * 1e9) + self._clocks.spread_ns
+        self.lag_ns = latency_ns + WRONG_CLOCK_NS
         gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
         retention_ns = RETENTION_NS + gnss_ns + imu_ns + latency_ns
         self.orders: dict[Stream, Sequencer[Any]] = {stream: Sequencer(self._max_jump_ns) for stream in Stream}
-        self._reference = Track(gnss_ns, latency_ns, retention_ns)
-        self._imu = Track(imu_ns, latency_ns, retention_ns)
-        self._tracks = {Stream.REFERENCE: self._reference, Stream.IMU: self._imu}
+        self.reference = Track(gnss_ns, latency_ns, retention_ns)
+        self.imu = Track(imu_ns, latency_ns, retention_ns)
+        self._tracks = {Stream.REFERENCE: self.reference, Stream.IMU: self.imu}
         self.tally: dict[str, Counter[str]] = {
             name: Counter() for name in (*(each.value for each in Stream), "pairing")
         }
@@ -132,6 +137,7 @@ class Aligner:
         self._waits_for: set[Track] = set()
         self._deadline_ns = NEVER_NS
         self._row_of_held = 0
+        self.reached_ns = LONG_AGO_NS  # the newest horizon so far
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._shortest_interval_ns = NEVER_NS
@@ -141,14 +147,14 @@ class Aligner:
     @property
     def newest_ns(self) -> dict[str, int | None]:
         """Stamp of the newest sample of each stream; None before the first."""
-        return {"dvl": self.last_ns, "reference": self._reference.newest_ns, "imu": self._imu.newest_ns}
+        return {"dvl": self.last_ns, "reference": self.reference.newest_ns, "imu": self.imu.newest_ns}
 
     def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:
         """Newest angular velocity (rad/s, body), if not older than imu_timeout; None where the IMU gives none."""
-        newest_ns = self._imu.newest_ns
+        newest_ns = self.imu.newest_ns
         if newest_ns is None or abs(stamp_ns - newest_ns) > self.parameters.imu_timeout * 1e9:
             return None
-        x, y, z = self._imu.values[self._imu.size - 1, 4:7].tolist()
+        x, y, z = self.imu.values[self.imu.size - 1, 4:7].tolist()
         return None if math.isnan(x) else (x, y, z)
 
     # ------------------------------------------------------------------ one by one
@@ -196,6 +202,7 @@ class Aligner:
         stamp_ns, velocity, covariance = sample
         interval_ns = 0 if self.last_ns is None else stamp_ns - self.last_ns
         self.last_ns = stamp_ns
+        late = self._is_late(stamp_ns)
         if self.first_ns is None:
             self.first_ns = stamp_ns
         else:
@@ -206,6 +213,7 @@ class Aligner:
         rows = self.rows
         slot = rows.extend(1).start
         rows.stamps_ns[slot] = stamp_ns
+        rows.late[slot] = late
         rows.row[slot] = row
         rows.velocity_dvl[slot] = velocity
         rows.covariance[slot] = math.nan if covariance is None else covariance
@@ -288,6 +296,7 @@ class Aligner:
 
     def _append(self, track: Track, sample: ReferenceSample | ImuSample) -> None:
         slot = track.append(sample.stamp_ns)
+        track.late[slot] = self._is_late(sample.stamp_ns)
         values = track.values[slot]
         if isinstance(sample, ImuSample):
             values[:4] = math.nan if sample.orientation is None else sample.orientation
@@ -332,36 +341,42 @@ class Aligner:
     def _advance(self) -> None:
         """Let rows go on as far as their partners are decided; note what the next ones wait for."""
         rows, end = self.rows, self.rows.end
-        horizon_ns = self._horizon_ns()
+        horizon_ns = self.horizon_ns
         self._waits_for.clear()
         self._deadline_ns = NEVER_NS
         while self.n_oriented < end:
             slot = self.n_oriented - rows.base
-            if not self._is_decided(self._imu, int(rows.stamps_ns[slot]), horizon_ns):
+            if not self._is_decided(self.imu, int(rows.stamps_ns[slot]), horizon_ns):
                 break
             self.n_oriented += 1
             self._orient(slot)
         while self.n_paired < (self.n_oriented if self._needs_turn_rate else end):
             slot = self.n_paired - rows.base
             stamp_ns = int(rows.stamps_ns[slot])
-            if not self._is_decided(self._reference, stamp_ns, horizon_ns):
+            if not self._is_decided(self.reference, stamp_ns, horizon_ns):
                 break
-            bracket = self._reference.bracket(stamp_ns)
-            in_earth_frame = bracket is not None and self._reference.frames[bracket.after] != _BODY
+            bracket = self.reference.bracket(stamp_ns)
+            in_earth_frame = bracket is not None and self.reference.frames[bracket.after] != _BODY
             if in_earth_frame and self.n_paired >= self.n_oriented:
                 break
             self.n_paired += 1
             self.decided_ns = stamp_ns
             self._pair(slot, stamp_ns, bracket)
 
-    def _horizon_ns(self) -> int:
+    @property
+    def horizon_ns(self) -> int:
         """Newest stamp of any stream that keeps the DVL's time.
 
         One whose clock is far ahead would say of every DVL sample that nothing can come for it any more.
         """
         dvl_ns = self.orders[Stream.DVL].last_ns or 0
-        tracks_ns = (self._reference.newest_ns or 0, self._imu.newest_ns or 0)
+        tracks_ns = (self.reference.newest_ns or 0, self.imu.newest_ns or 0)
         return max((ns for ns in tracks_ns if dvl_ns < ns <= dvl_ns + self._max_jump_ns), default=dvl_ns)
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Whether a sample that has just come lags other streams by more than one may even if its clock is wrong."""
+        self.reached_ns = max(self.reached_ns, self.horizon_ns)
+        return stamp_ns < self.reached_ns - self.lag_ns
 
     def _is_decided(self, track: Track, stamp_ns: int, horizon_ns: int) -> bool:
         """Whether a row need not wait for a track any more; if it must, note for what and until when."""
@@ -373,8 +388,8 @@ class Aligner:
 
     def _orient(self, slot: int) -> None:
         rows = self.rows
-        bracket = self._imu.bracket(int(rows.stamps_ns[slot]))
-        attitude = _NO_ATTITUDE if bracket is None else _interpolated_attitude(self._imu, bracket)
+        bracket = self.imu.bracket(int(rows.stamps_ns[slot]))
+        attitude = _NO_ATTITUDE if bracket is None else _interpolated_attitude(self.imu, bracket)
         rows.attitude[slot] = attitude
         has_rate = attitude[4] == attitude[4]  # else nan
         if self._needs_turn_rate:
@@ -396,7 +411,7 @@ class Aligner:
             self.given[Needs.REFERENCE] += 1
 
     def _pair_with(self, slot: int, stamp_ns: int, bracket: Bracket) -> int:
-        rows, track = self.rows, self._reference
+        rows, track = self.rows, self.reference
         before, after, fraction = bracket
         values, unmeasured, frame = track.values[after], track.unmeasured[after], track.frames[after]
         weight, since_s, until_s = 1.0, 0.0, 0.0
@@ -422,6 +437,11 @@ class Aligner:
         rows.weight[slot] = weight
         rows.around_s[slot] = since_s, until_s
         return Pairing.PAIRED
+
+    def forget_old(self) -> None:
+        """Forget of reference and IMU what nobody asks for any more."""
+        self.reference.forget_old()
+        self.imu.forget_old()
 
     # ------------------------------------------------------------------ columns
 
@@ -490,7 +510,7 @@ class Aligner:
         events = Events.of(
             (dvl.arrival[chunk.dvl_at], reference.arrival[chunk.reference_at], imu.arrival[chunk.imu_at]),
             (chunk.dvl_ns, chunk.reference_ns, chunk.imu_ns),
-            (self.orders[Stream.DVL].last_ns, self._reference.newest_ns, self._imu.newest_ns),
+            (self.orders[Stream.DVL].last_ns, self.reference.newest_ns, self.imu.newest_ns),
             self._max_jump_ns,
         )
         if not len(events.arrival):  # nothing that would let rows go on
@@ -501,7 +521,15 @@ class Aligner:
         if decisions is None:
             return False
         self._count_columns(screened, chunk, decisions, events)
-        self._append_columns(screened, chunk)
+        reached_ns = np.maximum(np.maximum.accumulate(events.horizon_ns), self.reached_ns)
+        self.reached_ns = int(reached_ns[-1])
+        late_before_ns = reached_ns - self.lag_ns
+        late = (
+            chunk.dvl_ns < late_before_ns[events.dvl_at],
+            chunk.reference_ns < late_before_ns[events.reference_at],
+            chunk.imu_ns < late_before_ns[events.imu_at],
+        )
+        self._append_columns(screened, chunk, late)
         n_events = len(events.horizon_ns)
         n_judged, n_oriented, n_paired = self.n_judged, self.n_oriented, self.n_paired
         if not self._needs_turn_rate:
@@ -510,8 +538,6 @@ class Aligner:
         self._orient_columns(n_oriented, events.imu_ns[decisions.oriented_at[:known]])
         known = int(np.searchsorted(decisions.paired_at, n_events))
         self._pair_columns(n_paired, events.reference_ns[decisions.paired_at[:known]])
-        self._reference.forget_old()
-        self._imu.forget_old()
         self._deadline_ns = LONG_AGO_NS  # what waits now is looked at with the next sample, whatever it is
         return True
 
@@ -522,12 +548,12 @@ class Aligner:
         stamps_ns = np.concatenate([rows.stamps_ns[waiting - rows.base : rows.size], chunk.dvl_ns])
         since = np.concatenate([np.zeros(len(stamps_ns) - len(chunk.dvl_ns), dtype=np.intp), events.dvl_at])
         to_orient, to_pair = self.n_oriented - waiting, self.n_paired - waiting
-        oriented_at = self._imu.decided_in(
+        oriented_at = self.imu.decided_in(
             stamps_ns, since, chunk.imu_ns, events.imu_at, events.imu_ns, events.horizon_ns
         )
         oriented_at[:to_orient] = 0
         oriented_at = np.maximum.accumulate(oriented_at)
-        alone = self._reference.decided_in(
+        alone = self.reference.decided_in(
             stamps_ns, since, chunk.reference_ns, events.reference_at, events.reference_ns, events.horizon_ns
         )
         paired_at = np.maximum(alone, oriented_at) if self._needs_turn_rate else alone
@@ -549,7 +575,7 @@ class Aligner:
         self, chunk: OrderedStreams, stamps_ns: Stamps, decided_at: Index, events: Events
     ) -> Mask | None:
         """(N,) rows whose reference, once decided, is in an earth frame; None if none can be."""
-        track, n_events = self._reference, len(events.horizon_ns)
+        track, n_events = self.reference, len(events.horizon_ns)
         frames = np.concatenate([track.frames[track.begin : track.size], chunk.frames])
         if not len(frames) or (frames == _BODY).all():
             return None
@@ -585,12 +611,13 @@ class Aligner:
             before = decided[np.searchsorted(decisions.paired_at, at)]
             _add(self.tally["reference"], "late", int(np.count_nonzero(stamps_ns < before)))
 
-    def _append_columns(self, screened: ScreenedStreams, chunk: OrderedStreams) -> None:
+    def _append_columns(self, screened: ScreenedStreams, chunk: OrderedStreams, late: tuple[Mask, Mask, Mask]) -> None:
         dvl, reference, _ = screened.streams
         if len(chunk.reference_ns):
-            track, at = self._reference, chunk.reference_at
+            track, at = self.reference, chunk.reference_at
             slots = track.extend(len(at))
             track.stamps_ns[slots] = chunk.reference_ns
+            track.late[slots] = late[1]
             track.values[slots] = screened.reference_values[at]
             track.frames[slots] = reference.frames[at]
             track.values[slots, :3] -= self._velocity_offset[reference.frames[at]]
@@ -600,9 +627,10 @@ class Aligner:
             track.unmeasured[slots] = screened.reference_unmeasured[at] | never
             self.orders[Stream.REFERENCE].last_ns = int(chunk.reference_ns[-1])
         if len(chunk.imu_ns):
-            slots = self._imu.extend(len(chunk.imu_ns))
-            self._imu.stamps_ns[slots] = chunk.imu_ns
-            self._imu.values[slots, :7] = screened.imu_values[chunk.imu_at]
+            slots = self.imu.extend(len(chunk.imu_ns))
+            self.imu.stamps_ns[slots] = chunk.imu_ns
+            self.imu.late[slots] = late[2]
+            self.imu.values[slots, :7] = screened.imu_values[chunk.imu_at]
             self.orders[Stream.IMU].last_ns = int(chunk.imu_ns[-1])
         n_messages = self._n_messages
         self._n_messages += len(dvl)
@@ -613,6 +641,7 @@ class Aligner:
         rows, at, stamps_ns = self.rows, chunk.dvl_at, chunk.dvl_ns
         slots = rows.extend(len(at))
         rows.stamps_ns[slots] = stamps_ns
+        rows.late[slots] = late[0]
         rows.row[slots] = n_messages + at
         rows.velocity_dvl[slots] = dvl.values[at]
         rows.covariance[slots] = screened.dvl_covariance[at]
@@ -656,7 +685,7 @@ class Aligner:
 
     def _orient_columns(self, first: int, newest_ns: Stamps) -> None:
         """Orient rows from one on; newest_ns: stamp of the newest IMU sample when each was decided."""
-        n, rows, track = len(newest_ns), self.rows, self._imu
+        n, rows, track = len(newest_ns), self.rows, self.imu
         if not n:
             return
         at = slice(first - rows.base, first + n - rows.base)
@@ -681,7 +710,7 @@ class Aligner:
 
     def _pair_columns(self, first: int, newest_ns: Stamps) -> None:
         """Pair rows from one on; newest_ns: stamp of the newest reference when each was decided."""
-        n, rows, track = len(newest_ns), self.rows, self._reference
+        n, rows, track = len(newest_ns), self.rows, self.reference
         if not n:
             return
         at = slice(first - rows.base, first + n - rows.base)

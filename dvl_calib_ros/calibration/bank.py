@@ -74,7 +74,7 @@ class Assembler:
         # by how many of its rows are left where axes of the reference are not measured
         self._gates = np.array(
             [
-                [_gate(max(model.n_measurement - dropped, 1), parameters) for dropped in range(N_MEASUREMENT)]
+                [gate_of(max(model.n_measurement - dropped, 1), parameters) for dropped in range(N_MEASUREMENT)]
                 for model in self.models
             ]
         )
@@ -126,7 +126,8 @@ class Assembler:
         for index, model in enumerate(self.models):
             z_model, h_model = model.linearise(seen)
             z[index, :, : model.n_measurement] = z_model
-            h[index, :, : model.n_measurement, : model.n_state] = h_model
+            # a model that extends another has columns for what that has; the rest is not shown sample by sample
+            h[index, :, : model.n_measurement, : h_model.shape[2]] = h_model
         usable = ~self._needs_prior[:, None] | prior_known
         noise, gate = self._noise(seen), self._gates[:, :1]
         if seen.unmeasured is not None:
@@ -415,7 +416,7 @@ def prior(model: Model, parameters: Parameters) -> GaussianState:
     return GaussianState(np.zeros(model.n_state), np.diag(np.square(std)))
 
 
-def _gate(rows: float, parameters: Parameters) -> float:
+def gate_of(rows: float, parameters: Parameters) -> float:
     """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
     if parameters.gate_probability in (0.0, 1.0):
         return float("inf")
@@ -428,7 +429,7 @@ def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float
     Gated samples are not in the mean, so it is that of a chi-square variable cut off at the gate:
     E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal.
     """
-    m, gate = rows, _gate(rows, parameters)
+    m, gate = rows, gate_of(rows, parameters)
     inside = chdtr(m, gate)
     mean = m * chdtr(m + 2, gate) / inside
     variance = m * (m + 2) * chdtr(m + 4, gate) / inside - mean**2

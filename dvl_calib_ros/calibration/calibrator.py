@@ -14,19 +14,23 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from .alignment import Aligner
-from .bank import ModelBank, nis_bounds
+from .bank import ModelBank, ModelCounts, gate_of, nis_bounds, prior
+from .delay_filter import DelayFilter
 from .folds import Moments, folds_of
 from .frames import Array, Vector
-from .history import Counts, Standing, StateTrace
+from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
-from .models import MODELS, Needs
+from .models import LINEAR_MODELS, MODELS, Model, Needs
 from .observability import convergence, observability
 from .observe import Observer
 from .parameters import ParameterError, Parameters
 from .results import Estimate, Result
-from .samples import AlignedBlock, DvlSample, ImuSample, Mask, Pairing, ReferenceSample, Stream, Streams
+from .samples import AlignedBlock, DvlSample, ImuSample, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
 from .verification import Verification, held_out_error, verify
+
+# DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
+COPIED_AT_ONCE = 64
 
 _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.NOTHING: lambda block: block.usable,
@@ -83,7 +87,18 @@ class Calibrator:
     def _start(self) -> None:
         self.selection = Selection()
         self._n_selected = 0  # rows that the selection knows of
-        self._bank = ModelBank(tuple(MODELS.values()), self.parameters, self._initial, self._verified)
+        self._bank = ModelBank(LINEAR_MODELS, self.parameters, self._initial, self._verified)
+        extended = MODELS["G2"]
+        unknown = prior(extended, self.parameters)
+        self._delay = DelayFilter(
+            self.parameters,
+            self._aligner,
+            (self._initial or {}).get(extended.name) or unknown,
+            np.sqrt(np.diag(unknown.p)),
+            gate_of(extended.n_measurement, self.parameters),
+            self._on_block,
+            self._verified,
+        )
         self._moments = Moments()
         # by need, the number of the first row that the models have not had
         self._n_seen = dict.fromkeys(Needs, 0)
@@ -119,6 +134,7 @@ class Calibrator:
         """Take a stretch of a recording, all streams."""
         self._aligner.take(streams)
         self._advance()
+        self._aligner.forget_old()
 
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
@@ -127,6 +143,9 @@ class Calibrator:
     def _advance(self) -> None:
         """Let the selection know what is paired, and update the models if enough samples have come together."""
         aligner = self._aligner
+        if aligner.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
+            self._delay.take_rows()
+        self._delay.advance()
         if aligner.n_paired > self._n_selected:
             rows = aligner.rows
             at = slice(self._n_selected - rows.base, aligner.n_paired - rows.base)
@@ -135,6 +154,12 @@ class Calibrator:
         for needs in Needs:
             if aligner.given[needs] - self._bank.n_given(needs) >= self._block_size:
                 self._update(needs)
+
+    def _on_block(self, from_ns: int) -> None:
+        """Let the selection, and the trace, know what G2 says after another block."""
+        self.selection.extend(from_ns, self._delay.evidence)
+        if self._trace is not None:
+            self._delay.remember(from_ns)
 
     # ------------------------------------------------------------------ models
 
@@ -171,7 +196,7 @@ class Calibrator:
     def _forget_rows(self) -> None:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
-        done = min(self._n_selected, *self._n_seen.values())
+        done = min(self._n_selected, self._delay.n_taken, *self._n_seen.values())
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
                 self._on_rows(_own(rows.block(rows.begin + rows.base, done)))
@@ -222,8 +247,9 @@ class Calibrator:
         pairing["awaiting_reference"] = aligner.n_judged - aligner.n_paired
         pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
         counts["calibration"] = {"restarts": self.restarts}
-        for name in MODELS:
-            if restarted := self._bank.counts(name).restarted:
+        for name, model in MODELS.items():
+            tally = self._bank.counts(name) if model.extends is None else self._delay.counts
+            if restarted := tally.restarted:
                 counts["calibration"][f"{name} restarted"] = restarted
         return counts
 
@@ -273,18 +299,42 @@ class Calibrator:
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model."""
-        self._update(MODELS[name].needs)
+        model = MODELS[name]
+        if model.extends is not None:
+            return self._delay.state(self.state(model.extends))
+        self._update(model.needs)
         return self._bank.state(name)
 
-    def states_at(self, name: str, standing: Standing) -> tuple[GaussianState, Counts, Array]:
-        """One model at E moments of a `StateTrace`: states, samples used (E,), and the sum of νᵀS⁻¹ν over them (E,)."""
-        return self._bank.states_at(name, standing), *self._bank.counts_at(name, standing)
+    def _source(self, model: Model) -> str | None:
+        """The linear model whose estimate a model's is; None for a model of its own that claims more."""
+        if model.extends is None:
+            return model.name
+        return None if self._delay.claims else model.extends
+
+    def states_at(
+        self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps
+    ) -> tuple[GaussianState, Counts, Array]:
+        """One model after E rows of a trace, with their stamps (E,).
+
+        Returns states x (E, n), P (E, n, n), samples used (E,), and the sum of νᵀS⁻¹ν over them (E,).
+        """
+        model = MODELS[name]
+        base = model.extends or name
+        standing = trace.standing(model.needs, numbers)
+        state, (used, nis_sum) = self._bank.states_at(base, standing), self._bank.counts_at(base, standing)
+        if model.extends is None:
+            return state, used, nis_sum
+        return self._delay.remembered(stamps_ns, state, used, nis_sum)
+
+    def _counts(self, model: Model) -> ModelCounts:
+        source = self._source(model)
+        return self._delay.counts if source is None else self._bank.counts(source)
 
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
         model = MODELS[name or self.selected]
         state, covariance = self.state(model.name)
-        used, gated, mean_nis, rows, _ = self._bank.counts(model.name)
+        used, gated, mean_nis, rows, _ = self._counts(model)
         return Estimate(
             model=model.name,
             state=state,
@@ -302,13 +352,19 @@ class Calibrator:
         estimate = self.estimate(name)
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         self._update(Needs.REFERENCE)
-        held_out = held_out_error(
-            model,
-            self._bank.states_without_folds(name),
-            self._moments,
-            self.parameters.rotation_dvl_from_body,
-        )
-        return verify(model, state, estimate.convergence, held_out, self.parameters)
+        source = self._source(model)
+        if source is None:
+            held_out = self._delay.held_out_error()
+        else:
+            held_out = held_out_error(
+                MODELS[source],
+                self._bank.states_without_folds(source),
+                self._moments,
+                self.parameters.rotation_dvl_from_body,
+            )
+        counts = (estimate.used, estimate.gated)
+        suggestion = self._delay.coarse.suggestion() if model.aided else None
+        return verify(model, state, estimate.convergence, held_out, self.parameters, counts, suggestion)
 
     def result(self) -> Result:
         """Everything, as of now."""

@@ -5,8 +5,8 @@ state, ``z = H x + noise``, with the residual misalignment φ (DVL frame, rad) f
 last what it must know to see them (nuisance states, such as a current).
 
 Sources: M1-M7 from Yampolsky and Klein, "Information-Aided DVL Calibration" (M1, M2 baselines, M3, M4 IAC-G, M5-M7
-IAC-GF). G1, F1 and A1 are our own; their derivations are in the docstrings of `_g1`, `_f1` and `_a1`. All hold in any
-right-handed frame with x ahead.
+IAC-GF). G1, F1 and A1 are our own; their derivations are in the docstrings of `linearise_g1`, `_f1` and `_a1`. G2 is G1
+with more states, filtered by `delay_filter`. All hold in any right-handed frame with x ahead.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ class Model:
     reference's vertical velocity for a measurement, so does without where there is none (M3, M4 and G1 assume their
     own). rows_in_body: its three rows are those of the body, else those of the DVL. motion_is_noise: its noise is the
     vehicle's motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first
-    five states are those of the correction, see `correction_parameters`.
+    five states are those of the correction, see `correction_parameters`. extends: the model whose states its own begin
+    with, and which it equals while the data show nothing more; such a model is filtered by `DelayFilter`.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Model:
     vertical_from_reference: bool = False
     rows_in_body: bool = False
     in_correction_parameters: bool = False
+    extends: str | None = None
 
     @property
     def aided(self) -> bool:
@@ -149,7 +151,7 @@ def _m7(seen: Observations) -> Linearised:
 SCALE_SHOWN_FROM = 0.3
 
 
-def _g1(seen: Observations) -> Linearised:
+def linearise_g1(seen: Observations) -> Linearised:
     """z = Tᵀr' - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), -k] on ψ, κ, h; body frame.
 
     The models of the paper put the noisy GNSS velocity r into H: noise in a regressor pulls its coefficient, here the
@@ -181,7 +183,7 @@ def _g1(seen: Observations) -> Linearised:
     return r - measured, h
 
 
-def _g1_noise(seen: Observations) -> Array:
+def g1_noise(seen: Observations) -> Array:
     """Covariance of r': (I - k e_zᵀ) R, body frame."""
     r = seen.noise_in_body
     noise: Array = r - seen.heave_gain[:, :, None] * r[:, 2:3, :]
@@ -273,6 +275,13 @@ _SHOWN_WITHOUT = {
     "yaw": "motion ahead without sway: a straight leg, no current across",
     "scale": "a reference velocity (GNSS): without one this cannot be seen",
 }
+# What shows the states that only G2 has, by name.
+_SHOWN_TO_G2 = {
+    "lever_arm_x": "turns to both sides, or of different sharpness (needs angular velocity)",
+    "lever_arm_y": "turns to both sides, or of different sharpness (needs angular velocity)",
+    "lever_arm_z": "rolling and pitching: waves, or dives (needs angular velocity)",
+    "time_offset": "speeding up and slowing down, entering and leaving turns (needs angular velocity)",
+}
 _NOISY_REGRESSOR = "slow, or with a noisy receiver: noise in the reference pulls the scale down by about"
 
 
@@ -333,14 +342,31 @@ _TABLE = (
         wrong_when="a current or turns make sway; by construction it finds half the angle, and its σ is too small",
     ),
     Model(
-        "G1", Needs.REFERENCE, 3, _g1, _SHOWN_WITH_GNSS,
+        "G1", Needs.REFERENCE, 3, linearise_g1, _SHOWN_WITH_GNSS,
         assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
         wrong_when="trimmed by more than heave_offset_std, or heaving in long waves beyond motion_std",
         scale_axes=_SCALE_PER_AXIS,
         nuisance=(Nuisance("heave", "m/s", "heave_offset_std"),),
-        noise=_g1_noise,
+        noise=g1_noise,
         rows_in_body=True,
         in_correction_parameters=True,
+    ),
+    Model(
+        "G2", Needs.REFERENCE, 3, linearise_g1, _SHOWN_WITH_GNSS | _SHOWN_TO_G2,
+        assumes="as G1, with a DVL anywhere on the vehicle whose stamps are off by up to 3 s; needs angular velocity",
+        wrong_when="the delay changes along the run; a vehicle that bends",
+        scale_axes=_SCALE_PER_AXIS,
+        nuisance=(
+            Nuisance("heave", "m/s", "heave_offset_std"),
+            Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
+            Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
+            Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
+            Nuisance("time_offset", "s", "initial_std_time_offset"),
+        ),
+        noise=g1_noise,
+        rows_in_body=True,
+        in_correction_parameters=True,
+        extends="G1",
     ),
     Model(
         "F1", Needs.NOTHING, 2, _f1, _SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
@@ -367,3 +393,7 @@ _TABLE = (
 )  # fmt: skip
 
 MODELS: Mapping[str, Model] = {model.name: model for model in _TABLE}
+# Those that are filtered sample by sample.
+LINEAR_MODELS: tuple[Model, ...] = tuple(model for model in MODELS.values() if model.extends is None)
+# The model that extends another, by the name of that.
+EXTENDED_BY: Mapping[str, str] = {model.extends: name for name, model in MODELS.items() if model.extends is not None}

@@ -18,6 +18,8 @@ from .parameters import Parameters
 OBSERVED_SHARE = 0.5
 # A DVL axis with more than this share of the motion ahead has its scale shown by it.
 SHARE_AHEAD = 0.25
+# From here on a lever arm (m) and a delay (s) are fine: 5 cm at 10 degrees per second are 9 mm/s, 10 ms at 1 m/s² 10.
+FINE_STD = {"m": 0.05, "s": 0.01}
 _BODY_AXES = ("roll", "pitch", "yaw")
 
 
@@ -32,10 +34,10 @@ class Convergence(Enum):
 class Observability(NamedTuple):
     """One parameter of one model.
 
-    std: standard deviation (rad, or dimensionless). observed: the data has halved the prior's. axis: the body axis
-    (roll, pitch, yaw) that an angle's uncertainty turns about, or scale (across). missing: what to fly, '' once
-    observed. progress: share of the way from the prior's standard deviation (0) to the fine threshold (1), by its
-    logarithm.
+    std: standard deviation (rad, dimensionless, m or s). observed: the data has halved the prior's. axis: the body axis
+    (roll, pitch, yaw) that an angle's uncertainty turns about, scale (across), or the name in words. missing: what to
+    fly, '' once observed. progress: share of the way from the prior's standard deviation (0) to the fine threshold (1),
+    by its logarithm.
     """
 
     name: str
@@ -47,7 +49,7 @@ class Observability(NamedTuple):
 
 
 def observability(model: Model, covariance: Array, parameters: Parameters) -> tuple[Observability, ...]:
-    """One entry per error of the DVL that the model estimates, from its covariance (n, n).
+    """One entry per error of the DVL that the model estimates, and lever arm and delay, from its covariance (n, n).
 
     What the data lacks is a motion of the vehicle, so the cause is looked for in the body frame: with a DVL mounted
     at 45 degrees, a straight leg leaves φx and φy uncertain together, and both for want of roll.
@@ -66,6 +68,13 @@ def observability(model: Model, covariance: Array, parameters: Parameters) -> tu
             fine_std = parameters.fine_std_scale
         missing = "" if observed else model.shown_by[axis]
         entries.append(Observability(name, std, observed, axis, missing, _progress(std, prior_std[index], fine_std)))
+    for index, name in enumerate(model.state_names[model.n_errors :], start=model.n_errors):
+        if name in model.shown_by:  # no mere nuisance
+            std = math.sqrt(covariance[index, index])
+            observed = bool(std <= OBSERVED_SHARE * prior_std[index])
+            missing = "" if observed else model.shown_by[name]
+            progress = _progress(std, prior_std[index], FINE_STD[model.nuisance[index - model.n_errors].unit])
+            entries.append(Observability(name, std, observed, name.replace("_", " "), missing, progress))
     return tuple(entries)
 
 

@@ -273,6 +273,21 @@ class Parameters:
         low=1e-7,
         high=0.5,
     )
+    initial_std_lever_arm: float = _parameter(
+        2.0,
+        "Prior standard deviation of each component of what the lever arm is beside lever_arm (G2).",
+        unit="m",
+        low=1e-4,
+        high=100.0,
+    )
+    initial_std_time_offset: float = _parameter(
+        1.0,
+        "Prior standard deviation of what the DVL's time offset is beside dvl_time_offset (G2, which looks within "
+        "3.2 s).",
+        unit="s",
+        low=1e-4,
+        high=10.0,
+    )
     process_std_misalignment: float = _parameter(
         0.0,
         "Random walk of each misalignment angle.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +53,24 @@ class Estimate:
     def scale(self) -> Array:
         """δk (3,) per DVL axis, zero where not estimated."""
         return (MODELS[self.model].error_terms_from_state @ self.state)[3:]
+
+    def lever_arm(self, nominal: Sequence[float]) -> Array:
+        """Where the DVL is (3,) m from the reference point, body frame: as the parameters say, and what was found."""
+        return np.asarray(nominal, dtype=float) + self._beyond("lever_arm_x", "lever_arm_y", "lever_arm_z")
+
+    def dvl_time_offset(self, nominal: float) -> float:
+        """By how much the DVL's stamps are late, s: as the parameters say, and what was found."""
+        return nominal + float(self._beyond("time_offset")[0])
+
+    def _beyond(self, *names: str) -> Array:
+        """States of these names, zero where the model has none."""
+        own = self.state_names
+        return np.array([self.state[own.index(name)] if name in own else 0.0 for name in names])
+
+    def std_of(self, *names: str) -> Array | None:
+        """Standard deviations of states of these names; None if the model has none of them."""
+        own = self.state_names
+        return self.std[[own.index(name) for name in names]] if set(names) <= set(own) else None
 
     def corrected_velocity(self, velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
         """Measured DVL velocities (..., 3) m/s -> corrected body velocities (..., 3) m/s."""

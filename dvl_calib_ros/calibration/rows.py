@@ -32,6 +32,7 @@ class Rows(Table):
         "unmeasured": (np.uint8, ()),
         "weight": (np.float64, ()),
         "around_s": (np.float64, (2,)),
+        "late": (np.bool_, ()),
     }
     stamps_ns: Stamps
     row: Stamps
@@ -47,6 +48,7 @@ class Rows(Table):
     unmeasured: Codes
     weight: Array
     around_s: Array
+    late: Mask
 
     def await_partners(self, at: int | slice) -> None:
         """Fill in what is not known yet."""
@@ -109,7 +111,8 @@ NO_DECISIONS = Decisions(*(np.zeros(0, dtype=kind) for kind in (np.intp, np.intp
 
 class Events(NamedTuple):
     """The T admitted samples in their order of arrival: at which events those of each stream are, and what is known
-    after each event: newest stamps of reference and IMU (`LONG_AGO_NS`: none), and the horizon (`_horizon_ns`)."""
+    after each event: newest stamps of reference and IMU (`LONG_AGO_NS`: none), and the horizon, see
+    `Aligner.horizon_ns`."""
 
     arrival: Stamps
     dvl_at: Index

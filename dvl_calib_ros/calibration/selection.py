@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
+import numpy as np
+
+from .models import EXTENDED_BY
 from .parameters import AUTO, IAC, Parameters
 from .samples import Mask, Stamps
 
@@ -68,16 +72,60 @@ class GnssAvailability:
         return f"GNSS is {state}, {change}; waiting for gnss_hysteresis"
 
 
+class Evidence(NamedTuple):
+    """For the model that extends another: chi-square of what only it has, and what that is, in words."""
+
+    chi_square: float
+    found: str
+
+
+NO_EVIDENCE = Evidence(0.0, "")
+# Chi-square (four degrees of freedom at most) from which the extending model is taken, and below which it is left: by
+# chance 30 comes once in 200 000 times, and an effect of a few σ that comes and goes does not flap the output.
+EXTENDED_FROM, EXTENDED_UNTIL = 30.0, 15.0
+
+
+# Evidence comes with every block of 10 s in which there is a reference; without it for so long, there is none.
+EVIDENCE_HOLDS_NS = 12_000_000_000
+
+
 class Selection:
     """The selected model over time."""
 
     def __init__(self) -> None:
         self.gnss = GnssAvailability()
         self.segments: list[Segment] = []
+        self._evidence = NO_EVIDENCE
+        self._extended = False
+        self._referenced_until_ns = 0
+        # what is to be taken note of once DVL samples reach its stamp
+        self._coming: deque[tuple[int, Evidence]] = deque()
+
+    def extend(self, from_ns: int, evidence: Evidence) -> None:
+        """From this stamp on, go by this evidence for the model that extends the one with GNSS."""
+        self._coming.append((from_ns, evidence))
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         """Take note of DVL samples (N,), in order of stamps, and of whether they were paired."""
+        while self._coming and len(stamps_ns) and self._coming[0][0] <= stamps_ns[-1]:
+            from_ns, evidence = self._coming.popleft()
+            at = int(np.searchsorted(stamps_ns, from_ns))
+            if at:
+                self._update(stamps_ns[:at], paired[:at], parameters)
+            stamps_ns, paired = stamps_ns[at:], paired[at:]
+            self._evidence = evidence
+            self._referenced_until_ns = from_ns + EVIDENCE_HOLDS_NS
+            extended = evidence.chi_square >= (EXTENDED_UNTIL if self._extended else EXTENDED_FROM)
+            if extended != self._extended:
+                self._extended = extended
+                self.record(int(stamps_ns[0]), parameters)
+        if len(stamps_ns):
+            self._update(stamps_ns, paired, parameters)
+
+    def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
+        if self._extended:  # which finds references that pairing, at the stamps as they are, does not
+            paired = paired | (stamps_ns < self._referenced_until_ns)
         if self.segments and self.gnss.stays_with(stamps_ns, paired):
             return
         for stamp_ns, is_paired in zip(stamps_ns.tolist(), paired.tolist(), strict=True):
@@ -100,12 +148,20 @@ class Selection:
             aided, unaided = parameters.gnss_model, parameters.gnss_free_model
         else:
             return parameters.model
-        return aided if self.gnss.available else unaided
+        if not self.gnss.available:
+            return unaided
+        if parameters.model == AUTO and self._extended:
+            return EXTENDED_BY.get(aided, aided)
+        return aided
 
     def reason(self, parameters: Parameters) -> str:
         """Why it is that model."""
-        follows_gnss = parameters.model in (AUTO, IAC)
-        return f"{parameters.model}: {self.gnss.reason}" if follows_gnss else "set by parameter model"
+        if parameters.model not in (AUTO, IAC):
+            return "set by parameter model"
+        reason = f"{parameters.model}: {self.gnss.reason}"
+        if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
+            return reason
+        return f"{reason}; {parameters.gnss_model} does not explain the data, which show {self._evidence.found}"
 
 
 def published_models(parameters: Parameters) -> tuple[str, str]:

@@ -18,6 +18,8 @@ from .tables import Table
 
 # Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
 LONG_AGO_NS = -(2**62)
+# The past that is kept for who needs more than pairing does, at most: a DVL that is silent must not fill the memory.
+LONGEST_NS = 600_000_000_000
 
 
 class Stamped(Protocol):
@@ -144,7 +146,8 @@ class Track(Table):
 
     values: what interpolates linearly or, of an IMU, the quaternion and the angular velocity, see samples.py; of a
     reference velocity (3), covariance (9, nan where not given). frames, unmeasured: of a reference, its frame (a place
-    in `FRAMES`) and a bit for every axis that it does not measure.
+    in `FRAMES`) and a bit for every axis that it does not measure. late: it came when other streams were further ahead
+    than one may lag another.
     """
 
     LAYOUT: ClassVar = {
@@ -152,11 +155,13 @@ class Track(Table):
         "values": (np.float64, (12,)),
         "frames": (np.uint8, ()),
         "unmeasured": (np.uint8, ()),
+        "late": (np.bool_, ()),
     }
     stamps_ns: Stamps
     values: Array
     frames: Codes
     unmeasured: Codes
+    late: Mask
 
     def __init__(self, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
         """Make an empty one.
@@ -168,6 +173,8 @@ class Track(Table):
         self.max_gap_ns = max_gap_ns
         self.max_latency_ns = max_latency_ns
         self.retention_ns = retention_ns
+        # stamp from which on nothing is forgotten before LONGEST_NS; None for no such wish
+        self.needed_from_ns: int | None = None
 
     @property
     def newest_ns(self) -> int | None:
@@ -183,7 +190,9 @@ class Track(Table):
     def forget_old(self) -> None:
         """Forget what no time that may still be asked for needs."""
         if self.size > self.begin:
-            oldest_ns = self.stamps_ns[self.size - 1] - self.retention_ns - self.max_gap_ns
+            oldest_ns = int(self.stamps_ns[self.size - 1]) - self.retention_ns - self.max_gap_ns
+            if self.needed_from_ns is not None:
+                oldest_ns = min(oldest_ns, max(self.needed_from_ns, int(self.stamps_ns[self.size - 1]) - LONGEST_NS))
             self.begin += int(np.searchsorted(self.stamps_ns[self.begin : self.size], oldest_ns))
 
     def decided(self, stamp_ns: int, horizon_ns: int) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 SMALLEST = 128
 
@@ -53,6 +54,12 @@ class Table:
     def forget_before(self, slot: int) -> None:
         """Give up the rows before a slot."""
         self.begin = max(self.begin, slot)
+
+    def between(self, column: NDArray[np.int64], first: int, end: int) -> slice:
+        """Slots of the rows where one of the columns, increasing, is from `first` on and below `end`."""
+        held = column[self.begin : self.size]
+        start, stop = (np.searchsorted(held, (first, end)) + self.begin).tolist()
+        return slice(start, stop)
 
     def clear(self) -> None:
         """Give up all rows; numbers go on."""

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from .coarse_mounting import Suggestion
 from .error_model import CORRECTION_JACOBIAN, correction_matrix
 from .folds import Moments
 from .frames import Array
@@ -29,6 +30,12 @@ ENOUGH_SAMPLES = 20
 # A squared error that grows by more than so many times the estimate's variance is no chance (99 % of chi-square with
 # three degrees of freedom and more).
 WORSE_FROM = 4.0
+# A held-out error of so many times what is predicted is no noise that was claimed a little too small.
+SEVERAL = 3.0
+# One below this share of what the instruments claim is less than their noise: they then share it.
+IMPLAUSIBLE = 0.2
+# If more than this share of the samples is gated, the estimate is that of a minority.
+MOST_GATED = 0.5
 # Share of runs whose held-out error may by chance exceed what a true covariance predicts.
 CHANCE = 0.01
 
@@ -68,8 +75,14 @@ def held_out_error(
         corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
         noise += moments.noise[fold]
         calibration += _calibration_variance(covariance, moments.vv[fold], nominal)
-    sums = (uncorrected, corrected, noise + calibration, calibration)
-    return HeldOutError(samples, *(math.sqrt(max(total, 0.0) / samples) for total in sums))
+    return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
+
+
+def held_out_from_sums(samples: int, sums: Sequence[float] | Array) -> HeldOutError | None:
+    """From sums of squares (m/s)² in the order of `HeldOutError`'s fields; None if there is too little to judge by."""
+    if samples < ENOUGH_SAMPLES:
+        return None
+    return HeldOutError(samples, *(math.sqrt(max(float(total), 0.0) / samples) for total in sums))
 
 
 def _calibration_variance(covariance: Array, vv: Array, rotation_body_from_dvl: Array) -> float:
@@ -95,41 +108,87 @@ class Word(Enum):
 
 @dataclass(frozen=True)
 class Verification:
-    """The verdict on one model's calibration, with reasons (sentences, the decisive ones first)."""
+    """The verdict on one model's calibration, with reasons (sentences, the decisive ones first).
+
+    mounting: what there is to inspect about the mounting, '' for nothing: a good calibration may be of a bad one.
+    """
 
     model: str
     held_out: HeldOutError | None
     verdict: Word
     reasons: tuple[str, ...]
+    mounting: str = ""
 
 
 def verify(
-    model: Model, state: GaussianState, convergence: Convergence, held_out: HeldOutError | None, parameters: Parameters
+    model: Model,
+    state: GaussianState,
+    convergence: Convergence,
+    held_out: HeldOutError | None,
+    parameters: Parameters,
+    used_and_gated: tuple[int, int] | None = None,
+    suggestion: Suggestion | None = None,
 ) -> Verification:
-    """Judge an estimate of all the data (state) by its size and by what it did on held-out samples."""
+    """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
+
+    Parameters
+    ----------
+    model: Whose estimate it is.
+    state: Its state, x (n,) and P (n, n).
+    convergence: How far it is.
+    held_out: What it did on samples that it had not seen; None for too few.
+    parameters: The thresholds.
+    used_and_gated: How many samples it used, and threw out; None where that is not known.
+    suggestion: What configuration would fit, if the one given does not.
+
+    """
     findings = [
+        *_use_findings(used_and_gated),
+        *([(Word.REJECT, f"{suggestion.says}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
         _error_finding(held_out, parameters),
     ]
     findings.sort(key=lambda finding: _SEVERITY.index(finding[0]))
-    return Verification(model.name, held_out, findings[0][0], tuple(sentence for _, sentence in findings))
+    reasons = tuple(sentence for _, sentence in findings)
+    return Verification(model.name, held_out, findings[0][0], reasons, _to_inspect(model, state, parameters))
 
 
 Finding = tuple[Word, str]
 _SEVERITY = (Word.REJECT, Word.MARGINAL, Word.ACCEPT)
 
 
+def _use_findings(used_and_gated: tuple[int, int] | None) -> list[Finding]:
+    if used_and_gated is None:
+        return []
+    used, gated = used_and_gated
+    if not used:
+        return [(Word.REJECT, "no sample was used: there is nothing to apply")]
+    if gated > MOST_GATED * (used + gated):
+        return [
+            (Word.REJECT, f"{gated} of {used + gated} samples contradict it and were gated: it is that of the rest")
+        ]
+    return []
+
+
+def _angle_deg(model: Model, state: GaussianState) -> float:
+    return math.degrees(math.atan(float(np.linalg.norm((model.error_terms_from_state @ state.x)[:3]))))
+
+
+def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> str:
+    angle, from_deg = _angle_deg(model, state), math.degrees(parameters.accept_misalignment)
+    if angle < from_deg:
+        return ""
+    return f"inspect the mounting: it is {angle:.1f}° from mounting_rpy, {from_deg:.1f}° or more"
+
+
 def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Finding]:
     errors = model.error_terms_from_state @ state.x
-    angle = math.degrees(math.atan(float(np.linalg.norm(errors[:3]))))
-    accept, reject = math.degrees(parameters.accept_misalignment), math.degrees(parameters.reject_misalignment)
+    angle, reject = _angle_deg(model, state), math.degrees(parameters.reject_misalignment)
     findings = []
     if angle >= reject:
         remedy = "is mounting_rpy right, and are the frames?"
         findings.append((Word.REJECT, f"the misalignment is {angle:.1f}°, {reject:.1f}° or more: {remedy}"))
-    elif angle >= accept:
-        findings.append((Word.MARGINAL, f"the misalignment is {angle:.1f}°, {accept:.1f}° or more"))
     scale = float(np.abs(errors[3:]).max())
     if scale > parameters.max_scale_error:
         limit = 100.0 * parameters.max_scale_error
@@ -148,6 +207,18 @@ def _error_finding(held_out: HeldOutError | None, parameters: Parameters) -> Fin
     # where there is nothing to correct, correcting adds the estimate's own variance, give or take
     if corrected**2 - uncorrected**2 > WORSE_FROM * held_out.calibration**2:
         return Word.REJECT, f"{found}: the calibration makes it worse"
+    if corrected > SEVERAL * predicted:
+        return Word.REJECT, (
+            f"{found}, several times less: the configuration is wrong, or an effect is missing from the model "
+            "(dvl-calib diagnose looks for it)"
+        )
+    noise = predicted**2 - held_out.calibration**2
+    claimed = not math.isclose(noise, 3.0 * parameters.gnss_aided_std**2, rel_tol=1e-6)
+    if claimed and corrected < IMPLAUSIBLE * predicted:
+        return Word.REJECT, (
+            f"{found}: implausibly small. Was the DVL fused into the reference? Then that cannot judge it; take GNSS "
+            "alone"
+        )
     dof = 3 * held_out.samples
     by_chance = math.sqrt(float(chdtri(dof, CHANCE)) / dof)
     if corrected > predicted * parameters.max_error_ratio * by_chance:
@@ -167,6 +238,7 @@ def verification_document(verification: Verification) -> dict[str, Any]:
     return {
         "verdict": verification.verdict.value,
         "reasons": list(verification.reasons),
+        "mounting": verification.mounting,
         "held_out": None
         if held_out is None
         else {

@@ -49,6 +49,8 @@ def print_answer(out: Console, replayed: Replayed, discovery: Discovery) -> None
     reasons = "; ".join(verification.reasons)
     text = f"{advice} {_capital(reasons) if advice.endswith('.') else reasons}."
     out.print(f"[bold {colour}]{verification.verdict.value}[/]: {escape(text)}")
+    if verification.mounting:
+        out.print(escape(f"{_capital(verification.mounting)}."))
     out.print()
     out.print(escape(_headline(replayed)))
     out.print(_table(replayed))
@@ -111,6 +113,21 @@ def _table(replayed: Replayed) -> Table:
         ahead = float(parameters.rotation_dvl_from_body[:, 0] ** 2 @ estimate.scale)
         mark = " ?" if "scale" in unseen else ""
         table.add_row("scale", "0.00 %", f"{100 * ahead:+.2f} %", f"{100 * scale_std[0]:.2f} %{mark}")
+    arm = estimate.lever_arm(parameters.lever_arm)
+    arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
+    if arm_std is not None:
+        for index, axis in enumerate("xyz"):
+            mark = " ?" if f"lever arm {axis}" in unseen else ""
+            table.add_row(
+                f"lever arm {axis}", f"{parameters.lever_arm[index]:.2f} m", f"{arm[index]:+.2f} m",
+                f"{arm_std[index]:.2f} m{mark}",
+            )  # fmt: skip
+    offset_std = estimate.std_of("time_offset")
+    if offset_std is not None:
+        offset, mark = estimate.dvl_time_offset(parameters.dvl_time_offset), " ?" if "time offset" in unseen else ""
+        table.add_row(
+            "stamps late", f"{parameters.dvl_time_offset:.2f} s", f"{offset:+.2f} s", f"{offset_std[0]:.2f} s{mark}"
+        )
     return table
 
 
@@ -161,7 +178,8 @@ def origin(replayed: Replayed, discovery: Discovery) -> str:
 
     result, parameters = replayed.result, discovery.parameters
     rpy = rpy_from_rotation(result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body))
-    return f'<origin xyz="{numbers(parameters.lever_arm)}" rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
+    arm = [float(f"{value:.4g}") for value in result.estimate.lever_arm(parameters.lever_arm)]
+    return f'<origin xyz="{numbers(arm)}" rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
 
 
 def next_commands(

@@ -58,6 +58,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
     to_frame = quaternion_from_rotation(corrected @ FLU_FROM_FRD) if turned else quaternion
     verification = result.verifications.get(result.selected)
     parent, child = parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
+    lever_arm = estimate.lever_arm(parameters["lever_arm"]).tolist()
     return {
         "format": FORMAT,
         "software": f"dvl_calib_ros {__version__}",
@@ -73,10 +74,12 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
             "corrected_rpy": rpy.tolist(),
             "corrected_quaternion_xyzw": list(quaternion),
             "scale_error_xyz": estimate.scale.tolist(),
+            "lever_arm": lever_arm,
+            "dvl_time_offset": estimate.dvl_time_offset(parameters["dvl_time_offset"]),
             "dvl_data_axes": FRD if turned else FLU,
             "frame_id": parent,
             "child_frame_id": child,
-            "static_transform_publisher": _static_transform_publisher(parameters["lever_arm"], to_frame, parent, child),
+            "static_transform_publisher": _static_transform_publisher(lever_arm, to_frame, parent, child),
         },
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},

@@ -153,14 +153,20 @@ def _restart_advice(counts: Counts) -> list[Finding]:
 def _estimate_values(estimate: Estimate) -> dict[str, str]:
     values = {}
     model, std = MODELS[estimate.model], estimate.std
-    for value, entry in zip(estimate.state, estimate.observability, strict=False):
+    units = {each.name: each.unit for each in model.nuisance}
+    for entry in estimate.observability:
         name = entry.name
+        value = estimate.state[estimate.state_names.index(name)]
         factor, unit = (math.degrees(1.0), "deg") if name.startswith("phi") else (100.0, "%")
+        if name in units:
+            factor, unit = 1.0, units[name]
         values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
         values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
         values[f"progress {name} [%]"] = f"{100.0 * entry.progress:.1f}"
         values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"
     for index, nuisance in enumerate(model.nuisance, start=model.n_errors):
+        if nuisance.name in model.shown_by:
+            continue
         values[f"{nuisance.name} [{nuisance.unit}]"] = f"{estimate.state[index]:.4f}"
         values[f"std {nuisance.name} [{nuisance.unit}]"] = f"{std[index]:.4f}"
     low, high = estimate.nis_bounds

@@ -128,7 +128,7 @@ class Recorder:
         paired_ns, paired_velocity, reference_velocity = self._paired.columns((), (3,), (3,))
         return RunHistory(
             stamps_ns=np.append(stamps_ns[numbers], calibrator.last_ns or 0),
-            models={name: _model_history(name, calibrator, self.trace, numbers) for name in MODELS},
+            models={name: _model_history(name, calibrator, self.trace, numbers, stamps_ns[numbers]) for name in MODELS},
             paired_share=_share(np.column_stack([paired[at], decided[at]])) if len(at) else np.full(1, np.nan),
             dvl_ns=dvl_ns.astype(np.int64),
             dvl_velocity=dvl_velocity,
@@ -138,12 +138,14 @@ class Recorder:
         )
 
 
-def _model_history(name: str, calibrator: Calibrator, trace: StateTrace, numbers: Stamps) -> ModelHistory:
+def _model_history(
+    name: str, calibrator: Calibrator, trace: StateTrace, numbers: Stamps, stamps_ns: Stamps
+) -> ModelHistory:
     estimate = calibrator.estimate(name)
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
     states, stds, sums = [estimate.state[None]], [estimate.std[None]], [[(nis_sum, estimate.used)]]
     if len(numbers):
-        state, used, nis_sums = calibrator.states_at(name, trace.standing(MODELS[name].needs, numbers))
+        state, used, nis_sums = calibrator.states_at(name, trace, numbers, stamps_ns)
         states.insert(0, state.x)
         stds.insert(0, np.sqrt(np.diagonal(state.p, axis1=1, axis2=2)))
         sums.insert(0, list(zip(nis_sums.tolist(), used.tolist(), strict=True)))

@@ -155,11 +155,7 @@ def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
 
 def _axes(series: DiagnosisSeries) -> dict[str, str]:
     """Axes that the reference measures, with what they are called."""
-    return {
-        axis: where
-        for (axis, where), measured in zip(BODY_AXES.items(), series.measured, strict=True)
-        if measured
-    }
+    return {axis: where for (axis, where), measured in zip(BODY_AXES.items(), series.measured, strict=True) if measured}
 
 
 def _with_std(values: Array, std: Array, unit: str) -> str:

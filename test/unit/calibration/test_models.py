@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.bank import ModelBank, prior
 from dvl_calib_ros.calibration.error_model import correct, distort
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, skew
-from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
 
@@ -20,7 +20,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 MOUNTINGS = {"none": (0, 0, 0), "yaw45": (0, 0, np.pi / 4), "tilted": (0.1, -0.2, 0.8), "inverted": (np.pi, 0.1, 0)}
 FRAMES = {"flu": np.eye(3), "frd": FLU_FROM_FRD}
 PRIOR = np.array([0.12, -0.07])
-each_model = pytest.mark.parametrize("name", MODELS)
+each_model = pytest.mark.parametrize("name", [model.name for model in LINEAR_MODELS])
 each_mounting = pytest.mark.parametrize("mounting", MOUNTINGS)
 each_frame = pytest.mark.parametrize("frame", FRAMES)
 
@@ -139,7 +139,7 @@ def level_motion(seen, velocity_body):
     return replace(seen, velocity_dvl=level @ seen.rotation_dvl_from_body.T)
 
 
-@pytest.mark.parametrize("name", [name for name, model in MODELS.items() if model.aided])
+@pytest.mark.parametrize("name", [model.name for model in LINEAR_MODELS if model.aided])
 @each_mounting
 @each_frame
 def test_noiseless_errors_are_recovered(name, mounting, frame, rng):
@@ -190,7 +190,7 @@ def test_a_padded_model_in_the_bank_is_the_model_alone(name, rng):
     seen = observations(
         velocity_body + rng.normal(0, 0.1, (60, 3)), velocity_body, np.eye(3), noise=0.04 * np.eye(3)[None]
     )
-    bank = ModelBank(list(MODELS.values()), parameters)
+    bank = ModelBank(LINEAR_MODELS, parameters)
     bank.update(model.needs, np.arange(60), seen, np.ones(60), np.ones(60, dtype=bool))
     z, h = model.linearise(seen)
     m = model.n_measurement
@@ -203,7 +203,7 @@ def test_a_padded_model_in_the_bank_is_the_model_alone(name, rng):
         kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
     after = bank.standing(model.needs, 1)
-    k = [each.name for each in MODELS.values() if each.needs is model.needs].index(name)
+    k = [each.name for each in LINEAR_MODELS if each.needs is model.needs].index(name)
     np.testing.assert_allclose(after.x[0, k, : model.n_state], alone.x[0], atol=1e-12)
     np.testing.assert_allclose(after.p[0, k, : model.n_state, : model.n_state], alone.p[0], atol=1e-12)
 

@@ -124,7 +124,7 @@ def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, 
     ("arguments", "word", "reason"),
     [
         ({}, Word.ACCEPT, "0.050 with it"),
-        ({"degrees": 2.1}, Word.MARGINAL, "misalignment is 2.1"),
+        ({"degrees": 2.1}, Word.ACCEPT, "0.050 with it"),
         ({"degrees": 2.1, "accept_misalignment": 0.1}, Word.ACCEPT, "0.050 with it"),
         ({"degrees": 5.1}, Word.REJECT, "mounting_rpy"),
         ({"scale": 0.051}, Word.REJECT, "scale"),

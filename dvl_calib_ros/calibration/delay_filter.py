@@ -1,0 +1,489 @@
+"""G2 beside the other models: fed from the aligner, in blocks of time that stamps decide.
+
+A hypothesis of 3 s of delay needs what comes 3 s later, so G2's samples are used when the others' have long been. It
+reads what the aligner holds of the streams as soon as all that may belong to a block has come or is overdue; nobody
+waits for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from .alignment import Aligner
+from .bank import ModelCounts
+from .coarse_mounting import CoarseFits
+from .delay_bank import DelayBank, Posterior
+from .delayed_rows import (
+    BEYOND,
+    DELAY,
+    LEVER_ARM,
+    MARGIN_S,
+    N_STATE,
+    DvlColumns,
+    ImuColumns,
+    ReferenceColumns,
+    attitude_at,
+    binned,
+    delayed_rows,
+)
+from .error_model import CORRECTION_JACOBIAN, correction_matrix
+from .folds import FOLDS, folds_of
+from .frames import ENU_FROM_NED, Array, skew
+from .kalman import GaussianState
+from .observations import Assumptions, Observations
+from .parameters import Parameters
+from .samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
+from .selection import NO_EVIDENCE, Evidence
+from .streams import LONG_AGO_NS, LONGEST_NS, Track
+from .tables import Table
+from .verification import HeldOutError, held_out_from_sums
+
+BLOCK_NS = 10_000_000_000
+MARGIN_NS = round(MARGIN_S * 1e9)
+# What is kept for verification comes no faster than this, s: a velocity error is judged as well by five a second.
+KEPT_EVERY_S = 0.19
+# An axis that the reference does not measure says nothing: (m/s)²
+NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
+_BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
+_BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
+# No vehicle with a DVL turns faster, rad/s.
+FASTEST_TURN = 20.0
+AXES = ("x", "y", "z")
+# What is less than so many σ from nothing is not worth a word.
+NAMED_FROM = 4.0
+_BITS = np.array([1, 2, 4], dtype=np.uint8)
+
+
+class _Dvl(Table):
+    """Usable DVL samples that blocks to come need."""
+
+    LAYOUT: ClassVar = {"stamps_ns": (np.int64, ()), "velocity": (np.float64, (3,)), "covariance": (np.float64, (3, 3))}
+    stamps_ns: Stamps
+    velocity: Array
+    covariance: Array
+
+
+def _in_time(track: Track, from_ns: int, to_ns: int) -> Index:
+    """Slots of a track's samples between two stamps that came in time: live, the others come when a block is closed."""
+    span = track.between(track.stamps_ns, from_ns, to_ns)
+    return np.flatnonzero(~track.late[span]) + span.start
+
+
+class _Kept(NamedTuple):
+    """Thinned columns of one block, for verification; times in s since the epoch of `DelayFilter`."""
+
+    dvl: DvlColumns
+    noise_dvl: Array
+    reference: ReferenceColumns
+    imu: ImuColumns
+
+
+class DelayFilter:
+    """Feeds a `DelayBank` from an aligner; tells the aligner which past of its tracks is still wanted.
+
+    coarse: of the same samples, what configuration they fit. restarted: how often what was found was not finite, and
+    that of before is kept. n_taken: number of the first row of the aligner that it has not copied yet.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        aligner: Aligner,
+        prior: GaussianState,
+        unknown_std: Array,
+        gate: float,
+        on_block: Callable[[int], None],
+        verified: bool,
+    ) -> None:
+        """Start from the prior of G2's states.
+
+        unknown_std: (n,) of a prior without any calibration before it. gate: largest νᵀS⁻¹ν of a good sample. on_block:
+        told after each block of the stamp from which on DVL samples may go by it. verified: keep what hold-out needs.
+        """
+        self._parameters = parameters
+        self._aligner = aligner
+        self._on_block = on_block
+        rate = np.zeros(len(prior.x))
+        rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
+        self._bank = DelayBank(prior, unknown_std, gate, np.diag(rate) if rate.any() else None, verified)
+        # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
+        self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
+        self._template = Observations(
+            velocity_dvl=np.zeros((1, 3)),
+            reference_body=None,
+            lever_velocity=None,
+            rotation_dvl_from_body=parameters.rotation_dvl_from_body,
+            sway_heave=np.zeros(2),
+            assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
+        )
+        self.coarse = CoarseFits(parameters.rotation_dvl_from_body)
+        x, y, z = parameters.lever_arm
+        self._lever_arm = (x, y, z)
+        self._dvl = _Dvl()
+        self.n_taken = 0  # rows of the aligner that have been looked at
+        self._block_ns: int | None = None  # start of the next block
+        self._epoch_ns = 0
+        self._kept: list[_Kept] | None = [] if verified else None
+        self._posterior: Posterior | None = None
+        self._changed = False
+        self.restarted = 0
+        self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
+        for track in (aligner.reference, aligner.imu):
+            track.needed_from_ns = LONG_AGO_NS  # until the first block is known
+
+    @property
+    def counts(self) -> ModelCounts:
+        """Samples used, those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones."""
+        return ModelCounts(self._bank.used, self._bank.gated, self._bank.mean_nis, 3.0, self.restarted)
+
+    @property
+    def posterior(self) -> Posterior | None:
+        """What is known after the blocks so far; None before the first."""
+        if self._changed:
+            self._changed = False
+            try:
+                found = self._bank.posterior()
+            except np.linalg.LinAlgError:  # a configuration so wrong that the errors have no small angles
+                found = None
+            if found is not None and np.isfinite(found.state.x).all() and np.isfinite(found.state.p).all():
+                self._posterior = found
+            else:
+                self.restarted += 1
+        return self._posterior
+
+    @property
+    def claims(self) -> bool:
+        """Whether the data show anything of lever arm or delay."""
+        return self.posterior is not None and bool(self.posterior.shown[BEYOND].any())
+
+    def state(self, base: GaussianState) -> GaussianState:
+        """The state, given that of the model that this extends."""
+        posterior = self.posterior
+        return posterior.state if posterior is not None and self.claims else self.extended(base)
+
+    def extended(self, base: GaussianState) -> GaussianState:
+        """The state of the model that this one extends, with the prior of what it does not have."""
+        n, prior = len(base.x), self._bank.prior
+        p = prior.p.copy()
+        p[:n, :n] = base.p
+        return GaussianState(np.concatenate([base.x, prior.x[n:]]), p)
+
+    @property
+    def evidence(self) -> Evidence:
+        """How much speaks for lever arm and delay."""
+        posterior = self.posterior
+        if posterior is None or not self.claims:
+            return NO_EVIDENCE
+        x, p = posterior.state
+        at = np.flatnonzero(posterior.shown & _BEYOND)
+        chi_square = float(x[at] @ np.linalg.solve(p[np.ix_(at, at)], x[at]))
+        std = np.sqrt(np.diag(p))
+        found = []
+        arm = [index for index in at.tolist() if index != DELAY]
+        if any(abs(x[index]) > NAMED_FROM * std[index] for index in arm):
+            axes = " ".join(f"{AXES[index - LEVER_ARM.start]} {x[index]:+.2f} ± {std[index]:.2f}" for index in arm)
+            found.append(f"a lever arm of {axes} m")
+        if DELAY in at and abs(x[DELAY]) > NAMED_FROM * std[DELAY]:
+            late = "late" if x[DELAY] > 0.0 else "early"
+            found.append(f"DVL stamps {abs(x[DELAY]):.2f} ± {std[DELAY]:.2f} s {late}")
+        return Evidence(chi_square, " and ".join(found))
+
+    def remember(self, from_ns: int) -> None:
+        """Keep the state as of now, for `remembered`."""
+        used, _, mean_nis, _, _ = self.counts
+        state = posterior.state if (posterior := self.posterior) is not None and self.claims else None
+        self._remembered.append((from_ns, state, used, used * mean_nis if used else 0.0))
+
+    def remembered(
+        self, stamps_ns: Stamps, base: GaussianState, used: Stamps, nis_sum: Array
+    ) -> tuple[GaussianState, Stamps, Array]:
+        """The state at some stamps (E,); where nothing was claimed that of the model that this extends, extended.
+
+        base: x (E, n), P (E, n, n) of that, used and nis_sum (E,) its counts.
+        """
+        extended = [self.extended(GaussianState(*each)) for each in zip(*base, strict=True)]
+        used, nis_sum = used.copy(), nis_sum.copy()
+        at = np.searchsorted([row[0] for row in self._remembered], stamps_ns, side="right") - 1
+        for index, row in enumerate(at.tolist()):
+            if row >= 0 and (state := self._remembered[row][1]) is not None:
+                extended[index] = state
+                used[index], nis_sum[index] = self._remembered[row][2:]
+        return GaussianState(np.array([s.x for s in extended]), np.array([s.p for s in extended])), used, nis_sum
+
+    def advance(self) -> None:
+        """Take the blocks that are complete."""
+        aligner = self._aligner
+        if self._block_ns is None:
+            if aligner.first_ns is None:
+                return
+            self._block_ns = self._epoch_ns = aligner.first_ns // BLOCK_NS * BLOCK_NS
+            self._tell_needed()
+        last_ns = aligner.reached_ns - self._wait_ns - BLOCK_NS
+        if self._block_ns > last_ns:
+            return
+        self.take_rows()
+        while self._block_ns <= last_ns:
+            if self._take_block(self._block_ns):
+                self._changed = True
+                self._on_block(self._block_ns + BLOCK_NS + self._wait_ns)
+            self._block_ns = self._next_block(self._block_ns, last_ns)
+        self._tell_needed()
+        self._dvl.forget_before(
+            self._dvl.begin
+            + int(np.searchsorted(self._dvl.stamps_ns[self._dvl.begin : self._dvl.size], self._block_ns - MARGIN_NS))
+        )
+
+    def _next_block(self, block_ns: int, last_ns: int) -> int:
+        """The next block that has a reference; else the first one that is not complete."""
+        track = self._aligner.reference
+        stamps_ns = track.stamps_ns[track.begin : track.size]
+        at = int(np.searchsorted(stamps_ns, block_ns + BLOCK_NS))
+        incomplete_ns = last_ns // BLOCK_NS * BLOCK_NS + BLOCK_NS
+        if at == len(stamps_ns):
+            return incomplete_ns
+        return min(int(stamps_ns[at]) // BLOCK_NS * BLOCK_NS, incomplete_ns)
+
+    def _tell_needed(self) -> None:
+        assert self._block_ns is not None
+        for track in (self._aligner.reference, self._aligner.imu):
+            track.needed_from_ns = self._block_ns - MARGIN_NS
+
+    def take_rows(self) -> None:
+        """Copy the DVL samples that are judged, before the aligner forgets them."""
+        aligner, rows = self._aligner, self._aligner.rows
+        first, end = self.n_taken - rows.base, aligner.n_judged - rows.base
+        if end <= first:
+            return
+        at = np.flatnonzero((rows.verdict[first:end] != Verdict.FROZEN) & ~rows.late[first:end]) + first
+        slots = self._dvl.extend(len(at))
+        self._dvl.stamps_ns[slots] = rows.stamps_ns[at]
+        self._dvl.velocity[slots] = rows.velocity_dvl[at]
+        self._dvl.covariance[slots] = rows.covariance[at]
+        self.n_taken = aligner.n_judged
+
+    def _seconds(self, stamps_ns: Stamps) -> Array:
+        seconds: Array = (stamps_ns - self._epoch_ns) * 1e-9
+        return seconds
+
+    def _take_block(self, block_ns: int) -> bool:
+        """Take a block; whether it has samples."""
+        end_ns = block_ns + BLOCK_NS
+        reference, stamps_ns = self._reference(block_ns, end_ns)
+        if not len(stamps_ns) or self._dvl_is_silent(end_ns):
+            return False
+        dvl, noise_dvl = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
+        imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
+        self._compare_coarsely(block_ns, end_ns, dvl, imu)
+        if self._kept is not None:
+            self._keep(block_ns, end_ns, dvl, noise_dvl, reference, imu)
+        if len(dvl.times) < 6 or len(imu.times) < 2:
+            return False
+        p = self._parameters
+        rows = delayed_rows(
+            DvlColumns(*binned(*dvl)),
+            reference,
+            imu,
+            noise_dvl=noise_dvl,
+            template=self._template,
+            lever_arm=self._lever_arm,
+            min_speed=p.min_speed,
+            max_turn_rate=p.max_turn_rate,
+            imu_gap_s=p.imu_timeout,
+        )
+        self._bank.add(rows, folds_of(stamps_ns[rows.index], p), BLOCK_NS * 1e-9)
+        return len(rows) > 0
+
+    def _dvl_is_silent(self, stamp_ns: int) -> bool:
+        """Whether the DVL stops here for so long that tracks forget what was before."""
+        stamps_ns = self._dvl.stamps_ns[self._dvl.begin : self._dvl.size]
+        at = int(np.searchsorted(stamps_ns, stamp_ns))
+        return at == len(stamps_ns) or int(stamps_ns[at]) - stamp_ns > LONGEST_NS // 2
+
+    def _compare_coarsely(self, block_ns: int, end_ns: int, dvl: DvlColumns, imu: ImuColumns) -> None:
+        """Give the block's references, as their messages had them, to `coarse`."""
+        track = self._aligner.reference
+        at = _in_time(track, block_ns, end_ns)
+        at = at[thinned(track.stamps_ns[at])]
+        times, raw = self._seconds(track.stamps_ns[at]), track.values[at, :3]
+        if len(dvl.times) < 2:
+            return
+        velocity = np.column_stack([np.interp(times, dvl.times, column) for column in dvl.velocity.T])
+        rotation, oriented = attitude_at(imu, times, self._parameters.imu_timeout)
+        inside = (times >= dvl.times[0]) & (times <= dvl.times[-1])
+        moving = inside & ((velocity**2).sum(axis=1) >= self._parameters.min_speed**2)
+        unmeasured = track.unmeasured[at] != 0
+        for code in np.unique(track.frames[at]).tolist():
+            for has_attitude in (True, False):
+                use = moving & (track.frames[at] == code) & (oriented == has_attitude) & ~unmeasured
+                if use.any():
+                    self.coarse.add(FRAMES[code], raw[use], rotation[use] if has_attitude else None, velocity[use])
+
+    def _dvl_columns(self, from_ns: int, to_ns: int) -> tuple[DvlColumns, Array]:
+        """DVL samples between two stamps, and their mean covariance (3, 3)."""
+        table = self._dvl
+        at = table.between(table.stamps_ns, from_ns, to_ns)
+        covariance = table.covariance[at]
+        given = ~np.isnan(covariance[:, 0, 0])
+        noise: Array = np.eye(3) * self._parameters.gnss_free_std**2
+        if given.any() and self._parameters.use_message_covariance:
+            noise = covariance[given].mean(axis=0)
+        return DvlColumns(self._seconds(table.stamps_ns[at]), table.velocity[at]), noise
+
+    def _imu(self, from_ns: int, to_ns: int) -> ImuColumns:
+        track = self._aligner.imu
+        at = _in_time(track, from_ns, to_ns)
+        values = track.values[at]
+        rates = np.where(np.abs(values[:, 4:7]) < FASTEST_TURN, values[:, 4:7], np.nan)
+        return ImuColumns(self._seconds(track.stamps_ns[at]), values[:, :4], rates)
+
+    def _reference(self, from_ns: int, to_ns: int) -> tuple[ReferenceColumns, Stamps]:
+        """References between two stamps, thinned, and their stamps."""
+        track = self._aligner.reference
+        at = _in_time(track, from_ns, to_ns)
+        at = at[thinned(track.stamps_ns[at])]
+        values, frames = track.values[at], track.frames[at]
+        noise = values[:, 3:12].reshape(-1, 3, 3)
+        given = ~np.isnan(noise[:, 0, 0]) & self._parameters.use_message_covariance
+        noise = np.where(given[:, None, None], noise, np.eye(3) * self._parameters.gnss_aided_std**2)
+        velocity, ned = values[:, :3], frames == _NED
+        if track.unmeasured[at].any():
+            axes = (track.unmeasured[at, None] & _BITS) != 0
+            velocity = np.where(axes, 0.0, velocity)
+            noise = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise) + np.eye(3) * np.where(
+                axes[:, :, None], NOT_MEASURED, 0.0
+            )
+        if ned.any():
+            velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
+            noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
+        stamps_ns = track.stamps_ns[at].copy()
+        return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY), stamps_ns
+
+    # ------------------------------------------------------------------ verification
+
+    def _keep(
+        self,
+        block_ns: int,
+        end_ns: int,
+        dvl: DvlColumns,
+        noise_dvl: Array,
+        reference: ReferenceColumns,
+        imu: ImuColumns,
+    ) -> None:
+        """Keep a block's own columns, thinned."""
+        assert self._kept is not None
+        from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
+        first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
+        at = first + _thinned_seconds(dvl.times[first:last])
+        own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
+        first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
+        at = first + _thinned_seconds(imu.times[first:last])
+        self._kept.append(
+            _Kept(own, noise_dvl, reference, ImuColumns(imu.times[at], imu.orientation[at], imu.angular_velocity[at]))
+        )
+
+    def held_out_error(self) -> HeldOutError | None:
+        """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
+
+        As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
+        less its delay, and the lever arm away from the reference point.
+        """
+        if not self._kept:
+            return None
+        recording = _Recording.of(self._kept)
+        p = self._parameters
+        folds = folds_of(np.round(recording.dvl.times * 1e9).astype(np.int64) + self._epoch_ns, p)
+        nominal = np.zeros(len(self._bank.prior.x))
+        sums = np.zeros(4)
+        samples = 0
+        for fold in range(FOLDS):
+            at = np.flatnonzero(folds == fold)
+            try:
+                state = self._bank.without_fold(fold)
+            except np.linalg.LinAlgError:  # as in `posterior`
+                return None
+            before = recording.errors(at, nominal, p)
+            after = recording.errors(at, state.x, p)
+            both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
+            jacobian = after.jacobian[both]
+            calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
+            noise = after.noise[both].sum()
+            squares = [(each.error[both] ** 2).sum() for each in (before, after)]
+            sums += [*squares, noise + calibration, calibration]
+            samples += int(np.count_nonzero(both))
+        return held_out_from_sums(samples, sums)
+
+
+class _Errors(NamedTuple):
+    """Of N DVL samples: reference less what the DVL says it is (N, 3) m/s, nan where there is none; its derivative by
+    the state (N, 3, n); and the variance that noise gives it (N,), summed over the axes."""
+
+    error: Array
+    jacobian: Array
+    noise: Array
+
+
+class _Recording(NamedTuple):
+    """All that was kept."""
+
+    dvl: DvlColumns
+    noise_dvl: Array
+    reference: ReferenceColumns
+    imu: ImuColumns
+
+    @staticmethod
+    def of(kept: list[_Kept]) -> _Recording:
+        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
+        noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
+        reference = zip(*(each.reference for each in kept), strict=True)
+        imu = zip(*(each.imu for each in kept), strict=True)
+        return _Recording(
+            dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
+        )
+
+    def errors(self, at: Index, state: Array, p: Parameters) -> _Errors:
+        """Errors of some DVL samples with a state (n,), interpolated as pairing does."""
+        n = len(at)
+        times, v = self.dvl.times[at] - state[DELAY], self.dvl.velocity[at]
+        stamps = self.reference.times
+        after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+        gap = stamps[after] - stamps[after - 1]
+        part = ((times - stamps[after - 1]) / gap)[:, None]
+        g0, g1 = self.reference.velocity[after - 1], self.reference.velocity[after]
+        in_body = self.reference.in_body[after]
+        rotation, oriented = attitude_at(self.imu, times, p.imu_timeout)
+        body_from_reference = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+        body = np.matmul(body_from_reference, (g0 + (g1 - g0) * part)[..., None])[..., 0]
+        rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
+        lever = np.array(p.lever_arm) + state[LEVER_ARM]
+        t = p.rotation_dvl_from_body
+        errors = np.array([*state[:3], *state[3:5], 0.0])
+        error = body + np.cross(rates, lever) - v @ correction_matrix(errors[:3], errors[3:], t).T
+        found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
+        found &= (v**2).sum(axis=1) >= p.min_speed**2
+        body_noise = body_from_reference @ self.reference.noise[after] @ body_from_reference.swapaxes(1, 2)
+        variance = np.diagonal(body_noise, axis1=1, axis2=2)
+        measured = variance < MEASURED_BELOW
+        error[~measured] = 0.0
+        error[~found] = np.nan
+        jacobian = np.zeros((n, 3, len(state)))
+        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
+        jacobian[:, :, LEVER_ARM] = skew(rates)
+        jacobian[:, :, DELAY] = -np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
+        jacobian[~measured] = 0.0
+        noise = np.where(measured, variance + self.noise_dvl[at, None] / 3.0, 0.0).sum(axis=1)
+        return _Errors(error, jacobian, noise)
+
+
+def thinned(stamps_ns: Stamps) -> Index:
+    """Those of increasing stamps that are at least KEPT_EVERY_S apart."""
+    return _thinned_seconds((stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0))
+
+
+def _thinned_seconds(times: Array) -> Index:
+    if len(times) < 2 or np.diff(times).min() >= KEPT_EVERY_S:
+        return np.arange(len(times))
+    bins = np.floor(times / KEPT_EVERY_S)
+    return np.flatnonzero(np.diff(bins, prepend=bins[0] - 1.0))

@@ -1,0 +1,298 @@
+"""What G2 compares: every reference velocity with the DVL's at each of a row of delays.
+
+The DVL measures, at the true time s, v(s) + ω(s) × l of the body, and stamps it s + τ. Of a reference sample at s, body
+velocity and angular velocity are those of s whatever τ is, with its noise in it once; only the DVL's velocity is read
+at s + τ, where it is 20 times less noisy than GNSS. So hypotheses of τ are told apart by the same reference noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from .frames import Array, Vector, rotation_from_quaternion, skew
+from .local_motion import local_fit, reach_at, spacing_at
+from .models import g1_noise, linearise_g1
+from .observations import Observations
+from .samples import Index, Mask
+
+# Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
+# (0.1 m/s² changing by 0.3 m/s³ bends by 1.5 mm/s).
+DELAYS_S: Array = np.arange(-16, 17) * 0.2
+STEP_S = 0.2
+# Samples at least as dense as this tell their noise apart from the vehicle's motion, s.
+NOISE_FROM_S = 0.15
+# Samples faster than this are averaged over bins of so long: none the worse for it, and the work stays the same.
+BIN_S = 0.1
+FASTER_THAN_S = 0.07
+# A quadratic that averages the DVL's noise reaches at least so far; the slope further, for its noise pulls the delay
+# that it shows: 0.01 m/s at 5 Hz is 0.006 m/s² over 1 s, an eighth of what a turning vehicle has.
+LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
+# ... and at most: DVL samples more than 1.3 s apart do not tell a turning vehicle's velocity between them.
+MOST_REACH_S = 3.4
+# How far beyond a block of references the other streams have to be known.
+MARGIN_S = 7.0
+N_STATE = 10
+HEAVE, LEVER_ARM, DELAY = 5, slice(6, 9), 9
+BEYOND = slice(6, 10)  # what G1 has not
+
+
+class DvlColumns(NamedTuple):
+    """times (N,) s, velocity (N, 3) m/s in the DVL's frame."""
+
+    times: Array
+    velocity: Array
+
+
+class ReferenceColumns(NamedTuple):
+    """times (J,) s, velocity (J, 3) m/s and noise (J, 3, 3) (m/s)²; ENU, or body where in_body (J,)."""
+
+    times: Array
+    velocity: Array
+    noise: Array
+    in_body: Mask
+
+
+class ImuColumns(NamedTuple):
+    """times (M,) s, orientation (M, 4) quaternion (x, y, z, w) enu from body, angular_velocity (M, 3) rad/s, body."""
+
+    times: Array
+    orientation: Array
+    angular_velocity: Array
+
+
+@dataclass(frozen=True)
+class DelayedRows:
+    """J reference samples, each compared at K delays.
+
+    index: (J,) of the reference. z: (J, K, 3) m/s and h: (J, K, 3, 10) on ψ, κ, heave, lever arm (m, body) and what the
+    delay is more (s) than that of its hypothesis. information: (J, 3, 3) inverse of the noise. weight: (J,) share of
+    its own information that a sample adds. regressor_noise: (J, 4) how much of the information on lever arm (3) and
+    delay is that of noise: angular velocity and slope that only seem to change.
+    """
+
+    index: Index
+    z: Array
+    h: Array
+    information: Array
+    weight: Array
+    regressor_noise: Array
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+def delayed_rows(
+    dvl: DvlColumns,
+    reference: ReferenceColumns,
+    imu: ImuColumns,
+    *,
+    noise_dvl: Array,
+    template: Observations,
+    lever_arm: Vector,
+    min_speed: float,
+    max_turn_rate: float,
+    imu_gap_s: float,
+) -> DelayedRows:
+    """Rows of the references that lie within what is known of the other streams.
+
+    noise_dvl: (3, 3) (m/s)², DVL frame. template: whose mounting and assumptions hold; its samples are not looked at.
+    lever_arm: (3,) m, body, as far as it is known already. min_speed (m/s), max_turn_rate (rad/s, 0 for none): as the
+    parameters. imu_gap_s: longest gap that is interpolated across.
+    """
+    times = reference.times
+    turning, turning_noise = _angular_velocity(imu, times, imu_gap_s)
+    body, noise, oriented = _in_body(reference, imu, imu_gap_s)
+    moving = (body**2).sum(axis=1) >= min_speed**2
+    if max_turn_rate > 0.0:
+        moving &= (turning**2).sum(axis=1) <= max_turn_rate**2
+    read = _read(dvl, times)
+    use = oriented & ~np.isnan(turning[:, 0]) & moving & read.known
+    index = np.flatnonzero(use)
+    body, noise, turning = body[index], noise[index], turning[index]
+    value, slope, spacing = read.velocity[index], read.slope[index], read.spacing[index]
+    uncertain = _Uncertain(turning_noise, noise_dvl, read.slope_gain[index])
+    interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)[index]
+    # references closer together than the DVL's samples share these
+    weight = np.clip(interval / spacing, 0.0, 1.0)
+    return _rows(
+        index, value, slope, body, turning, uncertain, noise + noise_dvl, interval, weight, template, lever_arm
+    )
+
+
+class _Uncertain(NamedTuple):
+    """Noise of regressors: variance of the angular velocity (3,) (rad/s)² as it is used, covariance (3, 3) (m/s)² of
+    the DVL's velocity, and by what (J,) that is multiplied to be its slope's."""
+
+    turning: Array
+    velocity_dvl: Array
+    slope_gain: Array
+
+    def information(self, told: Array) -> Array:
+        """What such noise alone would tell of lever arm and delay (J, 4), where a velocity tells (J, 3, 3)."""
+        x, y, z = told[:, 0, 0], told[:, 1, 1], told[:, 2, 2]
+        nx, ny, nz = self.turning
+        delay = np.einsum("nij,ji->n", told, self.velocity_dvl) * self.slope_gain
+        return np.column_stack([nz * y + ny * z, nz * x + nx * z, ny * x + nx * y, delay])
+
+
+class _Reading(NamedTuple):
+    """The DVL at J times and every delay: velocity, slope (J, K, 3), and at J times whether all of it is known, how far
+    the DVL's samples are apart, s, and the slope's noise for samples with noise of variance 1."""
+
+    velocity: Array
+    slope: Array
+    known: Mask
+    spacing: Array
+    slope_gain: Array
+
+
+def _read(dvl: DvlColumns, times: Array) -> _Reading:
+    """Fits are made every STEP_S, and cubics read between them: on so short a step no worse, a tenth of the work."""
+    first = int(np.floor((times[0] + DELAYS_S[0]) / STEP_S))
+    n = int(np.ceil((times[-1] + DELAYS_S[-1]) / STEP_S)) + 2 - first
+    grid = STEP_S * np.arange(first, first + n)
+    spacing = spacing_at(dvl.times, grid)
+    reach = reach_at(spacing, LEAST_REACH_S, MOST_REACH_S)
+    fit = local_fit(dvl.times, dvl.velocity, grid, reach)
+    wide = local_fit(dvl.times, dvl.velocity, grid, np.maximum(reach, LEAST_SLOPE_REACH_S))
+    place = (times / STEP_S - first)[:, None] + DELAYS_S / STEP_S
+    before = np.floor(place).astype(np.intp)
+    part = (place - before)[..., None]
+    after = before + 1
+    rest = 1.0 - part
+    velocity = (
+        fit.value[before] * (rest * rest * (1.0 + 2.0 * part))
+        + fit.value[after] * (part * part * (1.0 + 2.0 * rest))
+        + (fit.slope[before] * rest - fit.slope[after] * part) * (STEP_S * part * rest)
+    )
+    slope = wide.slope[before] * rest + wide.slope[after] * part
+    found = fit.found & wide.found
+    known: Mask = np.all(found[before] & found[after], axis=1)
+    middle = before[:, len(DELAYS_S) // 2]
+    return _Reading(velocity, slope, known, spacing[middle], wide.slope_gain[middle])
+
+
+def _rows(
+    index: Index,
+    velocity_dvl: Array,
+    slope: Array,
+    body: Array,
+    turning: Array,
+    uncertain: _Uncertain,
+    noise: Array,
+    interval: Array,
+    weight: Array,
+    template: Observations,
+    lever_arm: Vector,
+) -> DelayedRows:
+    n, k = velocity_dvl.shape[:2]
+    body_from_dvl = template.rotation_dvl_from_body.T
+    lever = np.cross(turning, lever_arm) if any(lever_arm) else None
+    once = Observations(
+        velocity_dvl=velocity_dvl[:, 0],
+        reference_body=body,
+        lever_velocity=lever,
+        rotation_dvl_from_body=template.rotation_dvl_from_body,
+        sway_heave=template.sway_heave,
+        noise=noise,
+        interval=interval,
+        assumptions=template.assumptions,
+    )
+    # the same reference beside the DVL at every delay
+    each = Observations(
+        velocity_dvl=velocity_dvl.reshape(n * k, 3),
+        reference_body=np.repeat(body, k, axis=0),
+        lever_velocity=None if lever is None else np.repeat(lever, k, axis=0),
+        rotation_dvl_from_body=template.rotation_dvl_from_body,
+        sway_heave=template.sway_heave,
+        noise=np.repeat(noise, k, axis=0),
+        interval=np.repeat(interval, k),
+        assumptions=template.assumptions,
+    )
+    z, h_g1 = linearise_g1(each)
+    h = np.zeros((n, k, 3, N_STATE))
+    h[..., : HEAVE + 1] = h_g1.reshape(n, k, 3, HEAVE + 1)
+    h[..., LEVER_ARM] = -skew(turning)[:, None]
+    h[..., DELAY] = slope @ body_from_dvl.T
+    information = np.linalg.inv(g1_noise(once))
+    return DelayedRows(index, z.reshape(n, k, 3), h, information, weight, uncertain.information(information))
+
+
+def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
+    """Means of times (N,) s and columns (N, ...) over bins of BIN_S, of those bins that hold any;
+    as they are if they come no faster than FASTER_THAN_S."""
+    if len(times) < 2 or np.median(np.diff(times)) >= FASTER_THAN_S:
+        return times, *columns
+    bins = np.floor(times / BIN_S).astype(np.int64)
+    starts = np.flatnonzero(np.diff(bins, prepend=bins[:1] - 1))
+    count = np.diff(np.append(starts, len(times)))
+    return tuple(
+        np.add.reduceat(column, starts, axis=0) / count.reshape(-1, *[1] * (column.ndim - 1))
+        for column in (times, *columns)
+    )
+
+
+def _angular_velocity(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Array]:
+    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (3,)."""
+    known = ~np.isnan(imu.angular_velocity).any(axis=1)
+    if np.count_nonzero(known) < 2:
+        return np.full((len(times), 3), np.nan), np.zeros(3)
+    stamps, rates = binned(imu.times[known], imu.angular_velocity[known])
+    interpolated = np.column_stack([np.interp(times, stamps, column) for column in rates.T])
+    reach = reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S)
+    smooth = local_fit(stamps, rates, times, reach)
+    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    outside = (times < stamps[0]) | (times > stamps[-1]) | (stamps[after] - stamps[after - 1] > gap_s)
+    value = np.where(smooth.found[:, None], smooth.value, interpolated)
+    value[outside] = np.nan
+    return value, _noise_of(stamps, rates) * float(np.nanmean(smooth.value_gain)) if smooth.found.any() else np.zeros(3)
+
+
+def _noise_of(times: Array, values: Array) -> Array:
+    """Variance (c,) of white noise on samples at times (N,) s, by their second differences; zero for slow ones.
+
+    A vehicle that rolls in waves has second differences of its own if it is looked at once a second.
+    """
+    if len(times) < 8 or np.median(np.diff(times)) > NOISE_FROM_S:
+        return np.zeros(values.shape[1])
+    bent: Array = np.median(np.diff(values, 2, axis=0) ** 2, axis=0) / (6.0 * 0.455)  # 0.455: median of chi-square
+    return bent
+
+
+def _in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> tuple[Array, Array, Mask]:
+    """Velocity (J, 3), noise (J, 3, 3) in the body frame, and where that is known (J,)."""
+    in_body = reference.in_body
+    if in_body.all():
+        return reference.velocity, reference.noise, np.ones(len(in_body), dtype=bool)
+    rotation, known = attitude_at(imu, reference.times, gap_s)
+    body_from_enu = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+    velocity = np.matmul(body_from_enu, reference.velocity[..., None])[..., 0]
+    noise = body_from_enu @ reference.noise @ body_from_enu.swapaxes(1, 2)
+    return velocity, noise, known | in_body
+
+
+def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
+    """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,)."""
+    given = ~np.isnan(imu.orientation[:, 0])
+    stamps, quaternions = imu.times[given], imu.orientation[given]
+    if len(stamps) < 2:
+        return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
+    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    gap = stamps[after] - stamps[after - 1]
+    fraction = np.clip((times - stamps[after - 1]) / gap, 0.0, 1.0)
+    a, b = quaternions[after - 1], quaternions[after]
+    dot = (a * b).sum(axis=1)
+    b, dot = np.where(dot[:, None] < 0.0, -b, b), np.minimum(np.abs(dot), 1.0)
+    angle = np.arccos(dot)
+    sine = np.sin(angle)
+    small = sine < 1e-6  # the chord is exact then
+    divisor = np.where(small, 1.0, sine)
+    left = np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / divisor)
+    right = np.where(small, fraction, np.sin(fraction * angle) / divisor)
+    mixed = left[:, None] * a + right[:, None] * b
+    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+    known = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= gap_s)
+    return rotation_from_quaternion(mixed), known

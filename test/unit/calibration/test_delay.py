@@ -1,0 +1,283 @@
+"""G2: lever arm and time offset of the DVL, from the data; and that it claims nothing that they do not show."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from runs import START_NS, calibrate, feed, shifted
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.local_motion import local_fit, reach_at, spacing_at
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.time_blocks import MOST, TimeBlocks
+from dvl_calib_ros.simulation.sensors import measure_dvl_matched
+from dvl_calib_ros.simulation.trajectories import body_rates
+
+LEVER_ARM = (-1.9, 0.4, -0.3)
+PHI = (0.0, 0.01, -0.02)
+NOISE = Parameters(gnss_aided_std=0.021)
+BEYOND = slice(6, 10)
+GNSS_STD, DVL_STD = 0.02, 0.005
+
+
+@cache
+def late(seconds: float, seed: int = 0, lever_arm=LEVER_ARM, duration: float = 150.0):
+    """A figure of eight with changes of speed, smooth at any time; the DVL's stamps late by so many seconds."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, duration, 0.05)
+    yaw_rate = 0.16 * np.sin(2.0 * np.pi * time / 50.0)
+    roll, pitch = 0.04 * np.sin(2.0 * np.pi * time / 6.0), 0.02 * np.sin(2.0 * np.pi * time / 4.7)
+    yaw = 0.16 * 50.0 / (2.0 * np.pi) * (1.0 - np.cos(2.0 * np.pi * time / 50.0))
+    speed = 1.5 + 0.5 * np.sin(2.0 * np.pi * time / 23.0)
+    body = np.column_stack([speed, -0.25 * yaw_rate * speed, np.zeros_like(speed)])
+    rates = body_rates(time, roll, pitch, yaw_rate)
+    rotation = rotation_from_rpy(np.column_stack([roll, pitch, yaw]))
+    at_dvl = body + np.cross(rates, lever_arm)
+    measured = measure_dvl_matched(at_dvl, np.array(PHI), np.zeros(3), DVL_STD, np.eye(3), rng)
+    reference = np.einsum("nij,nj->ni", rotation, body) + rng.normal(0.0, GNSS_STD, body.shape)
+    samples = []
+    for i in range(len(time)):
+        stamp = START_NS + i * 50_000_000
+        samples.append(ImuSample(stamp, quaternion_from_rotation(rotation[i]), tuple(rates[i].tolist())))
+        if i % 4 == 1:
+            samples.append(ReferenceSample(stamp, tuple(reference[i].tolist()), None, VelocityFrame.ENU))
+        if i % 4 == 0:
+            samples.append(DvlSample(stamp + round(seconds * 1e9), tuple(measured[i].tolist())))
+    return samples
+
+
+@cache
+def found(seconds: float) -> Calibrator:
+    """What is made of such a run; not to be fed any more."""
+    return calibrate(late(seconds), NOISE)
+
+
+def straight(seconds: float = 120.0, yaw_rate: float = 0.0, speed: float = 1.5, with_rates: bool = True):
+    """A run of one speed and one yaw rate for ever, with a lever arm that such a run does not show."""
+    rng = np.random.default_rng(3)
+    samples = []
+    for i in range(round(seconds * 20)):
+        t = i / 20.0
+        stamp = START_NS + i * 50_000_000
+        rotation = rotation_from_rpy([0.0, 0.0, yaw_rate * t])
+        rate = (0.0, 0.0, yaw_rate) if with_rates else None
+        samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), rate))
+        if i % 4 == 0:
+            body = np.array([speed, 0.0, 0.0])
+            reference = rotation @ body + rng.normal(0.0, 0.02, 3)
+            samples.append(ReferenceSample(stamp, tuple(reference.tolist()), None, VelocityFrame.ENU))
+            measured = body + np.cross([0.0, 0.0, yaw_rate], [1.0, 0.3, 0.0]) + rng.normal(0.0, 0.005, 3)
+            samples.append(DvlSample(stamp, tuple(measured.tolist())))
+    return samples
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.13, -1.4, 2.9, -3.0])
+def test_lever_arm_and_delay_are_found_within_what_they_are_said_to_be_good_for(seconds):
+    estimate = found(seconds).estimate("G2")
+    error = estimate.state[BEYOND] - [*LEVER_ARM, seconds]
+    assert np.all(np.abs(error) < 3.5 * estimate.std[BEYOND])
+    assert np.all(np.abs(error[:2]) < 0.05)
+    assert abs(error[3]) < 0.05
+    assert np.all(np.abs(estimate.state[:3] - PHI) < 4.0 * estimate.std[:3])
+    assert all(entry.observed for entry in estimate.observability if entry.name in ("lever_arm_x", "time_offset"))
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [straight(), straight(yaw_rate=0.15), straight(yaw_rate=0.15, with_rates=False), straight(speed=0.1)],
+    ids=["straight", "one yaw rate for ever", "no angular velocity", "too slow"],
+)
+def test_what_the_run_does_not_show_is_not_claimed_and_g2_is_g1(samples):
+    calibrator = calibrate(samples, NOISE)
+    g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
+    prior = [2.0, 2.0, 2.0, 1.0]
+    np.testing.assert_array_equal(g2.state[:6], g1.state)
+    np.testing.assert_array_equal(g2.covariance[:6, :6], g1.covariance)
+    np.testing.assert_allclose(g2.std[BEYOND], prior)
+    assert not g2.state[BEYOND].any()
+    assert (g2.used, g2.gated) == (g1.used, g1.gated)
+    assert calibrator.selected == "G1"
+    shown = {entry.name: entry for entry in g2.observability}
+    assert "turns" in shown["lever_arm_x"].missing
+    assert "slowing down" in shown["time_offset"].missing
+
+
+def test_auto_takes_g2_when_the_data_call_for_it_and_says_why():
+    calibrator = found(-1.4)
+    result = calibrator.result()
+    assert result.selected == "G2"
+    assert "lever arm of x -1." in result.selected_because
+    assert "s early" in result.selected_because
+    assert [segment.model for segment in result.segments][-2:] == ["G1", "G2"]
+
+
+def test_auto_takes_g2_when_the_stamps_are_so_late_that_nothing_pairs():
+    calibrator = calibrate(late(2.5), NOISE)
+    assert calibrator.counts["pairing"]["paired"] == 0
+    assert calibrator.selected == "G2"
+
+
+def test_auto_stays_with_g1_when_there_is_no_lever_arm_and_no_delay():
+    calibrator = calibrate(late(0.0, 0, (0.0, 0.0, 0.0)), NOISE)
+    assert {segment.model for segment in calibrator.result().segments} <= {"G1", "F1"}
+    estimate = calibrator.estimate("G2")
+    assert np.all(np.abs(estimate.state[BEYOND]) < 3.5 * estimate.std[BEYOND])
+
+
+def test_what_is_known_of_lever_arm_and_delay_is_not_found_again():
+    parameters = NOISE.replace(lever_arm=LEVER_ARM, dvl_time_offset=0.8)
+    calibrator = calibrate(late(0.8), parameters)
+    assert calibrator.selected == "G1"
+    estimate = calibrator.estimate("G2")
+    assert np.all(np.abs(estimate.state[BEYOND]) < 3.5 * estimate.std[BEYOND])
+    np.testing.assert_allclose(estimate.lever_arm(parameters.lever_arm)[:2], LEVER_ARM[:2], atol=0.05)
+
+
+@pytest.mark.parametrize("block_size", [1, 7, 400])
+def test_how_samples_are_gathered_changes_nothing(block_size):
+    samples = late(-1.4)
+    one, other = found(-1.4), calibrate(samples, NOISE, block_size=block_size)
+    a, b = one.estimate("G2"), other.estimate("G2")
+    np.testing.assert_allclose(a.state, b.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)
+    assert [s.model for s in one.result().segments] == [s.model for s in other.result().segments]
+
+
+def test_after_a_restart_the_state_is_that_of_a_calibration_that_began_there():
+    samples = late(-1.4)
+    again = shifted(samples, -400_000_000_000)
+    both = feed(Calibrator(NOISE), [*samples, *again])
+    alone = feed(Calibrator(NOISE), again)
+    assert both.restarts == 1
+    a, b = both.estimate("G2"), alone.estimate("G2")
+    # streams that had not gone back yet cost a sample or two of the first block
+    np.testing.assert_allclose(a.state[BEYOND], b.state[BEYOND], atol=0.3 * b.std[BEYOND].max())
+
+
+def test_switching_by_hand_loses_nothing():
+    samples = late(-1.4)
+    calibrator = Calibrator(NOISE.replace(model="M3"))
+    feed(calibrator, samples)
+    calibrator.set_parameters(NOISE.replace(model="G2"))
+    assert calibrator.selected == "G2"
+    np.testing.assert_array_equal(calibrator.estimate().state, found(-1.4).estimate("G2").state)
+
+
+def test_outliers_are_gated_and_a_large_effect_is_not_taken_for_them():
+    samples = late(-1.4)
+    rng = np.random.default_rng(1)
+    spoilt = [
+        sample._replace(velocity=tuple(np.add(sample.velocity, rng.normal(0.0, 2.0, 3)).tolist()))
+        if isinstance(sample, ReferenceSample) and rng.random() < 0.05
+        else sample
+        for sample in samples
+    ]
+    estimate = calibrate(spoilt, NOISE).estimate("G2")
+    assert 0.02 < estimate.gated / (estimate.used + estimate.gated) < 0.12
+    np.testing.assert_allclose(estimate.state[6:8], LEVER_ARM[:2], atol=0.1)
+
+
+def test_a_random_walk_lets_go_of_the_past():
+    calibrator = calibrate(late(-1.4), NOISE.replace(process_std_misalignment=1e-3))
+    still, walking = found(-1.4).estimate("G2"), calibrator.estimate("G2")
+    assert np.all(walking.std[:3] > still.std[:3])
+    np.testing.assert_allclose(walking.state[6:8], LEVER_ARM[:2], atol=0.1)
+
+
+def test_an_initial_calibration_of_g2_goes_on_where_it_was():
+    first = found(-1.4)
+    later = calibrate(late(-1.4, seed=1), NOISE, initial={"G2": first.state("G2"), "G1": first.state("G1")})
+    assert np.all(later.estimate("G2").std[6:8] < first.estimate("G2").std[6:8])
+    np.testing.assert_allclose(later.estimate("G2").state[6:8], LEVER_ARM[:2], atol=0.05)
+
+
+def test_held_out_samples_are_judged_where_and_when_the_dvl_was():
+    verification = calibrate(late(-1.4), NOISE, verified=True).verification("G2")
+    held_out = verification.held_out
+    assert held_out.corrected < 0.05 < held_out.uncorrected
+    assert verification.verdict.value == "accept"
+
+
+def test_the_model_is_one_entry_of_the_table_that_extends_another():
+    model = MODELS["G2"]
+    base = MODELS[model.extends]
+    assert model.state_names[: base.n_state] == base.state_names
+    assert model.needs is base.needs
+
+
+@pytest.mark.slow
+def test_intervals_hold_what_they_say_over_200_runs():
+    rng = np.random.default_rng(11)
+    scores = []
+    for seed in range(200):
+        delay = float(rng.uniform(-2.9, 2.9))
+        arm = tuple(rng.uniform(-2.0, 2.0, 3).tolist())
+        estimate = calibrate(late.__wrapped__(delay, seed, arm, 120.0), NOISE).estimate("G2")
+        scores.append((estimate.state[BEYOND] - [*arm, delay]) / estimate.std[BEYOND])
+    share = np.mean(np.abs(scores) < 1.96, axis=0)
+    assert np.all((share > 0.90) & (share <= 1.0)), share
+    assert 0.92 < np.mean(share) < 0.98, share
+
+
+# ---------------------------------------------------------------------- parts
+
+
+def test_a_local_fit_reads_a_parabola_exactly_wherever_the_samples_are():
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.1, 0.3, 200))
+    values = np.column_stack([2.0 - 0.3 * times + 0.05 * times**2, times])
+    at = rng.uniform(times[5], times[-6], 50)
+    fit = local_fit(times, values, at, reach_at(spacing_at(times, at), 0.6, 5.0))
+    assert fit.found.all()
+    np.testing.assert_allclose(fit.value[:, 0], 2.0 - 0.3 * at + 0.05 * at**2, atol=1e-8)
+    np.testing.assert_allclose(fit.slope[:, 0], -0.3 + 0.1 * at, atol=1e-8)
+
+
+def test_a_local_fit_is_as_noisy_on_a_sample_as_between_two():
+    times = np.arange(0.0, 2000.0, 1.0)
+    noise = np.random.default_rng(0).normal(0.0, 1.0, (2000, 1))
+    spread = []
+    for part in (0.0, 0.25, 0.5):
+        at = np.arange(10.0, 1990.0) + part
+        spread.append(local_fit(times, noise, at, reach_at(spacing_at(times, at), 0.6, 5.0)).value.std())
+    assert max(spread) / min(spread) < 1.2
+
+
+def test_nothing_is_fitted_beyond_the_samples_or_across_a_gap():
+    times = np.concatenate([np.arange(0.0, 20.0, 0.2), np.arange(40.0, 60.0, 0.2)])
+    at = np.array([-1.0, 0.1, 10.0, 30.0, 59.9, 61.0])
+    fit = local_fit(times, np.zeros((len(times), 1)), at, reach_at(spacing_at(times, at), 0.6, 3.4))
+    assert fit.found.tolist() == [False, False, True, False, False, False]
+
+
+def test_blocks_of_time_raise_sigma_for_correlated_noise_only():
+    rng = np.random.default_rng(2)
+
+    def inflation(correlated: bool) -> float:
+        blocks = TimeBlocks()
+        information, vector = np.zeros((1, 1)), np.zeros(1)
+        for _ in range(40):
+            own = rng.normal() * 3.0 if correlated else 0.0
+            z = own + rng.normal(0.0, 1.0, 50)
+            told, y = np.array([[50.0]]), np.array([z.sum()])
+            blocks.add(told[None], y[None], 50.0)
+            information, vector = information + told, vector + y
+        p = np.linalg.inv(information)
+        return float(blocks.inflation(0, p @ vector, p)[0])
+
+    assert np.mean([inflation(correlated=False) for _ in range(30)]) < 1.1
+    assert inflation(correlated=True) > 10.0
+
+
+def test_blocks_of_time_are_joined_so_that_memory_is_bounded():
+    blocks = TimeBlocks()
+    for index in range(5000):
+        blocks.add(np.full((1, 1, 1), 1.0), np.full((1, 1), float(index)), 2.0)
+    assert len(blocks.kept) <= MOST
+    assert sum(float(each[0][0, 0, 0]) for each in blocks.kept) == 5000.0
+    assert blocks.weight == 10000.0
