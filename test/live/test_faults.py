@@ -120,7 +120,7 @@ def with_extra(every: int, make: Callable[[Any, int], Sequence[Any]]) -> list[An
 SPOILT_TWISTS = [
     {"velocity": (NAN, 0.0, 0.0)}, {"velocity": (1.0, INF, 0.0)}, {"velocity": (1.0, 0.0, -INF)},
     {"velocity": (1e308, 1e308, 1e308)}, {"velocity": (1.0, 11.0, 0.0)},
-    {"covariance": np.full((3, 3), NAN)}, {"covariance": np.diag([1e-4, -1.0, 1e-4])},
+    {"covariance": np.full((3, 3), NAN)}, {"covariance": np.diag([1e-4, -0.5, 1e-4])},  # -1: not measured
     {"covariance": np.diag([INF, 1.0, 1.0])}, {"covariance": np.ones((3, 3))},
 ]  # fmt: skip
 SPOILT_QUATERNIONS = [(NAN, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0), (INF, 0.0, 0.0, 0.0), (5e-324, 0.0, 0.0, 0.0)]
