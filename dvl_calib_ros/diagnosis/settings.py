@@ -45,7 +45,7 @@ class DiagnosisSettings:
     first_step: float = 0.25
     level: float = 0.008
     max_effects: int = 4
-    ghost_share: float = 0.004
+    ghost_share: float = 0.0008
     indistinguishable: float = 6.0
     robust_level: float = 0.003
     block: float = 20.0
