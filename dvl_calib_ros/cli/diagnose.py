@@ -36,6 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--apply", type=Path, metavar="FILE",
         help="write a parameter file for node and replay that compensates what was found, over --params and -p",
     )  # fmt: skip
+    parser.add_argument(
+        "--twin", type=Path, metavar="FOLDER",
+        help="write bags with a simulated DVL on the recorded motion: NAME_without and NAME_with what was found",
+    )  # fmt: skip
     add_report_option(parser)
     common.add_parameter_options(parser)
     common.add_discovery_options(parser)
@@ -58,6 +62,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.results import diagnosis_document
     from ..files.atomic import save_text
+    from ..simulation.twin_bags import write_twins
 
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "apply", "report")
@@ -81,6 +86,9 @@ def run(arguments: argparse.Namespace) -> None:
             for index, (name, _) in enumerate(diagnosis.recordings):
                 own = arguments.apply.with_name(f"{arguments.apply.stem}.{Path(name).stem}{arguments.apply.suffix}")
                 save_text(own, parameter_file(compensated(parameters, diagnosis, index)))
+    if arguments.twin is not None:
+        for twin in diagnosis.twins:
+            write_twins(arguments.twin, twin)
     if write_report is not None:
         write_report(arguments.report, diagnosis)
     _print(diagnosis)

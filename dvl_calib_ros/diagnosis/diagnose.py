@@ -24,6 +24,7 @@ from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
 from .selection import Selected, Selection, blocks_of, select
 from .series import collect_series
 from .settings import SETTINGS
+from .twin import twins
 from .unexplained import Unexplained, unexplained
 from .where import places
 
@@ -108,6 +109,7 @@ def diagnose_recordings(
         calibration=tuple(_interval(float(value), std) for value, std in calibration),
         compared_axes=_compared_axes(selection),
         recordings=tuple((recording.name, recording.first_ns) for recording in recordings),
+        twins=twins(selection),
     )
 
 

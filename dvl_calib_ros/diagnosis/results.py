@@ -10,6 +10,7 @@ from typing import Any
 from .closure import Gap
 from .noise_findings import NoiseFinding
 from .series import DiagnosisSeries
+from .twin import Twin
 from .where import Place
 
 
@@ -42,7 +43,7 @@ class FoundEffect:
 class Diagnosis:
     """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any.
     calibration: value, low, high of φ (rad) and δk, three of each, beside the effects. compared_axes: in words.
-    recordings: names and first stamps (ns).
+    recordings: names and first stamps (ns). twins: of the recordings.
     """
 
     verdict: Verdict
@@ -59,6 +60,7 @@ class Diagnosis:
     calibration: tuple[tuple[float, float, float], ...] = ()
     compared_axes: str = "xyz"
     recordings: tuple[tuple[str, int], ...] = ()
+    twins: tuple[Twin, ...] = ()
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:

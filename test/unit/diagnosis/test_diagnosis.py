@@ -17,10 +17,11 @@ from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
-from dvl_calib_ros.diagnosis.recordings import Curve, Recording, make_recording
+from dvl_calib_ros.diagnosis.recordings import Curve, Recording, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import Verdict, diagnosis_document
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.replay.replay import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Run, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -406,6 +407,17 @@ def test_what_was_found_can_be_applied_and_the_gap_is_gone(bag_with_lever_arm, t
         succeed(capsys, "replay", bag_with_lever_arm, "--json", after, "--models", "G1", *options)
         errors.append(json.loads(after.read_text())["verification"]["G1"]["held_out"]["corrected_mps"])
     assert errors[1] < errors[0]
+
+
+def test_the_twin_with_what_was_found_measures_what_was_recorded(bag_with_lever_arm, tmp_path, capsys):
+    succeed(capsys, "diagnose", bag_with_lever_arm, "--twin", tmp_path / "twins")
+    assert {path.name for path in (tmp_path / "twins").iterdir()} == {"bag_without", "bag_with"}
+    recorded, without, with_it = (
+        load_recordings([path], Parameters(), Topics()).recordings[0].dvl.values[10:-10]
+        for path in (bag_with_lever_arm, tmp_path / "twins" / "bag_without", tmp_path / "twins" / "bag_with")
+    )
+    far, near = (np.sqrt(np.mean((twin - recorded) ** 2)) for twin in (without, with_it))
+    assert near < 0.9 * far and near == pytest.approx(0.03, rel=0.2)  # the noise of the reference that it is made of
 
 
 def test_the_answer_comes_first_in_one_sentence(bag_with_lever_arm, capsys):

@@ -1,0 +1,66 @@
+"""Twins of recordings: what a simulated DVL measures on the recorded motion, without and with what was found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.samples import VelocityFrame
+from ..effects.base import ActsOn, EffectInput
+from ..effects.composition import at_dvl, late, traces
+from .composed import Hypothesis, Problem
+from .recordings import Recording
+from .selection import Selection
+
+# Passes in which the true time of a late stamp is found
+_PASSES = 3
+
+
+@dataclass(frozen=True)
+class Twin:
+    """One recording and its twins. recording: its streams. time: (N,) s by the DVL's stamps, since its first. recorded,
+    without, with_effects: (N, 3) m/s, DVL frame; without: the calibration alone.
+    """
+
+    recording: Recording
+    time: Array
+    recorded: Array
+    without: Array
+    with_effects: Array
+
+
+def twins(selection: Selection) -> tuple[Twin, ...]:
+    """Of every recording, on its own motion, at its DVL's stamps; without noise."""
+    problem = selection.fitter.problem
+    found = []
+    for index, recording in enumerate(problem.recordings):
+        without, with_effects = (_simulated(problem, fit.hypothesis, index) for fit in (selection.base, selection.fit))
+        dvl = recording.dvl
+        found.append(Twin(recording, dvl.time, dvl.values, without, with_effects))
+    return tuple(found)
+
+
+def _simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
+    """(N, 3) m/s: the composed model forwards, from the reference's motion to what the DVL measures."""
+    recording, injections = problem.recordings[index], hypothesis.injections(index)
+    time = recording.dvl.time
+    for _ in range(_PASSES):
+        time = recording.dvl.time - late(injections, ActsOn.DVL_CLOCK, time)
+    oriented = time + late(injections, ActsOn.ATTITUDE_CLOCK, time)
+    velocity = recording.reference(time + late(injections, ActsOn.REFERENCE_CLOCK, time))
+    rotation = None if recording.attitude is None else recording.rotation_enu_from_body(oriented)
+    if recording.frame is not VelocityFrame.BODY and rotation is not None:
+        velocity = np.einsum("nji,nj->ni", rotation, velocity)
+    has_rates = recording.attitude is not None or recording.rates is not None
+    rates = recording.angular_velocity(oriented) if has_rates else None
+    nominal = problem.rotation_dvl_from_body
+    motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0)
+    motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
+    moved = at_dvl(injections, motion)
+    if rates is not None:
+        moved = replace(moved, velocity_body=moved.velocity_body + np.cross(rates, problem.lever_arm))
+    measured_from_body = np.linalg.inv(hypothesis.body_from_measured(nominal))
+    measured: Array = moved.velocity_body @ measured_from_body.T + traces(injections, moved, ActsOn.DVL) @ nominal.T
+    return measured

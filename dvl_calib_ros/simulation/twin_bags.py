@@ -1,0 +1,53 @@
+"""Bags of the twins that a diagnosis makes of recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..bags.writer import BagWriter, Compression, Storage
+from ..calibration.frames import Array
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..diagnosis.twin import Twin
+from ..messages.encode import SampleWriter
+
+
+def write_twins(folder: Path, twin: Twin) -> list[Path]:
+    """Write NAME_without and NAME_with: DVL simulated without noise, reference and IMU as recorded. Raises InputError.
+
+    Stamps are the recording's, less what the parameters know of its clocks.
+    """
+    paths = []
+    for kind, velocity in (("without", twin.without), ("with", twin.with_effects)):
+        path = folder / f"{Path(twin.recording.name).stem}_{kind}"
+        with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:
+            SampleWriter(bag).recording(*_streams(twin, velocity))
+        paths.append(path)
+    return paths
+
+
+def _streams(twin: Twin, velocity: Array) -> tuple[list[ImuSample], list[ReferenceSample], list[DvlSample]]:
+    recording = twin.recording
+
+    def stamps(time: Array) -> list[int]:
+        return [recording.first_ns + round(1e9 * each) for each in time.tolist()]
+
+    dvl = [DvlSample(at, (x, y, z)) for at, (x, y, z) in zip(stamps(twin.time), velocity.tolist(), strict=True)]
+    reference = [
+        ReferenceSample(at, (x, y, z), None, recording.frame)
+        for at, (x, y, z) in zip(stamps(recording.reference.time), recording.reference.values.tolist(), strict=True)
+    ]
+    imu: list[ImuSample] = []
+    oriented = recording.attitude or recording.rates
+    if oriented is not None:
+        time = oriented.time
+        rates = recording.angular_velocity(time).tolist()
+        quaternions: list[list[float]] = []
+        if recording.attitude is not None:
+            values = recording.attitude(time)
+            quaternions = (values / np.linalg.norm(values, axis=1)[:, None]).tolist()
+        for i, at in enumerate(stamps(time)):
+            x, y, z = rates[i]
+            imu.append(ImuSample(at, tuple(quaternions[i]) if quaternions else None, (x, y, z)))  # type: ignore[arg-type]
+    return imu, reference, dvl
