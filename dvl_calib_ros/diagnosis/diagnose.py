@@ -25,7 +25,7 @@ from .selection import Selected, Selection, blocks_of, select
 from .series import collect_series
 from .settings import SETTINGS
 from .twin import twins
-from .unexplained import Unexplained, unexplained
+from .unexplained import Unexplained, holds_out, unexplained
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -172,9 +172,22 @@ def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
     return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before
 
 
+def _matters(selection: Selection, rest: Unexplained) -> bool:
+    """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
+    problem = selection.fitter.problem
+    if rest.energy < max(SETTINGS.unexplained_energy, SETTINGS.unexplained_size * selection.fit.residual.size):
+        return False
+    stretch = np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds
+    return holds_out(selection.fitter, selection.fit, rest, stretch) > SETTINGS.unexplained_held_out * rest.energy
+
+
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
     explained = max(0.0, selection.base.deviance - selection.fit.deviance)
-    if rest.found and rest.energy > SETTINGS.unexplained_share * (explained + rest.energy):
+    if (
+        rest.found
+        and _matters(selection, rest)
+        and rest.energy > SETTINGS.unexplained_share * (explained + rest.energy)
+    ):
         return Verdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)

@@ -27,6 +27,9 @@ class DiagnosisSettings:
 
     Judging: block, folds: of hold-out. noise_tolerance: so many standard errors may the noise of all frequencies lie
     above that of the high ones. unexplained_share: of the gap, from which a combination of effects does not explain it.
+    unexplained_energy: what is unexplained must have at least, in units of the noise variance, and as a share of all
+    samples, unexplained_size: what interpolation leaves in sharp corners has less. unexplained_held_out: share of it
+    that must be there on stretches that it was not fitted to.
     prior_angle, prior_scale: standard deviation of misalignment and scale, held so where the data says little (roll,
     the scale of sway): else these would take in much of a lever arm.
     """
@@ -52,6 +55,9 @@ class DiagnosisSettings:
     folds: int = 5
     noise_tolerance: float = 3.0
     unexplained_share: float = 0.25
+    unexplained_energy: float = 60.0
+    unexplained_size: float = 0.005
+    unexplained_held_out: float = 0.3
     prior_angle: float = 0.1
     prior_scale: float = 0.02
 

@@ -16,6 +16,7 @@ from scipy.stats import chi2
 from ..calibration.frames import Array
 from .composed import Grid, Problem, Seen
 from .fitting import Fit, Fitter
+from .least_squares import WhitenedLeastSquares
 from .noise import Noise
 
 LEVEL = 0.001
@@ -191,6 +192,36 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
         waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
         found.append(Line(period, float(log_p.min() + np.log(log_p.size)), waves))
     return found
+
+
+def holds_out(fitter: Fitter, fit: Fit, rest: Unexplained, fold: NDArray[np.intp]) -> float:
+    """Whitened squares that what the rest follows explains on folds (M,) that it was not fitted to.
+
+    One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
+    what is there tells of itself elsewhere.
+    """
+    functions = dictionary(fitter.problem, fit.seen).get(rest.about)
+    if functions is None:  # a line in the spectrum, which is one of very many
+        return rest.energy
+    raw = _along_axes(functions, fitter.problem.axes)
+    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
+    known = fit.columns / np.maximum(np.sqrt((fit.columns**2).mean(axis=(0, 1))), 1e-12)
+    white = fit.noise.whiten(np.concatenate([known, raw / size], axis=2))
+    series = fit.noise.whiten(fit.residual)
+    rows = np.repeat(fold, fitter.problem.axes)
+    gain = 0.0
+    for held in np.unique(fold):
+        train, test = rows != held, rows == held
+        solution = _solved(white[train], series[train])
+        base = _solved(white[train][:, : known.shape[2]], series[train])
+        left = series[test] - white[test][:, : known.shape[2]] @ base
+        gain += float(left @ left - np.sum((series[test] - white[test] @ solution) ** 2))
+    return gain
+
+
+def _solved(white: Array, series: Array) -> Array:
+    ridge = np.full(white.shape[1], 10.0)
+    return WhitenedLeastSquares.of(white, series, ridge, np.zeros_like(ridge)).solution()
 
 
 def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:
