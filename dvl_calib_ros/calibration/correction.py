@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from .error_model import correction_jacobian, correction_matrix
 from .frames import Array
 from .kalman import GaussianState
@@ -21,6 +23,13 @@ def twist_terms(model: Model, state: GaussianState) -> tuple[Array, Array]:
     missing = ~terms.any(axis=1)
     covariance[missing, missing] = NOT_ESTIMATED
     return terms @ state.x, covariance
+
+
+def lever_arm(model: Model, state: GaussianState, nominal: Sequence[float]) -> tuple[float, float, float]:
+    """Where the DVL is, m from the reference point, body frame: as the parameters say, and what the model found."""
+    found = dict(zip(model.state_names, state.x.tolist(), strict=True))
+    x, y, z = (known + found.get(f"lever_arm_{axis}", 0.0) for axis, known in zip("xyz", nominal, strict=True))
+    return x, y, z
 
 
 class Correction:

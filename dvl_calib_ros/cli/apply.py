@@ -111,7 +111,7 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
     )
     for line in lines:
         out.print(escape(line), soft_wrap=True)
-    if not any(calibrated.parameters.lever_arm):
+    if not any(calibrated.lever_arm):
         out.print("position: lever_arm is not set, so the static transform is at 0 0 0", soft_wrap=True)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from .. import __version__
+from ..calibration.correction import lever_arm
 from ..calibration.error_model import corrected_mounting
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
@@ -40,7 +41,8 @@ class CalibratedMounting:
 
     rotation_body_from_dvl (3, 3): corrected, of the forward-left-up axes that are calibrated. turned: whether the
     driver's data, in dvl_frame, are forward-right-down, and were turned to those. scale (3,): δk per DVL axis, 0 where
-    not estimated; scale_ahead: of motion ahead. objections: why it should not be applied; doubts: what to know when it
+    not estimated; scale_ahead: of motion ahead. lever_arm (3,): m from the reference point, body frame, as it was
+    found, else as the parameters say. objections: why it should not be applied; doubts: what to know when it
     is; both in sentences.
     """
 
@@ -54,6 +56,7 @@ class CalibratedMounting:
     objections: tuple[str, ...]
     doubts: tuple[str, ...]
     turned: bool = False
+    lever_arm: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     @property
     def rotation_body_from_dvl_frame(self) -> Array:
@@ -74,7 +77,7 @@ class CalibratedMounting:
     def static_transform(self) -> str:
         """Arguments of tf2's static_transform_publisher."""
         quaternion = quaternion_from_rotation(self.rotation_body_from_dvl_frame)
-        return static_transform_arguments(self.parameters.lever_arm, quaternion, self.base_frame, self.dvl_frame)
+        return static_transform_arguments(self.lever_arm, quaternion, self.base_frame, self.dvl_frame)
 
 
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:
@@ -98,10 +101,13 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
             raise InputError(f"{path}: {frame!r} is no name of a frame; letters, digits and _ . / - make one")
     errors = model.error_terms_from_state @ state.x
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
+    position = lever_arm(model, state, parameters.lever_arm)
     if not angle_between(rotation, saved) < 1e-6:
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     doubts += _unseen(model, state, parameters)
-    return CalibratedMounting(path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned)
+    return CalibratedMounting(
+        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, position
+    )
 
 
 def _judged(

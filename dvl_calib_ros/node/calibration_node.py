@@ -20,10 +20,10 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.correction import NOT_ESTIMATED, Correction, twist_terms
+from ..calibration.correction import NOT_ESTIMATED, Correction, lever_arm, twist_terms
 from ..calibration.findings import Finding, finding
 from ..calibration.kalman import GaussianState
-from ..calibration.models import MODELS
+from ..calibration.models import MODELS, Model
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..discovery.placement import Frames, not_default, placement
@@ -125,7 +125,7 @@ class CalibrationNode(Node):
         """Calibrate with these parameters from here on."""
         self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
         self._feed = MessageFeed(self._calibrator, self._warn)
-        self._lever_arm = parameters.lever_arm if any(parameters.lever_arm) else None
+        self._lever_arm: Sequence[float] | None = parameters.lever_arm if any(parameters.lever_arm) else None
 
     def _place(self, message: Any) -> None:
         """Begin anew with mounting, lever arm and orientation of the IMU from transforms, when they come or change.
@@ -236,8 +236,7 @@ class CalibrationNode(Node):
         model = MODELS[calibrator.selected]
         self._published = (model.name, calibrator.n_given(model.name))
         state = calibrator.state(model.name)
-        self._correction = Correction(model, state, calibrator.parameters.rotation_dvl_from_body)
-        self._corrected_by = model.name
+        self._set_correction(model, state)
         terms, covariance = twist_terms(model, state)
         message = self._estimate
         if calibrator.last_ns is not None:
@@ -248,15 +247,23 @@ class CalibrationNode(Node):
         message.twist.covariance = covariance.ravel()
         self._estimate_publisher.publish(message)
 
+    def _set_correction(self, model: Model, state: GaussianState) -> Correction:
+        """Correct by this state from now on; its correction."""
+        parameters = self._calibrator.parameters
+        self._correction = Correction(model, state, parameters.rotation_dvl_from_body)
+        self._corrected_by = model.name
+        arm = lever_arm(model, state, parameters.lever_arm)
+        self._lever_arm = arm if any(arm) else None
+        return self._correction
+
     def _publish_corrected(self, sample: DvlSample) -> None:
         calibrator = self._calibrator
         name = calibrator.selected
-        if self._correction is None or self._corrected_by != name:
-            rotation = calibrator.parameters.rotation_dvl_from_body
-            self._correction = Correction(MODELS[name], calibrator.state(name), rotation)
-            self._corrected_by = name
+        correction = self._correction
+        if correction is None or self._corrected_by != name:
+            correction = self._set_correction(MODELS[name], calibrator.state(name))
         noise = self._unaided_noise if sample.covariance is None else sample.covariance
-        velocity, covariance = self._correction.apply(np.array(sample.velocity), noise)
+        velocity, covariance = correction.apply(np.array(sample.velocity), noise)
         if self._lever_arm is not None:
             rate = calibrator.latest_angular_velocity(sample.stamp_ns)
             if rate is not None:

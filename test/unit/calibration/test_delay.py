@@ -9,6 +9,7 @@ import pytest
 from runs import START_NS, calibrate, feed, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.correction import lever_arm
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.models import MODELS
@@ -26,7 +27,7 @@ GNSS_STD, DVL_STD = 0.02, 0.005
 
 
 @cache
-def late(seconds: float, seed: int = 0, lever_arm=LEVER_ARM, duration: float = 150.0):
+def late(seconds: float, seed: int = 0, arm=LEVER_ARM, duration: float = 150.0):
     """A figure of eight with changes of speed, smooth at any time; the DVL's stamps late by so many seconds."""
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, duration, 0.05)
@@ -37,7 +38,7 @@ def late(seconds: float, seed: int = 0, lever_arm=LEVER_ARM, duration: float = 1
     body = np.column_stack([speed, -0.25 * yaw_rate * speed, np.zeros_like(speed)])
     rates = body_rates(time, roll, pitch, yaw_rate)
     rotation = rotation_from_rpy(np.column_stack([roll, pitch, yaw]))
-    at_dvl = body + np.cross(rates, lever_arm)
+    at_dvl = body + np.cross(rates, arm)
     measured = measure_dvl_matched(at_dvl, np.array(PHI), np.zeros(3), DVL_STD, np.eye(3), rng)
     reference = np.einsum("nij,nj->ni", rotation, body) + rng.normal(0.0, GNSS_STD, body.shape)
     samples = []
@@ -136,6 +137,12 @@ def test_what_is_known_of_lever_arm_and_delay_is_not_found_again():
     estimate = calibrator.estimate("G2")
     assert np.all(np.abs(estimate.state[BEYOND]) < 3.5 * estimate.std[BEYOND])
     np.testing.assert_allclose(estimate.lever_arm(parameters.lever_arm)[:2], LEVER_ARM[:2], atol=0.05)
+
+
+def test_the_position_found_is_that_of_the_parameters_and_what_was_found_beside():
+    state = found(-1.4).state("G2")
+    np.testing.assert_allclose(lever_arm(MODELS["G2"], state, (0.1, 0.0, 0.0)), np.add(state.x[6:9], (0.1, 0.0, 0.0)))
+    assert lever_arm(MODELS["G1"], found(-1.4).state("G1"), (0.1, 0.0, 0.0)) == (0.1, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("block_size", [1, 7, 400])
