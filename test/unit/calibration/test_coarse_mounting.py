@@ -1,0 +1,106 @@
+"""A configuration that is grossly wrong is rejected, and what would fit is named."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from runs import START_NS, calibrate
+
+from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.observability import Convergence
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.verification import HeldOutError, Word, verify
+
+PARAMETERS = Parameters(gnss_aided_std=0.03)
+SAME = np.eye(3)
+
+
+@cache
+def motion():
+    """Stamps, body velocity, rotation and angular velocity of a box with rolling and pitching, at 5 Hz."""
+    time = np.arange(0.0, 120.0, 0.2)
+    yaw_rate = np.where(time % 30.0 > 20.0, np.pi / 20.0, 0.0)
+    yaw = np.concatenate([[0.0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * 0.2)])
+    rpy = np.column_stack([0.05 * np.sin(time), 0.03 * np.sin(0.7 * time), yaw])
+    body = np.column_stack([1.5 + 0.3 * np.sin(0.2 * time), 0.5 * np.sin(0.15 * time), np.zeros_like(time)])
+    return [START_NS + i * 200_000_000 for i in range(len(time))], body, rotation_from_rpy(rpy), yaw_rate
+
+
+def verdict(frame=VelocityFrame.ENU, reference=SAME, attitude=(SAME, SAME), dvl=SAME):
+    """Verdict on G1 where the messages hold these linear functions of what they should."""
+    rng = np.random.default_rng(0)
+    stamps, body, rotation, yaw_rate = motion()
+    samples = []
+    for stamp, v, r, rate in zip(stamps, body, rotation, yaw_rate, strict=True):
+        samples.append(ImuSample(stamp, quaternion_from_rotation(attitude[0] @ r @ attitude[1]), (0.0, 0.0, rate)))
+        samples.append(
+            ReferenceSample(stamp, tuple((reference @ r @ v + rng.normal(0, 0.02, 3)).tolist()), None, frame)
+        )
+        samples.append(DvlSample(stamp, tuple((dvl @ v + rng.normal(0, 0.005, 3)).tolist())))
+    return calibrate(samples, PARAMETERS, verified=True).verification("G1")
+
+
+def test_a_right_configuration_is_accepted_and_nothing_is_suggested():
+    found = verdict()
+    assert found.verdict is Word.ACCEPT
+    assert not any("fit" in reason or "looks like" in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"dvl": rotation_from_rpy([0.0, 0.0, 0.785]).T}, "the data fit mounting_rpy"),
+        ({"reference": ENU_FROM_NED}, "the reference looks like NED (gnss_frame: ned)"),
+        ({"frame": VelocityFrame.NED}, "the reference looks like ENU (gnss_frame: enu)"),
+        ({"attitude": (ENU_FROM_NED, FLU_FROM_FRD)}, "the IMU's orientation looks like NED"),
+        ({"dvl": FLU_FROM_FRD}, "the DVL's axes look forward-right-down (dvl_axes: frd)"),
+    ],
+    ids=["45 degrees", "NED called ENU", "ENU called NED", "attitude in NED", "flipped axes"],
+)
+def test_a_wrong_configuration_is_rejected_with_the_sentence_that_names_it(wrong, sentence):
+    found = verdict(**wrong)
+    assert found.verdict is Word.REJECT
+    assert any(sentence in reason for reason in found.reasons), found.reasons
+
+
+def test_a_mounting_that_fits_is_named_in_rad():
+    reasons = " ".join(verdict(dvl=rotation_from_rpy([0.0, 0.0, 0.785]).T).reasons)
+    named = reasons.partition("mounting_rpy ")[2].split()[:3]
+    np.testing.assert_allclose([float(each) for each in named], [0.0, 0.0, 0.785], atol=0.02)
+
+
+def judged(**changes):
+    state = GaussianState(np.zeros(6), np.eye(6) * 1e-6)
+    arguments = {"held_out": HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), "used_and_gated": (1000, 10)} | changes
+    return verify(MODELS["G1"], state, Convergence.FINE, parameters=Parameters(), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word", "sentence"),
+    [
+        ({}, Word.ACCEPT, "0.050 with it"),
+        ({"used_and_gated": (0, 0)}, Word.REJECT, "no sample was used"),
+        ({"used_and_gated": (400, 600)}, Word.REJECT, "600 of 1000 samples contradict it"),
+        ({"held_out": HeldOutError(1000, 0.30, 0.20, 0.05, 0.002)}, Word.REJECT, "several times less"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.005, 0.05, 0.002)}, Word.REJECT, "fused into the reference"),
+    ],
+    ids=["good", "nothing used", "most gated", "much worse than predicted", "reference with the DVL in it"],
+)
+def test_a_verdict_protects(changes, word, sentence):
+    found = judged(**changes)
+    assert found.verdict is word
+    assert sentence in found.reasons[0]
+
+
+def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
+    state = GaussianState(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]), np.eye(6) * 1e-6)
+    found = verify(
+        MODELS["G1"], state, Convergence.FINE, HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), Parameters(), (1000, 0)
+    )
+    assert found.verdict is Word.ACCEPT
+    assert "inspect the mounting: it is 2.9°" in found.mounting
