@@ -68,6 +68,8 @@ TRAJECTORIES = (*ROUNDS, FREE)
 # Free manoeuvres: a leg's length, speed and yaw rate are drawn from these; three legs in ten are straight
 FREE_SECONDS, FREE_SPEEDS_MPS, FREE_YAW_RATE = (5.0, 40.0), (0.6, 2.2), np.deg2rad(12.0)
 FREE_STRAIGHT = 0.3
+# Changes of speed and yaw rate are spread over so long
+INERTIA_S = 3.0
 
 
 def make_motion(trajectory: str, seconds: float, rate_hz: float, rng: np.random.Generator | None = None) -> Motion:
@@ -116,13 +118,21 @@ def _smoothed(legs: Iterator[Leg], seconds: float, time: Array) -> tuple[Array, 
         yaw_rates.append(leg.yaw_rate)
         if end > seconds:
             break
-    speed, yaw_rate = np.zeros_like(time), np.zeros_like(time)
-    shifts = np.linspace(-1.5, 1.5, 31)
-    for shift in shifts:
-        at = np.searchsorted(ends, np.clip(time + shift, 0.0, seconds))
-        speed += np.array(speeds)[at] / len(shifts)
-        yaw_rate += np.array(yaw_rates)[at] / len(shifts)
-    return speed, yaw_rate
+    edges = np.array([0.0, *ends])
+    lengths = np.diff(edges)
+
+    def mean(values: list[float]) -> Array:
+        """Over the 3 s about each time, as if the first and the last leg went on for ever."""
+        travelled = np.concatenate([[0.0], np.cumsum(lengths * np.array(values))])
+
+        def until(at: Array) -> Array:
+            beyond = np.minimum(at - edges[0], 0.0) * values[0] + np.maximum(at - edges[-1], 0.0) * values[-1]
+            return np.interp(at, edges, travelled) + beyond
+
+        averaged: Array = (until(time + 0.5 * INERTIA_S) - until(time - 0.5 * INERTIA_S)) / INERTIA_S
+        return averaged
+
+    return mean(speeds), mean(yaw_rates)
 
 
 def _integral(time: Array, rate: Array) -> Array:
