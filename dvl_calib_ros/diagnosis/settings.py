@@ -56,7 +56,7 @@ class DiagnosisSettings:
     noise_tolerance: float = 3.0
     unexplained_share: float = 0.25
     unexplained_energy: float = 60.0
-    unexplained_size: float = 0.005
+    unexplained_size: float = 0.025
     unexplained_held_out: float = 0.3
     prior_angle: float = 0.1
     prior_scale: float = 0.02
