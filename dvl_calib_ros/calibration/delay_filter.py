@@ -359,7 +359,7 @@ class DelayFilter:
             velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
             noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
         stamps_ns = track.stamps_ns[at].copy()
-        return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY), stamps_ns
+        return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY, given), stamps_ns
 
     # ------------------------------------------------------------------ verification
 

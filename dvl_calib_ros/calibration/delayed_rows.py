@@ -47,12 +47,16 @@ class DvlColumns(NamedTuple):
 
 
 class ReferenceColumns(NamedTuple):
-    """times (J,) s, velocity (J, 3) m/s and noise (J, 3, 3) (m/s)²; ENU, or body where in_body (J,)."""
+    """times (J,) s, velocity (J, 3) m/s and noise (J, 3, 3) (m/s)²; ENU, or body where in_body (J,).
+
+    claimed: (J,) where the noise is the message's, to which the DVL's is added; else it is that of both.
+    """
 
     times: Array
     velocity: Array
     noise: Array
     in_body: Mask
+    claimed: Mask
 
 
 class ImuColumns(NamedTuple):
@@ -113,13 +117,12 @@ def delayed_rows(
     index = np.flatnonzero(use)
     body, noise, turning = body[index], noise[index], turning[index]
     value, slope, spacing = read.velocity[index], read.slope[index], read.spacing[index]
+    added = np.where(reference.claimed[index, None, None], noise_dvl, 0.0)
     uncertain = _Uncertain(turning_noise, noise_dvl, read.slope_gain[index])
     interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)[index]
     # references closer together than the DVL's samples share these
     weight = np.clip(interval / spacing, 0.0, 1.0)
-    return _rows(
-        index, value, slope, body, turning, uncertain, noise + noise_dvl, interval, weight, template, lever_arm
-    )
+    return _rows(index, value, slope, body, turning, uncertain, noise + added, interval, weight, template, lever_arm)
 
 
 class _Uncertain(NamedTuple):
