@@ -50,7 +50,7 @@ class DiagnosisSettings:
     max_effects: int = 4
     ghost_share: float = 0.0008
     indistinguishable: float = 6.0
-    robust_level: float = 0.003
+    robust_level: float = 0.0005
     block: float = 20.0
     folds: int = 5
     noise_tolerance: float = 3.0
