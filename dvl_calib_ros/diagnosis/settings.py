@@ -55,9 +55,9 @@ class DiagnosisSettings:
     folds: int = 5
     noise_tolerance: float = 3.0
     unexplained_share: float = 0.25
-    unexplained_energy: float = 60.0
+    unexplained_energy: float = 80.0
     unexplained_size: float = 0.025
-    unexplained_held_out: float = 0.3
+    unexplained_held_out: float = 0.5
     prior_angle: float = 0.1
     prior_scale: float = 0.02
 
