@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 NAME = "demo"
 HELP = "live node, replay and truth side by side on a shipped bag"
-EXAMPLE = "dvl-calib demo --speed 40"
+EXAMPLE = "dvl-calib demo --speed 20"
 BAG = "harbour_box"
 # What the bag was simulated with, see bags/README.md
 MISALIGNMENT_DEG = (1.0, -1.5, 3.0)
@@ -34,7 +34,7 @@ SCALE_PERCENT = 0.5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
+    parser.add_argument("--speed", type=float, default=10.0, help="times real time; default: %(default)g")
     add_report_option(parser)
 
 
