@@ -8,7 +8,6 @@ NAME = "dvl_calib_ros"
 # The lowest versions that work: .ci/lowest.txt, with which CI runs the suite on Python 3.10.
 BAGS = ["rosbags>=0.11.7", "apsw>=3.46", "lz4>=4.3.2", 'backports.zstd>=1.0; python_version < "3.14"', "mcap>=1.2.1"]
 ROS_FREE = ["numpy>=1.26", "scipy>=1.11.1", "pyyaml>=6.0.1", "rich>=13.7", "joblib>=1.3", *BAGS]
-STATISTICS = ["statsmodels>=0.14"]
 REPORT = ["matplotlib>=3.6.3", "jinja2>=3.1.2"]
 DASK = ["distributed>=2023.9"]
 COMPLETION = ["argcomplete>=3.1"]
@@ -44,7 +43,7 @@ setup(
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "report/templates/*"]},
     python_requires=">=3.10",
-    install_requires=[*ROS_FREE, *STATISTICS, *REPORT],
+    install_requires=[*ROS_FREE, *REPORT],
     extras_require={"ros": ROS, "dask": DASK, "completion": COMPLETION, "docs": DOCS, "pandas": PANDAS, "test": TEST},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

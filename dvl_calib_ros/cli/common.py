@@ -137,7 +137,7 @@ def check_outputs(
     if hasattr(arguments, "overrides") and (initial := load(arguments).initial_calibration):
         read.append(Path(initial))
     for name in folders:
-        if os.path.islink(given[name]) and not given[name].exists():
+        if name in given and os.path.islink(given[name]) and not given[name].exists():
             raise InputError(f"{given[name]}: is a link that leads nowhere; give another name, or remove it first")
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0], read, as_options[1])

@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulation.twin_bags import write_twins
 
     parameters = common.load(arguments)
-    common.check_outputs(arguments, "json", "apply", "report")
+    common.check_outputs(arguments, "json", "apply", "report", folders=["twin"])
     write_report = report_writer(arguments, "write_diagnosis_report")
     discovery = common.discovered(arguments, arguments.bags, parameters)
     parameters = discovery.parameters

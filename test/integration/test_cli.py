@@ -40,7 +40,7 @@ def shell(*arguments, **environment) -> subprocess.CompletedProcess:
     [
         ("rosbags", ["replay", "bags/harbour_box"]),
         ("mcap", ["simulate", "new_bag"]),
-        ("statsmodels", ["diagnose", "bags/harbour_box"]),
+        ("scipy", ["diagnose", "bags/harbour_box"]),
     ],
 )
 def test_a_python_package_that_is_not_there_is_named_in_one_line(missing, arguments):

@@ -11,7 +11,7 @@ import pytest
 from conftest import ROOT
 
 PACKAGE = ROOT / "dvl_calib_ros"
-FOREIGN = ("rclpy", "rosbags", "mcap", "apsw", "lz4", "yaml", "rich", "matplotlib", "jinja2", "joblib", "statsmodels")
+FOREIGN = ("rclpy", "rosbags", "mcap", "apsw", "lz4", "yaml", "rich", "matplotlib", "jinja2", "joblib")
 # what a package may import of its siblings; one that is not listed may import all but commands and node
 MAY_IMPORT = {
     "calibration": {"errors"},

@@ -36,7 +36,8 @@ COMMAND = {
     ),
     "replay of a file": Command("replay loose/run.db3", (LOOSE, f"{LOOSE}-wal"), ("--json", "--save", "--report")),
     "diagnose": Command(
-        "diagnose bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--apply", "--report")
+        "diagnose bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--apply", "--report"),
+        ("--twin",),
     ),
     "doctor": Command("doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json",)),
     "evaluate": Command(
