@@ -325,16 +325,17 @@ def evaluate(
         Any of the node's parameters, in SI units.
     """
     from .evaluation.bags import cross_check
-    from .evaluation.evaluate import DEFAULTS
+    from .evaluation.evaluate import DEFAULTS, EVALUATED
     from .evaluation.evaluate import evaluate as run
     from .parallel import Workers
     from .replay.replay import Topics
 
-    names = tuple(MODELS) if models is None else tuple(models)
-    for name in names:
-        if name not in MODELS:
-            raise InputError(f"models: {name!r} is none of {', '.join(MODELS)}")
     found = [] if paths is None else _paths(paths)
+    known = tuple(MODELS) if len(found) > 1 else EVALUATED
+    names = known if models is None else tuple(models)
+    for name in names:
+        if name not in known:
+            raise InputError(f"models: {name!r} is none of {', '.join(known)}")
     if len(found) > 1:
         return cross_check(found, Parameters.from_mapping(parameters), names, Topics(), Workers())
     return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)

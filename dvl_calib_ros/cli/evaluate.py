@@ -53,11 +53,12 @@ def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
     from ..calibration.models import MODELS
     from ..errors import InputError
-    from ..evaluation.evaluate import DEFAULTS, evaluate
+    from ..evaluation.evaluate import DEFAULTS, EVALUATED, evaluate
     from ..evaluation.protocol import SETS
     from ..parallel import Workers
 
-    models = common.chosen("--models", arguments.models, tuple(MODELS))
+    are_bags = _are_bags(arguments.paths)
+    models = common.chosen("--models", arguments.models, tuple(MODELS) if are_bags else EVALUATED)
     sets = common.chosen("--sets", arguments.sets, [each.name for each in SETS])
     if not 1 <= arguments.seeds <= MAX_SEEDS:
         raise InputError(f"--seeds: {arguments.seeds} is outside 1 .. {MAX_SEEDS}")
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError(f"--jobs: {arguments.jobs} is negative; give a number of processes, or 0 for one per core")
     common.check_outputs(arguments, "json", "csv", "report")
     workers = Workers(arguments.jobs, arguments.dask)
-    if _are_bags(arguments.paths):
+    if are_bags:
         _cross_check(arguments, models, workers)
         return
     parameters = common.load(arguments, DEFAULTS)

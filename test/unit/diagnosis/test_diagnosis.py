@@ -129,7 +129,9 @@ def test_a_large_and_a_small_effect_in_one_recording_are_both_found():
 
 
 def test_two_late_streams_are_told_by_the_two_differences_that_matter_and_the_third_clock_is_named():
-    diagnosis = diagnosed(effects=["reference_time_offset:seconds=0.6", "attitude_time_offset:seconds=0.3"])
+    diagnosis = diagnosed(
+        effects=["reference_time_offset:seconds=0.6", "attitude_time_offset:seconds=0.3"], gnss_std=0.03
+    )
     assert_within(diagnosis, "dvl_time_offset", seconds=-0.3)
     assert_within(diagnosis, "reference_time_offset", seconds=0.3)
     assert all("attitude_time_offset" in effect.equivalent_to for effect in diagnosis.effects)

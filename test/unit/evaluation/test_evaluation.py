@@ -21,7 +21,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import metrics, protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
-from dvl_calib_ros.evaluation.evaluate import DEFAULTS, evaluate
+from dvl_calib_ros.evaluation.evaluate import DEFAULTS, EVALUATED, evaluate
 from dvl_calib_ros.evaluation.procedure import (
     Procedure,
     dvl_velocities,
@@ -101,9 +101,10 @@ def test_every_state_is_that_of_replaying_a_bag_of_the_same_data(options, runs, 
         replayed = replay([tmp_path / "bag"], parameters.replace(prior_source="fixed", prior_sway_heave=(sway, heave)))
     else:
         replayed = replay([tmp_path / "bag"], parameters)
-    states = estimate(tuple(MODELS), data, parameters, [50, 150])
-    assert set(states) == set(MODELS)
-    for name, expected in replayed.result.estimates.items():
+    states = estimate(EVALUATED, data, parameters, [50, 150])
+    assert set(states) == set(EVALUATED)
+    for name in EVALUATED:
+        expected = replayed.result.estimates[name]
         assert expected.used > 20
         np.testing.assert_allclose(states[name].x[-1, COMBINATION], expected.state, rtol=0, atol=1e-10)
         np.testing.assert_allclose(states[name].p[-1, COMBINATION], expected.covariance, rtol=0, atol=1e-10)
@@ -111,8 +112,8 @@ def test_every_state_is_that_of_replaying_a_bag_of_the_same_data(options, runs, 
 
 def test_a_model_that_needs_attitude_does_not_run_without(runs):
     data = sensor_data(runs["T14"].part(0, 60), seed=0)
-    states = estimate(tuple(MODELS), data, Parameters(**DEFAULTS), [60])
-    assert set(MODELS) - set(states) == {"A1"}
+    states = estimate(EVALUATED, data, Parameters(**DEFAULTS), [60])
+    assert set(EVALUATED) - set(states) == {"A1"}
 
 
 def test_the_truth_to_find_is_in_the_frame_of_the_estimates(runs):
@@ -174,7 +175,7 @@ def test_a_set_is_calibrated_on_its_own_window(evaluation):
 
 def test_calibrations_are_judged_on_samples_that_they_had_not_seen(evaluation):
     found = {(each.set_name, each.model): each for each in evaluation.held_out}
-    assert set(found) == {(each.name, model) for each in evaluation.sets for model in MODELS} - {
+    assert set(found) == {(each.name, model) for each in evaluation.sets for model in EVALUATED} - {
         ("E3", "A1"),
         ("E4", "A1"),
     }

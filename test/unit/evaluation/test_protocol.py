@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.evaluate import DEFAULTS
+from dvl_calib_ros.evaluation.evaluate import DEFAULTS, EVALUATED
 from dvl_calib_ros.evaluation.procedure import Procedure, run_seed
 from dvl_calib_ros.evaluation.results import UNCALIBRATED
 from dvl_calib_ros.evaluation.trajectories import load_folder
@@ -21,10 +20,10 @@ def scores(snapir):
     """Set -> column -> Avg.VRMSE m/s, mean over the seeds; one P0 and one R for all models with GNSS and without."""
     runs, notes = load_folder(snapir)
     assert not notes
-    procedure = Procedure(runs, tuple(MODELS), protocol.SETS, Parameters(**DEFAULTS), studies=False)
+    procedure = Procedure(runs, EVALUATED, protocol.SETS, Parameters(**DEFAULTS), studies=False)
     values = np.mean([[run.avg_vrmse for run in run_seed(procedure, seed).by_set] for seed in range(N_SEEDS)], axis=0)
     return {
-        each.name: dict(zip((UNCALIBRATED, *MODELS), row, strict=True))
+        each.name: dict(zip((UNCALIBRATED, *EVALUATED), row, strict=True))
         for each, row in zip(protocol.SETS, values.tolist(), strict=True)
     }
 
