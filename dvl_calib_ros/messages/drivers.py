@@ -217,6 +217,20 @@ def _dvl_msgs_definition(covariance: str = "", beams: str = "DVLBeam[]", times: 
 
 _TIMES = "int64 time_of_validity\nint64 time_of_transmission\n"
 
+# What drivers of one family of messages have in common
+_WATER_TRACK = Rule(
+    "water_track",
+    "`velocity_mode` is water track",
+    lambda message, _: message.velocity_mode == WATER_TRACK,
+    "that is velocity through the water, not over ground; let the DVL track the bottom",
+)
+_FEW_BEAMS = Rule(
+    "few_beams",
+    f"`num_good_beams` below {ENOUGH_BEAMS}",
+    lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
+    _CHECK_LOCK,
+)
+
 VELOCITY_TYPES: Mapping[str, VelocityType] = {
     each.name: each
     for each in (
@@ -257,12 +271,7 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             covariance_says="`velocity_covar`; -1 or zero: not given",
             points_down=True,  # the definition: z in the direction the DVL points, x forward
             rules=(
-                Rule(
-                    "water_track",
-                    "`velocity_mode` is water track",
-                    lambda message, _: message.velocity_mode == WATER_TRACK,
-                    "that is velocity through the water, not over ground; let the DVL track the bottom",
-                ),
+                _WATER_TRACK,
                 Rule(
                     "unknown_mode",
                     "`velocity_mode` is neither bottom nor water track",
@@ -270,12 +279,7 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
                     "let the driver fill velocity_mode (DVL_MODE_BOTTOM is 1)",
                 ),
                 _flagged("beam_velocities_valid"),  # where Water Linked's drivers put the sensor's velocity_valid
-                Rule(
-                    "few_beams",
-                    f"`num_good_beams` below {ENOUGH_BEAMS}",
-                    lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
-                    _CHECK_LOCK,
-                ),
+                _FEW_BEAMS,
                 _NO_BOTTOM,
                 _zero_velocity(_VELOCITY),
             ),
@@ -343,24 +347,14 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             lacks_covariance=lambda message: np.asarray(message.velocity_covar)[..., 0] == -1.0,
             covariance_says="`velocity_covar`; -1 or zero: not given",
             rules=(
-                Rule(
-                    "water_track",
-                    "`velocity_mode` is water track",
-                    lambda message, _: message.velocity_mode == WATER_TRACK,
-                    "that is velocity through the water, not over ground; let the DVL track the bottom",
-                ),
+                _WATER_TRACK,
                 Rule(
                     "other_axes",
                     "`coordinate_mode` is not that of the instrument",
                     lambda message, _: message.coordinate_mode != DS_INSTRUMENT,
                     "let the driver send velocities in the instrument's axes (DVL_COORD_INSTRUMENT is 1)",
                 ),
-                Rule(
-                    "few_beams",
-                    f"`num_good_beams` below {ENOUGH_BEAMS}",
-                    lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
-                    _CHECK_LOCK,
-                ),
+                _FEW_BEAMS,
                 _zero_velocity(_VELOCITY),
             ),
             install="build ds_msgs in your workspace",
