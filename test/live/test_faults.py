@@ -366,13 +366,14 @@ def test_a_best_effort_publisher_that_comes_later_is_heard_and_the_reliable_one_
 
 def test_a_storm_of_parameters_good_and_bad_costs_no_sample_and_ends_where_it_should(node):
     messages, names = as_messages(CLEAN), [*MODELS, "M9"]
-    refused = []
+    asked, refused = [], []
     for number in range(0, len(messages), 6):
         node.publish(messages[number : number + 6])
-        answer = node.world.set_parameter("model", names[number // 6 % len(names)])
+        asked.append(names[number // 6 % len(names)])
+        answer = node.world.set_parameter("model", asked[-1])
         refused += [] if answer.successful else [answer.reason]
-    assert len(refused) == 9 and all("'M9'" in reason for reason in refused)
-    assert node.world.set_parameter("model", "auto").successful
+    assert node.world.set_parameter("model", "auto").successful  # before anything fails: other tests share this node
+    assert asked.count("M9") > 5 and len(refused) == asked.count("M9") and all("'M9'" in reason for reason in refused)
     replay = Offline(PARAMETERS).feed(messages)
     saved, expected = node.when_like(replay), replay.calibrator.result()
     for name in MODELS:
