@@ -15,7 +15,7 @@ import numpy as np
 
 from .alignment import Aligner
 from .bank import ModelBank, ModelCounts, gate_of, nis_bounds, prior
-from .delay_filter import DelayFilter
+from .delay.filter import DelayFilter
 from .folds import Moments, folds_of
 from .frames import Array, Vector
 from .history import Counts, Numbers, StateTrace

@@ -10,8 +10,8 @@ from runs import START_NS, calibrate, feed, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.correction import lever_arm
+from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame

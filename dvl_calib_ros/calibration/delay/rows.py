@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import Array, Vector, rotation_from_quaternion, skew
+from ..frames import Array, Vector, rotation_from_quaternion, skew
+from ..models.own import g1_noise, linearise_g1
+from ..observations import Observations
+from ..samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
-from .models import g1_noise, linearise_g1
-from .observations import Observations
-from .samples import Index, Mask
 
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
 # (0.1 m/s² changing by 0.3 m/s³ bends by 1.5 mm/s).

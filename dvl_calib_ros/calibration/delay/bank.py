@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .correction_parameters import PriorOnErrors, to_correction
-from .delayed_rows import BEYOND, DELAY, DELAYS_S, N_STATE, DelayedRows
-from .folds import FOLDS
-from .frames import Array
-from .kalman import GaussianState
-from .samples import Index, Mask
-from .time_blocks import TimeBlocks
+from ..correction_parameters import PriorOnErrors, to_correction
+from ..folds import FOLDS
+from ..frames import Array
+from ..kalman import GaussianState
+from ..samples import Index, Mask
+from ..time_blocks import TimeBlocks
+from .rows import BEYOND, DELAY, DELAYS_S, N_STATE, DelayedRows
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
 CELL_STD_S = 0.2

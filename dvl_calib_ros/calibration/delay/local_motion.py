@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import Array
+from ..frames import Array
 
 # Samples on each side that a fit needs: with fewer it extrapolates.
 ON_EACH_SIDE = 2

@@ -8,15 +8,26 @@ waits for it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
-from .alignment import Aligner
-from .bank import ModelCounts
-from .coarse_mounting import CoarseFits
-from .delay_bank import DelayBank, Posterior
-from .delayed_rows import (
+from ..alignment import Aligner
+from ..bank import ModelCounts
+from ..coarse_mounting import CoarseFits
+from ..folds import folds_of
+from ..frames import ENU_FROM_NED, Array
+from ..kalman import GaussianState
+from ..observations import Assumptions, Observations
+from ..parameters import Parameters
+from ..samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
+from ..selection import NO_EVIDENCE, Evidence
+from ..streams import LONG_AGO_NS, LONGEST_NS, Track
+from ..tables import Table
+from ..verification import HeldOutError
+from .bank import DelayBank, Posterior
+from .hold_out import NOT_MEASURED, Kept, held_out_error, thinned
+from .rows import (
     BEYOND,
     DELAY,
     LEVER_ARM,
@@ -29,24 +40,9 @@ from .delayed_rows import (
     binned,
     delayed_rows,
 )
-from .error_model import CORRECTION_JACOBIAN, correction_matrix
-from .folds import FOLDS, folds_of
-from .frames import ENU_FROM_NED, Array, skew
-from .kalman import GaussianState
-from .observations import Assumptions, Observations
-from .parameters import Parameters
-from .samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
-from .selection import NO_EVIDENCE, Evidence
-from .streams import LONG_AGO_NS, LONGEST_NS, Track
-from .tables import Table
-from .verification import HeldOutError, held_out_from_sums
 
 BLOCK_NS = 10_000_000_000
 MARGIN_NS = round(MARGIN_S * 1e9)
-# What is kept for verification comes no faster than this, s: a velocity error is judged as well by five a second.
-KEPT_EVERY_S = 0.19
-# An axis that the reference does not measure says nothing: (m/s)²
-NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
 # No vehicle with a DVL turns faster, rad/s.
@@ -70,15 +66,6 @@ def _in_time(track: Track, from_ns: int, to_ns: int) -> Index:
     """Slots of a track's samples between two stamps that came in time: live, the others come when a block is closed."""
     span = track.between(track.stamps_ns, from_ns, to_ns)
     return np.flatnonzero(~track.late[span]) + span.start
-
-
-class _Kept(NamedTuple):
-    """Thinned columns of one block, for verification; times in s since the epoch of `DelayFilter`."""
-
-    dvl: DvlColumns
-    noise_dvl: Array
-    reference: ReferenceColumns
-    imu: ImuColumns
 
 
 class DelayFilter:
@@ -126,7 +113,7 @@ class DelayFilter:
         self.n_taken = 0  # rows of the aligner that have been looked at
         self._block_ns: int | None = None  # start of the next block
         self._epoch_ns = 0
-        self._kept: list[_Kept] | None = [] if verified else None
+        self._kept: list[Kept] | None = [] if verified else None
         self._posterior: Posterior | None = None
         self._changed = False
         self.restarted = 0
@@ -278,7 +265,8 @@ class DelayFilter:
         imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         self._compare_coarsely(block_ns, end_ns, dvl, imu)
         if self._kept is not None:
-            self._keep(block_ns, end_ns, dvl, noise_dvl, reference, imu)
+            from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
+            self._kept.append(Kept.between(from_s, to_s, dvl, noise_dvl, reference, imu))
         if len(dvl.times) < 6 or len(imu.times) < 2:
             return False
         p = self._parameters
@@ -361,129 +349,6 @@ class DelayFilter:
         stamps_ns = track.stamps_ns[at].copy()
         return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY, given), stamps_ns
 
-    # ------------------------------------------------------------------ verification
-
-    def _keep(
-        self,
-        block_ns: int,
-        end_ns: int,
-        dvl: DvlColumns,
-        noise_dvl: Array,
-        reference: ReferenceColumns,
-        imu: ImuColumns,
-    ) -> None:
-        """Keep a block's own columns, thinned."""
-        assert self._kept is not None
-        from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
-        first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
-        at = first + _thinned_seconds(dvl.times[first:last])
-        own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
-        first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
-        at = first + _thinned_seconds(imu.times[first:last])
-        self._kept.append(
-            _Kept(own, noise_dvl, reference, ImuColumns(imu.times[at], imu.orientation[at], imu.angular_velocity[at]))
-        )
-
     def held_out_error(self) -> HeldOutError | None:
-        """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
-
-        As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
-        less its delay, and the lever arm away from the reference point.
-        """
-        if not self._kept:
-            return None
-        recording = _Recording.of(self._kept)
-        p = self._parameters
-        folds = folds_of(np.round(recording.dvl.times * 1e9).astype(np.int64) + self._epoch_ns, p)
-        nominal = np.zeros(len(self._bank.prior.x))
-        sums = np.zeros(4)
-        samples = 0
-        for fold in range(FOLDS):
-            at = np.flatnonzero(folds == fold)
-            try:
-                state = self._bank.without_fold(fold)
-            except np.linalg.LinAlgError:  # as in `posterior`
-                return None
-            before = recording.errors(at, nominal, p)
-            after = recording.errors(at, state.x, p)
-            both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
-            jacobian = after.jacobian[both]
-            calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
-            noise = after.noise[both].sum()
-            squares = [(each.error[both] ** 2).sum() for each in (before, after)]
-            sums += [*squares, noise + calibration, calibration]
-            samples += int(np.count_nonzero(both))
-        return held_out_from_sums(samples, sums)
-
-
-class _Errors(NamedTuple):
-    """Of N DVL samples: reference less what the DVL says it is (N, 3) m/s, nan where there is none; its derivative by
-    the state (N, 3, n); and the variance that noise gives it (N,), summed over the axes."""
-
-    error: Array
-    jacobian: Array
-    noise: Array
-
-
-class _Recording(NamedTuple):
-    """All that was kept."""
-
-    dvl: DvlColumns
-    noise_dvl: Array
-    reference: ReferenceColumns
-    imu: ImuColumns
-
-    @staticmethod
-    def of(kept: list[_Kept]) -> _Recording:
-        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
-        noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
-        reference = zip(*(each.reference for each in kept), strict=True)
-        imu = zip(*(each.imu for each in kept), strict=True)
-        return _Recording(
-            dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
-        )
-
-    def errors(self, at: Index, state: Array, p: Parameters) -> _Errors:
-        """Errors of some DVL samples with a state (n,), interpolated as pairing does."""
-        n = len(at)
-        times, v = self.dvl.times[at] - state[DELAY], self.dvl.velocity[at]
-        stamps = self.reference.times
-        after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
-        gap = stamps[after] - stamps[after - 1]
-        part = ((times - stamps[after - 1]) / gap)[:, None]
-        g0, g1 = self.reference.velocity[after - 1], self.reference.velocity[after]
-        in_body = self.reference.in_body[after]
-        rotation, oriented = attitude_at(self.imu, times, p.imu_timeout)
-        body_from_reference = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
-        body = np.matmul(body_from_reference, (g0 + (g1 - g0) * part)[..., None])[..., 0]
-        rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
-        lever = np.array(p.lever_arm) + state[LEVER_ARM]
-        t = p.rotation_dvl_from_body
-        errors = np.array([*state[:3], *state[3:5], 0.0])
-        error = body + np.cross(rates, lever) - v @ correction_matrix(errors[:3], errors[3:], t).T
-        found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
-        found &= (v**2).sum(axis=1) >= p.min_speed**2
-        body_noise = body_from_reference @ self.reference.noise[after] @ body_from_reference.swapaxes(1, 2)
-        variance = np.diagonal(body_noise, axis1=1, axis2=2)
-        measured = variance < MEASURED_BELOW
-        error[~measured] = 0.0
-        error[~found] = np.nan
-        jacobian = np.zeros((n, 3, len(state)))
-        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
-        jacobian[:, :, LEVER_ARM] = skew(rates)
-        jacobian[:, :, DELAY] = -np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
-        jacobian[~measured] = 0.0
-        noise = np.where(measured, variance + self.noise_dvl[at, None] / 3.0, 0.0).sum(axis=1)
-        return _Errors(error, jacobian, noise)
-
-
-def thinned(stamps_ns: Stamps) -> Index:
-    """Those of increasing stamps that are at least KEPT_EVERY_S apart."""
-    return _thinned_seconds((stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0))
-
-
-def _thinned_seconds(times: Array) -> Index:
-    if len(times) < 2 or np.diff(times).min() >= KEPT_EVERY_S:
-        return np.arange(len(times))
-    bins = np.floor(times / KEPT_EVERY_S)
-    return np.flatnonzero(np.diff(bins, prepend=bins[0] - 1.0))
+        """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
+        return held_out_error(self._kept, self._bank, self._epoch_ns, self._parameters) if self._kept else None

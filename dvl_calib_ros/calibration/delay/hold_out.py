@@ -1,0 +1,146 @@
+"""G2 verified: the velocity error on samples that an estimate has not seen, with its lever arm and delay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..error_model import CORRECTION_JACOBIAN, correction_matrix
+from ..folds import FOLDS, folds_of
+from ..frames import Array, skew
+from ..parameters import Parameters
+from ..samples import Index, Stamps
+from ..verification import HeldOutError, held_out_from_sums
+from .bank import DelayBank
+from .rows import DELAY, LEVER_ARM, DvlColumns, ImuColumns, ReferenceColumns, attitude_at
+
+# What is kept comes no faster than this, s: a velocity error is judged as well by five a second.
+KEPT_EVERY_S = 0.19
+# An axis that the reference does not measure says nothing: (m/s)²
+NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
+
+
+class Kept(NamedTuple):
+    """Thinned columns of one block, for verification; times in s since the epoch of `DelayFilter`."""
+
+    dvl: DvlColumns
+    noise_dvl: Array
+    reference: ReferenceColumns
+    imu: ImuColumns
+
+    @staticmethod
+    def between(
+        from_s: float, to_s: float, dvl: DvlColumns, noise_dvl: Array, reference: ReferenceColumns, imu: ImuColumns
+    ) -> Kept:
+        """A block's own columns, thinned. noise_dvl: (3, 3) (m/s)²."""
+        first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
+        at = first + _thinned_seconds(dvl.times[first:last])
+        own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
+        first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
+        at = first + _thinned_seconds(imu.times[first:last])
+        turning = ImuColumns(imu.times[at], imu.orientation[at], imu.angular_velocity[at])
+        return Kept(own, noise_dvl, reference, turning)
+
+
+def held_out_error(kept: Sequence[Kept], bank: DelayBank, epoch_ns: int, p: Parameters) -> HeldOutError | None:
+    """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
+
+    As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
+    less its delay, and the lever arm away from the reference point.
+    """
+    recording = _Recording.of(kept)
+    folds = folds_of(np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns, p)
+    nominal = np.zeros(len(bank.prior.x))
+    sums = np.zeros(4)
+    samples = 0
+    for fold in range(FOLDS):
+        at = np.flatnonzero(folds == fold)
+        try:
+            state = bank.without_fold(fold)
+        except np.linalg.LinAlgError:  # as in `posterior`
+            return None
+        before = recording.errors(at, nominal, p)
+        after = recording.errors(at, state.x, p)
+        both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
+        jacobian = after.jacobian[both]
+        calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
+        noise = after.noise[both].sum()
+        squares = [(each.error[both] ** 2).sum() for each in (before, after)]
+        sums += [*squares, noise + calibration, calibration]
+        samples += int(np.count_nonzero(both))
+    return held_out_from_sums(samples, sums)
+
+
+class _Errors(NamedTuple):
+    """Of N DVL samples: reference less what the DVL says it is (N, 3) m/s, nan where there is none; its derivative by
+    the state (N, 3, n); and the variance that noise gives it (N,), summed over the axes."""
+
+    error: Array
+    jacobian: Array
+    noise: Array
+
+
+class _Recording(NamedTuple):
+    """All that was kept."""
+
+    dvl: DvlColumns
+    noise_dvl: Array
+    reference: ReferenceColumns
+    imu: ImuColumns
+
+    @staticmethod
+    def of(kept: Sequence[Kept]) -> _Recording:
+        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
+        noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
+        reference = zip(*(each.reference for each in kept), strict=True)
+        imu = zip(*(each.imu for each in kept), strict=True)
+        return _Recording(
+            dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
+        )
+
+    def errors(self, at: Index, state: Array, p: Parameters) -> _Errors:
+        """Errors of some DVL samples with a state (n,), interpolated as pairing does."""
+        n = len(at)
+        times, v = self.dvl.times[at] - state[DELAY], self.dvl.velocity[at]
+        stamps = self.reference.times
+        after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+        gap = stamps[after] - stamps[after - 1]
+        part = ((times - stamps[after - 1]) / gap)[:, None]
+        g0, g1 = self.reference.velocity[after - 1], self.reference.velocity[after]
+        in_body = self.reference.in_body[after]
+        rotation, oriented = attitude_at(self.imu, times, p.imu_timeout)
+        body_from_reference = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+        body = np.matmul(body_from_reference, (g0 + (g1 - g0) * part)[..., None])[..., 0]
+        rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
+        lever = np.array(p.lever_arm) + state[LEVER_ARM]
+        t = p.rotation_dvl_from_body
+        errors = np.array([*state[:3], *state[3:5], 0.0])
+        error = body + np.cross(rates, lever) - v @ correction_matrix(errors[:3], errors[3:], t).T
+        found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
+        found &= (v**2).sum(axis=1) >= p.min_speed**2
+        body_noise = body_from_reference @ self.reference.noise[after] @ body_from_reference.swapaxes(1, 2)
+        variance = np.diagonal(body_noise, axis1=1, axis2=2)
+        measured = variance < MEASURED_BELOW
+        error[~measured] = 0.0
+        error[~found] = np.nan
+        jacobian = np.zeros((n, 3, len(state)))
+        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
+        jacobian[:, :, LEVER_ARM] = skew(rates)
+        jacobian[:, :, DELAY] = -np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
+        jacobian[~measured] = 0.0
+        noise = np.where(measured, variance + self.noise_dvl[at, None] / 3.0, 0.0).sum(axis=1)
+        return _Errors(error, jacobian, noise)
+
+
+def thinned(stamps_ns: Stamps) -> Index:
+    """Those of increasing stamps that are at least KEPT_EVERY_S apart."""
+    return _thinned_seconds((stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0))
+
+
+def _thinned_seconds(times: Array) -> Index:
+    if len(times) < 2 or np.diff(times).min() >= KEPT_EVERY_S:
+        return np.arange(len(times))
+    bins = np.floor(times / KEPT_EVERY_S)
+    return np.flatnonzero(np.diff(bins, prepend=bins[0] - 1.0))

@@ -1,0 +1,186 @@
+"""G1, G2, F1 and A1, our own models; derivations are in the docstrings of `linearise_g1`, `_f1` and `_a1`.
+
+G2 is G1 with more states; it is filtered by `calibration.delay`. All hold in any right-handed frame with x ahead.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..frames import Array, skew
+from ..observations import Observations
+from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance
+
+# A DVL axis shows its scale from this speed along it, m/s: a DVL noise of 0.01 m/s then pulls by 0.1 per cent at most,
+# while a scale error of 0.5 per cent that is left out costs 1.5 mm/s.
+SCALE_SHOWN_FROM = 0.3
+
+
+def linearise_g1(seen: Observations) -> Linearised:
+    """z = Tᵀr' - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), -k] on ψ, κ, h; body frame.
+
+    The models of the paper put the noisy GNSS velocity r into H: noise in a regressor pulls its coefficient, here the
+    scale, down ("errors in variables"). Here the correction itself is estimated,
+
+        T v_b = (I - [ψ×] - diag(κ)) v,
+
+    with the DVL's v, twenty times less noisy, in H; what pull is left is σ_dvl²/‖v‖². It is exactly linear in ψ and
+    κ; `correction_parameters` turns them into φ and δk.
+
+    r' = g - k g_z is the GNSS velocity as known after the heave assumption 0 = g_z - h + noise, weighed with its own
+    variance against the receiver's. The heave h, constant (trim), is a state. In the row of heave κ acts on level
+    motion only: what is assumed to be near zero must not be read as a scale that makes it so. Nor does an axis say
+    anything of its scale while it moves so slowly that its own noise would pull (SCALE_SHOWN_FROM).
+    """
+    assert seen.reference_body is not None
+    r = seen.reference_body - seen.heave_gain * seen.reference_body[:, 2:]
+    if seen.lever_velocity is not None:
+        r = r + seen.lever_velocity
+    body_from_dvl = seen.rotation_dvl_from_body.T
+    measured = seen.velocity_dvl @ body_from_dvl.T
+    level = measured * (1.0, 1.0, 0.0) @ body_from_dvl
+    fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
+    h = np.zeros((len(r), 3, 6))
+    h[:, :, :3] = np.matmul(body_from_dvl, skew(seen.velocity_dvl))
+    h[:, :2, 3:5] = -(body_from_dvl[:2] * (fast * seen.velocity_dvl)[:, None, :])[:, :, :2]
+    h[:, 2, 3:5] = -(body_from_dvl[2] * fast * level)[:, :2]
+    h[:, :, 5] = -seen.heave_gain
+    return r - measured, h
+
+
+def g1_noise(seen: Observations) -> Array:
+    """Covariance of r': (I - k e_zᵀ) R, body frame."""
+    r = seen.noise_in_body
+    noise: Array = r - seen.heave_gain[:, :, None] * r[:, 2:3, :]
+    return noise
+
+
+# Sway of a vehicle that turns unseen, m/s
+UNSEEN_TURN_SWAY_STD = 0.1
+
+
+def _f1(seen: Observations) -> Linearised:
+    """z = (Tᵀv)_yz, H = [-(Tᵀ[v×])_yz, 1] on φ, s, h: sway and heave are unknown constants, not zeros.
+
+    (Tᵀ(v + [v×]φ))_y = s, (...)_z = h. Where M7 compares lengths, which feel a misalignment only to second order and
+    so find half of it, the direction of travel feels all of it; how much of the sway is taken for misalignment and
+    how much for current is what their prior variances say, (σ_φ ‖v‖)² against σ_c². Roll would show where sway and
+    heave vary together, but in turns they do so by themselves: of [v×] only the motion ahead is used.
+    """
+    ahead = np.zeros_like(seen.velocity_in_body)
+    ahead[:, 0] = seen.velocity_in_body[:, 0]
+    h = np.zeros((len(ahead), 2, 5))
+    h[:, :, :3] = -(skew(ahead) @ seen.rotation_dvl_from_body.T)[:, 1:]
+    h[:, 0, 3] = h[:, 1, 4] = 1.0
+    return seen.velocity_in_body[:, 1:], h
+
+
+def _f1_noise(seen: Observations) -> Array:
+    heave = seen.assumptions.motion_std**2
+    return np.diag([heave + UNSEEN_TURN_SWAY_STD**2, heave, 1.0])[None]
+
+
+# Sway and heave that a turn leaves beside what is in proportion to it, s: m/s per (rad/s of turn · m/s of speed).
+# On Snapir, vehicles skid by 1.8 s and leave a third of it unexplained.
+TURN_SWAY_STD_S, TURN_HEAVE_STD_S = 1.0, 0.5
+# A vehicle more than this far from upright does not hold depth by its pitch.
+UPRIGHT = 0.5
+
+
+def _a1(seen: Observations) -> Linearised:
+    """Sway of a current and of turns, heave of a pitch: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h.
+
+    (Tᵀ(v + [v×]φ))_y = (Rᵀc)_y + b ω_z u: a constant current c turns with the heading, a misalignment does not, so
+    flying several headings tells them apart; b is the skid in turns. On one heading c and φ about z are the same to
+    the data and their priors decide, as in F1.
+    (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of a vehicle that holds its depth with this pitch and roll, the
+    vertical axis R's third row being n: n·v_b = 0. d = -1 is one that moves where it points; data with changing
+    pitch tells. R = rotation_enu_from_body, u the measured speed ahead.
+    """
+    rotation, rates, v = seen.rotation_enu_from_body, seen.angular_velocity, seen.velocity_in_body
+    assert rotation is not None and rates is not None
+    up = rotation[:, 2]
+    upright = np.abs(up[:, 2]) > UPRIGHT
+    level_heave = np.where(upright, -(up[:, 0] * v[:, 0] + up[:, 1] * v[:, 1]) / np.where(upright, up[:, 2], 1.0), 0.0)
+    h = np.zeros((len(v), 2, 8))
+    h[:, :, :3] = -seen.body_from_measured[:, 1:]
+    h[:, 0, 3:5] = rotation[:, :2, 1]
+    h[:, 0, 5] = rates[:, 2] * v[:, 0]
+    h[:, 1, 6] = level_heave
+    h[:, 1, 7] = 1.0
+    z = v[:, 1:].copy()
+    z[:, 1] -= level_heave
+    return z, h
+
+
+def _a1_noise(seen: Observations) -> Array:
+    assert seen.angular_velocity is not None
+    turn = seen.angular_velocity[:, 2] * seen.velocity_in_body[:, 0]
+    noise = np.zeros((len(turn), 3, 3))
+    noise[:, 0, 0] = (TURN_SWAY_STD_S * turn) ** 2
+    noise[:, 1, 1] = (TURN_HEAVE_STD_S * turn) ** 2
+    noise += seen.assumptions.motion_std**2 * np.eye(3)
+    return noise
+
+
+_SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
+_SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
+# What shows the states that only G2 has, by name.
+_SHOWN_TO_G2 = {
+    "lever_arm_x": "turns to both sides, or of different sharpness (needs angular velocity)",
+    "lever_arm_y": "turns to both sides, or of different sharpness (needs angular velocity)",
+    "lever_arm_z": "rolling and pitching: waves, or dives (needs angular velocity)",
+    "time_offset": "speeding up and slowing down, entering and leaving turns (needs angular velocity)",
+}
+
+OWN = (
+    Model(
+        "G1", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS,
+        assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
+        wrong_when="trimmed by more than heave_offset_std, or heaving in long waves beyond motion_std",
+        scale_axes=_SCALE_PER_AXIS,
+        nuisance=(Nuisance("heave", "m/s", "heave_offset_std"),),
+        noise=g1_noise,
+        rows_in_body=True,
+        in_correction_parameters=True,
+    ),
+    Model(
+        "G2", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS | _SHOWN_TO_G2,
+        assumes="as G1, with a DVL anywhere on the vehicle whose stamps are off by up to 3 s; needs angular velocity",
+        wrong_when="the delay changes along the run; a vehicle that bends",
+        scale_axes=_SCALE_PER_AXIS,
+        nuisance=(
+            Nuisance("heave", "m/s", "heave_offset_std"),
+            Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
+            Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
+            Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
+            Nuisance("time_offset", "s", "initial_std_time_offset"),
+        ),
+        noise=g1_noise,
+        rows_in_body=True,
+        in_correction_parameters=True,
+        extends="G1",
+    ),
+    Model(
+        "F1", Needs.NOTHING, 2, _f1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
+        assumes="no GNSS; sway and heave near unknown constants, as large as current_std and heave_offset_std say",
+        wrong_when="a current stronger than current_std; a run that is mostly turning",
+        nuisance=(Nuisance("sway", "m/s", "current_std"), Nuisance("heave", "m/s", "heave_offset_std")),
+        noise=_f1_noise,
+        motion_is_noise=True,
+    ),
+    Model(
+        "A1", Needs.ATTITUDE, 2, _a1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
+        assumes="attitude, no GNSS; a constant current, skid in proportion to the turn rate, depth held or pitch flown",
+        wrong_when="on one heading (then it is F1: yaw and current are the same); a current that changes along the run",
+        nuisance=(
+            Nuisance("current_east", "m/s", "current_std"),
+            Nuisance("current_north", "m/s", "current_std"),
+            Nuisance("skid", "s", 3.0),
+            Nuisance("dive", "", 0.5),
+            Nuisance("heave", "m/s", "heave_offset_std"),
+        ),
+        noise=_a1_noise,
+        motion_is_noise=True,
+    ),
+)  # fmt: skip
