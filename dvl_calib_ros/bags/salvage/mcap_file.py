@@ -67,6 +67,7 @@ def _summary(file: BinaryIO) -> Summary | None:
     start, _, _, magic = _FOOTER.unpack(file.read(_FOOTER.size))
     if magic != MCAP_MAGIC:
         raise DamagedError("it does not end as a finished recording does")
+    _check_no_chunk(file, start, size)
     # The library looks for the magic bytes wherever the file stands; those at the beginning may be unreadable.
     file.seek(size - len(MCAP_MAGIC))
     try:
@@ -77,6 +78,18 @@ def _summary(file: BinaryIO) -> Summary | None:
         lost = sum(last - first for first, last in holes)
         raise DamagedError(f"{lost} bytes of its index cannot be read from the disk")
     return summary
+
+
+def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
+    """Raise DamagedError if an index that begins at `start` holds a chunk, which the library would unpack unbounded."""
+    at = start
+    while 0 < at < size - _FOOTER.size:
+        opcode, length = record_head(file, at)
+        if opcode == Opcode.CHUNK:
+            raise DamagedError(f"its index would begin at byte {start}, before messages")
+        if opcode == Opcode.FOOTER:
+            return
+        at += RECORD_HEAD.size + length
 
 
 def bytes_at_once(summary: Summary, channels: Collection[int]) -> int:

@@ -263,6 +263,25 @@ def test_a_chunk_that_unpacks_to_gigabytes_takes_no_memory(tmp_path, compression
     assert found == [] and notes
 
 
+@pytest.mark.parametrize("compression", [LZ4, ZSTD])
+@pytest.mark.parametrize("content_of_chunk", ["as recorded", "damaged", "gigabytes"])
+def test_a_footer_that_names_a_chunk_as_the_index_costs_no_message_and_no_memory(
+    tmp_path, compression, content_of_chunk
+):
+    whole = bytearray(bomb(compression, 2_500_000_000) if content_of_chunk == "gigabytes" else content(compression))
+    number = 0 if content_of_chunk == "gigabytes" else 2
+    begin, end, *_ = damage.chunk_spans(content(compression))[number]
+    whole[-28:-20] = struct.pack("<Q", begin)
+    if content_of_chunk == "damaged":
+        whole[end - 300 : end - 200] = bytes(100)
+    with limited_memory():
+        found, notes = read(tmp_path, bytes(whole))
+    before, after = (chunks(compression)[at][1] for at in (number - 1, number))
+    expected = {"as recorded": messages(), "damaged": messages()[:before] + messages()[after:], "gigabytes": ()}
+    assert tuple(found) == expected[content_of_chunk]
+    assert notes
+
+
 def test_a_compressed_message_that_unpacks_to_gigabytes_is_left_out_and_told_of(tmp_path):
     good = messages()[:3]
     packed = [("dvl/twist", 5, zstd_zeros(2_500_000_000)), ("dvl/twist", 6, zstd.compress(b"x" * 99)[:-9])]
