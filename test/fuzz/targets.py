@@ -7,6 +7,7 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
+from wholes import Names, names_seeds, run_names, run_settings, settings_seeds
 
 from dvl_calib_ros.bags.definitions import Definition, DefinitionError, typestore
 from dvl_calib_ros.bags.reader import BagReader
@@ -328,4 +330,10 @@ TARGETS = {
     "override": Target(run_override, _override_seeds),
     "urdf": Target(run_urdf, _urdf_seeds),
     "trajectory": Target(run_trajectory, _trajectory_seeds),
+    "settings": Target(run_settings, settings_seeds),
+    "names": Target(partial(run_names, names=Names(FOLDER, _SMALLEST_BAG)), names_seeds),
 }
+with suppress(ImportError):  # without ROS 2 there is no live node
+    from live import live_seeds, run_live
+
+    TARGETS["live"] = Target(partial(run_live, folder=FOLDER), live_seeds)
