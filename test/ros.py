@@ -19,7 +19,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 
-from dvl_calib_ros.node.domain import free_domain
+from dvl_calib_ros.node.domain import give_back, take_domain
 
 PATIENCE_S = 60.0
 RETRY_S = 3.0
@@ -55,7 +55,7 @@ class World:
 
     def __init__(self) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        self.domain = free_domain()
+        self.domain = take_domain()
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=self.domain)
         self.node = rclpy.create_node("test_client", context=self.context)
@@ -74,6 +74,7 @@ class World:
         self._spinning.join()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
+        give_back(self.domain)
 
     def call(self, service_type: type, name: str, request: Any = None) -> Any:
         """Answer of a service.

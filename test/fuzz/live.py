@@ -24,7 +24,7 @@ from wholes import assert_sound
 from dvl_calib_ros.calibration.parameters import SCHEMA
 from dvl_calib_ros.files.result_file import load_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode
-from dvl_calib_ros.node.domain import free_domain
+from dvl_calib_ros.node.domain import take_domain
 
 _STEPS_NS = (0, 50_000_000, 200_000_000, -50_000_000, 3 * 10**9, -(10**9), 60 * 10**9, 10**17)
 _AT_RUN_TIME = tuple(name for name, spec in SCHEMA.items() if not spec.read_only and name != "result_file")
@@ -37,7 +37,7 @@ def _node(folder: Path) -> CalibrationNode:
     """One for all inputs, heard by nobody."""
     os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_LOG_DIR": str(folder)}
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=free_domain())
+    rclpy.init(context=context, domain_id=take_domain())
     result = Parameter("result_file", value=str(folder / "live.yaml"))
     node = CalibrationNode(context=context, parameter_overrides=[result])
     node.get_logger().set_level(LoggingSeverity.FATAL)
