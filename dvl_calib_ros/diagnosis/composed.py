@@ -4,9 +4,9 @@ The physics of `effects.composition`, gone backwards. At a true time s, with the
 
     u = D⁻¹ (v_dvl - T traces on DVL(u))        v = u - traces on MOTION(v)        e = v - g - traces on REFERENCE(v)
 
-with D = (I + diag(δk)) Exp(φ) T the calibration and g the reference velocity in the body frame. Exp(φ) is the rotation
-that I + [φ×] stands for. Nothing is paired: every stream is a curve of its own, so a delay of seconds is a change of
-argument, and e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
+with D = (I + diag(δk)) Exp(φ + turns on MOUNTING(u)) T and g the reference velocity in the body frame. Exp(φ) is the
+rotation that I + [φ×] stands for. Nothing is paired: every stream is a curve of its own, so a delay of seconds is a
+change of argument, and e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
 
 Regressors are made of the smoothed DVL velocity, whose noise is small; those made from the reference would pull
 estimates towards zero (errors in variables).
@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array, skew
 from ..calibration.samples import VelocityFrame
-from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, Needs, ParameterSpec
-from ..effects.composition import Injection, late, traces
+from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, MountingEffect, Needs, ParameterSpec
+from ..effects.composition import Injection, late, traces, turns
 from .noise import segments_of
 from .recordings import Curve, Recording
 from .settings import SETTINGS
@@ -96,7 +96,6 @@ class Hypothesis:
 
     def moved(self, step: Array) -> Hypothesis:
         """A step (6 + p,) on, within the bounds of each parameter."""
-        phi = (Rotation.from_rotvec(step[:3]) * Rotation.from_rotvec(self.phi)).as_rotvec()
         values = {name: [dict(each) for each in per] for name, per in self.values.items()}
         for parameter, change in zip(self.parameters(), step[6:].tolist(), strict=True):
             spec = parameter.spec
@@ -104,7 +103,10 @@ class Hypothesis:
             for recording in range(len(per)) if parameter.recording is None else [parameter.recording]:
                 per[recording][spec.name] = float(np.clip(per[recording][spec.name] + change, spec.low, spec.high))
         return replace(
-            self, phi=phi, scale=self.scale + step[3:6], values={name: tuple(per) for name, per in values.items()}
+            self,
+            phi=self.phi + step[:3],
+            scale=self.scale + step[3:6],
+            values={name: tuple(per) for name, per in values.items()},
         )
 
     def with_effects(self, effects: Sequence[Effect], n: int, start: Mapping[str, tuple[Values, ...]]) -> Hypothesis:
@@ -115,11 +117,11 @@ class Hypothesis:
         }
         return replace(self, effects=tuple(effects), values=values)
 
-    def body_from_measured(self, rotation_dvl_from_body: Array) -> Array:
-        """D⁻¹ (3, 3)."""
-        turned = Rotation.from_rotvec(self.phi).as_matrix() @ rotation_dvl_from_body
-        matrix: Array = turned.T / (1.0 + self.scale)
-        return matrix
+    def body_from_measured(self, rotation_dvl_from_body: Array, turn: Array | None = None) -> Array:
+        """D⁻¹ (3, 3), or (N, 3, 3) if what the mounting is turned on top of φ is (N, 3)."""
+        angles = self.phi if turn is None else self.phi + turn
+        turned = Rotation.from_rotvec(angles).as_matrix() @ rotation_dvl_from_body
+        return np.swapaxes(turned, -1, -2) / (1.0 + self.scale)
 
 
 def no_effect(phi: Array | None = None, scale: Array | None = None) -> Hypothesis:
@@ -131,6 +133,7 @@ def no_effect(phi: Array | None = None, scale: Array | None = None) -> Hypothesi
 class Seen:
     """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
     (F, 3) m/s smoothed DVL velocity, its frame. rate_of_change: (F, 3) m/s² of it. error: (F, 3) e, body frame.
+    angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
     """
 
     motion: EffectInput
@@ -138,6 +141,8 @@ class Seen:
     measured: Array
     rate_of_change: Array
     error: Array
+    angles: Array
+    body_from_measured: Array
 
 
 @dataclass(frozen=True)
@@ -283,15 +288,21 @@ class Problem:
         if stream.frame is not VelocityFrame.BODY:
             g = np.einsum("nji,nj->ni", rotation, g)
         raw, smooth, change = self._kept_at("dvl", recording, dvl, lambda: _measured(stream.dvl, dvl, by_dvl))
-        matrix = hypothesis.body_from_measured(self.rotation_dvl_from_body)
-        from_nominal = (matrix @ self.rotation_dvl_from_body).T
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else np.cross(rates, self.lever_arm)
-        at_dvl = EffectInput(time, smooth @ matrix.T, self.rotation_dvl_from_body, rotation, rates, stream.frame, 0.0)
-        at_dvl, of_dvl = _undone(injections, at_dvl, ActsOn.DVL, from_nominal)
+        nominal = self.rotation_dvl_from_body
+        turn: Array = np.zeros(3)
+        matrix = hypothesis.body_from_measured(nominal)
+        measured = EffectInput(time, _turned(matrix, smooth), nominal, rotation, rates, stream.frame, 0.0)
+        if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
+            # turned a little otherwise, it is as fast
+            turn = turns(injections, _undone(injections, measured, ActsOn.DVL, matrix @ nominal)[0])
+            matrix = hypothesis.body_from_measured(nominal, turn)
+            measured = replace(measured, velocity_body=_turned(matrix, smooth))
+        at_dvl, of_dvl = _undone(injections, measured, ActsOn.DVL, matrix @ nominal)
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
-        error = raw @ matrix.T - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
-        return Seen(motion, at_dvl, smooth, change, error)
+        error = _turned(matrix, raw) - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
+        return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix)
 
     def _oriented(self, stream: Recording, at: Array) -> tuple[Array | None, Array | None]:
         rotation = stream.rotation_enu_from_body(at) if Needs.ATTITUDE in self.available else None
@@ -356,12 +367,10 @@ class Problem:
 
     def calibration_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
         """(M, A, 6) d e / d (φ, δk)."""
-        turned = Rotation.from_rotvec(hypothesis.phi).as_matrix() @ self.rotation_dvl_from_body
         parts = []
         for each in seen:
-            y = each.measured / (1.0 + hypothesis.scale)
-            columns = np.concatenate([skew(y), -(y / (1.0 + hypothesis.scale))[:, :, None] * np.eye(3)], axis=2)
-            parts.append(np.einsum("ji,njk->nik", turned, columns))
+            by_scale = -(each.measured / (1.0 + hypothesis.scale))[:, None, :] * each.body_from_measured
+            parts.append(np.concatenate([_by_turn(hypothesis, each), by_scale], axis=2))
         return self.binned(parts, seen)
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
@@ -388,23 +397,25 @@ class Problem:
         """(F, 3, p), body frame."""
         specs = amplitudes(effect)
         if isinstance(effect, ClockEffect):
-            by_late = self._by_late(hypothesis, seen, effect.acts_on)
+            by_late = self._by_late(seen, effect.acts_on)
             slopes = [_difference(spec, values, lambda at: effect.late(seen.motion.time, at)) for spec in specs]
             return np.stack([by_late * slope[:, None] for slope in slopes], axis=2)
+        if isinstance(effect, MountingEffect):
+            slopes = [_difference(spec, values, lambda at: effect.turn(seen.at_dvl, at)) for spec in specs]
+            by_turn = _by_turn(hypothesis, seen)
+            stacked = np.stack([np.broadcast_to(slope, seen.error.shape) for slope in slopes], axis=2)
+            return np.asarray(by_turn @ stacked)
         motion = seen.at_dvl if effect.acts_on is ActsOn.DVL else seen.motion
         slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
         stacked = -np.stack(slopes, axis=2)
         if effect.acts_on is not ActsOn.DVL:
             return stacked
-        matrix = hypothesis.body_from_measured(self.rotation_dvl_from_body) @ self.rotation_dvl_from_body
-        return np.einsum("ij,njk->nik", matrix, stacked)
+        return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ stacked)
 
-    def _by_late(self, hypothesis: Hypothesis, seen: Seen, clock: ActsOn) -> Array:
+    def _by_late(self, seen: Seen, clock: ActsOn) -> Array:
         """(F, 3) d e / d lateness of a clock, m/s per s, body frame."""
         if clock is ActsOn.DVL_CLOCK:
-            matrix = hypothesis.body_from_measured(self.rotation_dvl_from_body)
-            changed: Array = seen.rate_of_change @ matrix.T
-            return changed
+            return _turned(seen.body_from_measured, seen.rate_of_change)
         motion = seen.motion
         turning = np.zeros_like(motion.velocity_body)
         if motion.angular_velocity is not None and motion.reference_frame is not VelocityFrame.BODY:
@@ -431,9 +442,32 @@ def _undone(
         return motion, added
     for _ in range(_PASSES):
         added = traces(injections, motion, acts_on)
-        added = added if turned is None else added @ turned
+        added = added if turned is None else _turned(turned, added)
         motion = replace(motion, velocity_body=after - added)
     return motion, added
+
+
+def _turned(matrix: Array, values: Array) -> Array:
+    """(N, 3) values, multiplied by one matrix (3, 3) or by one each (N, 3, 3)."""
+    return values @ matrix.T if matrix.ndim == 2 else np.asarray(np.einsum("nij,nj->ni", matrix, values))
+
+
+def _by_turn(hypothesis: Hypothesis, seen: Seen) -> Array:
+    """(F, 3, 3) d e / d (φ + turns), body frame.
+
+    D⁻¹ y with y the unscaled velocity is Exp(θ)ᵀ y, and Exp(θ + δ) = Exp(J δ) Exp(θ) with J the left Jacobian.
+    """
+    matrix = seen.body_from_measured * (1.0 + hypothesis.scale)
+    return np.asarray(matrix @ skew(seen.measured / (1.0 + hypothesis.scale)) @ _left_jacobian(seen.angles))
+
+
+def _left_jacobian(angles: Array) -> Array:
+    """(..., 3, 3) of rotation vectors (..., 3) rad: I + (1 - cos θ) / θ² [θ×] + (θ - sin θ) / θ³ [θ×]²."""
+    square = np.maximum((angles**2).sum(axis=-1), 1e-12)[..., None, None]
+    size = np.sqrt(square)
+    cross = skew(angles)
+    once, twice = (1.0 - np.cos(size)) / square, (size - np.sin(size)) / (square * size)
+    return np.asarray(np.eye(3) + once * cross + twice * (cross @ cross))
 
 
 def _difference(spec: ParameterSpec, values: Values, of: Callable[[Values], Array]) -> Array:

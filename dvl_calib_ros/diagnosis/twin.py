@@ -9,7 +9,7 @@ import numpy as np
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn, EffectInput
-from ..effects.composition import at_dvl, late, traces
+from ..effects.composition import at_dvl, late, traces, turns
 from .composed import Hypothesis, Problem
 from .recordings import Recording
 from .selection import Selection
@@ -61,6 +61,6 @@ def _simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     moved = at_dvl(injections, motion)
     if rates is not None:
         moved = replace(moved, velocity_body=moved.velocity_body + np.cross(rates, problem.lever_arm))
-    measured_from_body = np.linalg.inv(hypothesis.body_from_measured(nominal))
-    measured: Array = moved.velocity_body @ measured_from_body.T + traces(injections, moved, ActsOn.DVL) @ nominal.T
-    return measured
+    calibration = np.linalg.inv(hypothesis.body_from_measured(nominal, turns(injections, moved)))
+    measured = np.einsum("...ij,...j->...i", calibration, moved.velocity_body)
+    return np.asarray(measured + traces(injections, moved, ActsOn.DVL) @ nominal.T)

@@ -13,6 +13,7 @@ from enum import Enum
 from typing import ClassVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
@@ -77,15 +78,20 @@ class Needs(Enum):
 class ActsOn(Enum):
     """Where an effect stands in the order of physics, in which these follow each other.
 
-    MOTION: the velocity at which the DVL is moved, at the time of measurement. DVL: what it makes of that, beside the
-    calibration D = (I + diag(δk)) (I + [φ×]). DVL_CLOCK: when it says that was. REFERENCE: the simulator takes the
-    trace off the reference velocity. REFERENCE_CLOCK, ATTITUDE_CLOCK: when these say that was. Traces are in the body
-    frame:
+    MOTION: the velocity at which the DVL is moved, at the time of measurement. MOUNTING: how the DVL is turned against
+    that, on top of the misalignment φ. DVL: what it makes of it, beside the calibration. DVL_CLOCK: when it says that
+    was. REFERENCE: the simulator takes the trace off the reference velocity. REFERENCE_CLOCK, ATTITUDE_CLOCK: when
+    these say that was. Traces are in the body frame:
 
-        u = v + traces on MOTION(v)        v_dvl = D T u + T traces on DVL(u)        stamped s + late on DVL_CLOCK
+        u = v + traces on MOTION(v)                 D = (I + diag(δk)) Exp(φ + turns on MOUNTING(u)) T
+        v_dvl = D u + T traces on DVL(u)            stamped s + late on DVL_CLOCK
+
+    Within one stage traces, turns and lateness add up. An effect on a clock is a `ClockEffect`, one on the mounting a
+    `MountingEffect`; any other an `Effect`.
     """
 
     MOTION = "motion"
+    MOUNTING = "mounting"
     DVL = "dvl"
     DVL_CLOCK = "clock of the dvl"
     REFERENCE = "reference"
@@ -180,6 +186,23 @@ class ClockEffect(Effect):
     @abstractmethod
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
         """(N,) s by which what is measured at times (N,) s since the start is stamped late."""
+
+
+class MountingEffect(Effect):
+    """A systematic effect on how the DVL is turned."""
+
+    acts_on = ActsOn.MOUNTING
+
+    @abstractmethod
+    def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """(N, 3) rad, or (3,) for all times, that is added to the misalignment φ; `motion` is the DVL's own."""
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """Tᵀ (Exp(turn) - I) T v: what it adds where there is no other misalignment."""
+        velocity = motion.velocity_dvl
+        return (
+            Rotation.from_rotvec(self.turn(motion, values)).apply(velocity) - velocity
+        ) @ motion.rotation_dvl_from_body
 
 
 class NoiseEffect(AnyEffect, ABC):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, AnyEffect, ClockEffect, Effect, EffectInput
+from .base import ActsOn, AnyEffect, ClockEffect, Effect, EffectInput, MountingEffect
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,15 @@ def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn
 def at_dvl(injections: Sequence[Injection], motion: EffectInput) -> EffectInput:
     """The motion of the DVL itself: that of the reference point with the traces on MOTION."""
     return replace(motion, velocity_body=motion.velocity_body + traces(injections, motion, ActsOn.MOTION))
+
+
+def turns(injections: Sequence[Injection], motion: EffectInput) -> Array:
+    """(N, 3) rad, or (3,) for all times, by which the mounting is turned on top of φ; motion: of the DVL."""
+    total = np.zeros(3)
+    for each in injections:
+        if isinstance(each.effect, MountingEffect):
+            total = total + each.effect.turn(motion, each.values)
+    return total
 
 
 def late(injections: Sequence[Injection], clock: ActsOn, elapsed: Array) -> Array:

@@ -14,7 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Generic, TypeVar
 
 from ..errors import InputError
-from .base import AnyEffect, Effect, NoiseEffect
+from .base import ActsOn, AnyEffect, ClockEffect, Effect, MountingEffect, NoiseEffect
 from .environment import HeadingError, WaterLock
 from .kinematic import LeverArm, Sideslip, TiltCoupling
 from .noise import ColouredReferenceNoise, NoiseInflation, Outliers, StaleSamples
@@ -102,11 +102,30 @@ def _plugged_in(point: EntryPoint) -> AnyEffect:
         wanted = ("name", "summary", "parameters", "acts_on", *(["manoeuvre"] if isinstance(effect, Effect) else []))
         for attribute in wanted:
             getattr(effect, attribute)
+        _check_stage(effect)
     except Exception as error:  # whatever a foreign package does wrong
         raise InputError(
             f"{_named(point)}: cannot be used ({type(error).__name__}: {error}); mend or uninstall that package"
         ) from error
     return effect
+
+
+_CLOCKS = (ActsOn.DVL_CLOCK, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
+# Where an effect can stand, by the first of these that it is one of
+_STAGES: tuple[tuple[type[AnyEffect], tuple[ActsOn, ...]], ...] = (
+    (NoiseEffect, (ActsOn.DVL, ActsOn.REFERENCE)),
+    (ClockEffect, _CLOCKS),
+    (MountingEffect, (ActsOn.MOUNTING,)),
+    (Effect, (ActsOn.MOTION, ActsOn.DVL, ActsOn.REFERENCE)),
+)
+
+
+def _check_stage(effect: AnyEffect) -> None:
+    """Raise TypeError for an effect that stands where nothing would ask it what it does."""
+    kind, stages = next((kind, stages) for kind, stages in _STAGES if isinstance(effect, kind))
+    if effect.acts_on not in stages:
+        listed = " or ".join(f"ActsOn.{stage.name}" for stage in stages)
+        raise TypeError(f"acts_on is {listed} for a subclass of {kind.__name__}, not {effect.acts_on}")
 
 
 def _named(point: EntryPoint) -> str:

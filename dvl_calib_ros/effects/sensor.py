@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array
-from .base import ActsOn, Effect, EffectInput, ParameterSpec, along_axes, vector
+from .base import ActsOn, Effect, EffectInput, MountingEffect, ParameterSpec, along_axes, vector
 
 HOUR_S = 3600.0
 
@@ -60,7 +59,7 @@ class ScaleDrift(Effect):
         return values["rate_per_hour"] / HOUR_S * motion.elapsed[:, None] * motion.velocity_body
 
 
-class MisalignmentDrift(Effect):
+class MisalignmentDrift(MountingEffect):
     """The mounting turns slowly along the run."""
 
     name = "misalignment_drift"
@@ -70,15 +69,14 @@ class MisalignmentDrift(Effect):
         "rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour", linear=False
     )
     of_the_day = True
-    acts_on = ActsOn.DVL
     confounded_with = ("scale_drift",)
 
-    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ (Exp((t - t_0) rate) - I) T v."""
-        return _turned(motion, motion.elapsed[:, None] * vector(values, "rad_per_hour") / HOUR_S)
+    def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """(t - t_0) · rate."""
+        return motion.elapsed[:, None] * vector(values, "rad_per_hour") / HOUR_S
 
 
-class MountFlexure(Effect):
+class MountFlexure(MountingEffect):
     """The mounting gives way to the water: misalignment that depends on speed."""
 
     name = "mount_flexure"
@@ -87,29 +85,26 @@ class MountFlexure(Effect):
     parameters = along_axes(
         "rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed", linear=False
     )
-    acts_on = ActsOn.DVL
     confounded_with = ("velocity_bias", "quadratic_scale")
 
-    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ (Exp(speed · flexure) - I) T v."""
-        return _turned(motion, motion.speed[:, None] * vector(values, "rad_per_mps"))
+    def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """speed · flexure."""
+        return motion.speed[:, None] * vector(values, "rad_per_mps")
 
 
-class MountingMoved(Effect):
+class MountingMoved(MountingEffect):
     """The DVL was mounted otherwise than in the first of several recordings."""
 
     name = "mounting_moved"
     summary = "the mounting is turned against that of the first of several recordings"
     manoeuvre = "straight legs that speed up and slow down, in each recording"
     parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
-    acts_on = ActsOn.DVL
     of_the_day = True
     relative_to_first = True
 
-    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ (Exp(φ) - I) T v."""
-        angles = np.tile(vector(values, "rad"), (len(motion.time), 1))
-        return _turned(motion, angles)
+    def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """The change of φ."""
+        return vector(values, "rad")
 
 
 class SoundSpeedMoved(Effect):
@@ -126,12 +121,6 @@ class SoundSpeedMoved(Effect):
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """ratio · v."""
         return values["ratio"] * motion.velocity_body
-
-
-def _turned(motion: EffectInput, rotation_vectors: Array) -> Array:
-    """(N, 3) m/s that the velocity changes by when the DVL turns by rotation vectors (N, 3) rad, body frame."""
-    velocity = motion.velocity_dvl
-    return (Rotation.from_rotvec(rotation_vectors).apply(velocity) - velocity) @ motion.rotation_dvl_from_body
 
 
 class AxisNonorthogonality(Effect):

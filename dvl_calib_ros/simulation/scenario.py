@@ -15,7 +15,7 @@ from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..effects.base import ActsOn, EffectInput
-from ..effects.composition import Injection, at_dvl, late, traces
+from ..effects.composition import Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter
 from .injection import disturbed, injection_document
 from .recorded import Recording, recorded_motion
@@ -158,7 +158,9 @@ def _simulate_dvl(scenario: Scenario, world: _World, rng: np.random.Generator) -
     at = _times(world.seconds, scenario.dvl_rate, 0.0)
     moved = at_dvl(scenario.effects, world.input)
     velocity = _interpolate(at, moved.time, moved.velocity_body)
-    measured = measure_dvl(velocity, scenario.errors, moved.rotation_dvl_from_body, rng)
+    turn = turns(scenario.effects, moved)
+    turn = turn if turn.ndim == 1 else _interpolate(at, moved.time, turn)
+    measured = measure_dvl(velocity, scenario.errors, moved.rotation_dvl_from_body, rng, turn)
     added = traces(scenario.effects, moved, ActsOn.DVL) @ moved.rotation_dvl_from_body.T
     measured = measured + _interpolate(at, moved.time, added)
     measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.DVL)

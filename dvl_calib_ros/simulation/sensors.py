@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..calibration.error_model import distort
 from ..calibration.frames import Array, rotation_from_rpy
@@ -60,10 +61,22 @@ def equivalent_error_terms(errors: DvlErrors) -> tuple[Array, Array]:
 
 
 def measure_dvl(
-    velocity_body: Array, errors: DvlErrors, rotation_dvl_from_body: Array, rng: np.random.Generator
+    velocity_body: Array,
+    errors: DvlErrors,
+    rotation_dvl_from_body: Array,
+    rng: np.random.Generator,
+    turn: Array | None = None,
 ) -> Array:
-    """Velocities (N, 3) m/s that the DVL reports, in its own frame: turned, scaled, beam by beam, least squares."""
-    turned = velocity_body @ (rotation_from_rpy(errors.misalignment_rpy).T @ rotation_dvl_from_body).T
+    """Velocities (N, 3) m/s that the DVL reports, in its own frame: turned, scaled, beam by beam, least squares.
+
+    turn: (3,) or (N, 3) rad, added to the rotation vector of the misalignment.
+    """
+    misaligned = rotation_from_rpy(errors.misalignment_rpy).T
+    if turn is None or not turn.any():
+        turned = velocity_body @ (misaligned @ rotation_dvl_from_body).T
+    else:
+        angles = Rotation.from_matrix(misaligned).as_rotvec() + turn
+        turned = Rotation.from_rotvec(angles).apply(velocity_body @ rotation_dvl_from_body.T)
     scaled = turned * (1.0 + np.asarray(errors.scale))
     beams = scaled @ BEAMS.T + np.asarray(errors.beam_bias)
     beams = beams + rng.normal(0.0, errors.beam_std, beams.shape)

@@ -338,9 +338,22 @@ class Impostor(OWN[0]):
     """Has the name of an own effect."""
 
 
+class LateByNothing(Effect):
+    """Says that it acts on a clock, which nobody would ask of an effect that is no ClockEffect."""
+
+    name = "late_by_nothing"
+    summary = manoeuvre = "none"
+    parameters = ()
+    acts_on = ActsOn.DVL_CLOCK
+
+    def trace(self, motion, values):
+        return motion.velocity_body
+
+
 @pytest.mark.parametrize(
     ("value", "said"),
     [
+        ("test_effects:LateByNothing", "acts_on is ActsOn.MOTION or ActsOn.DVL or ActsOn.REFERENCE for a"),
         ("no_such_module:Effect", "No module named 'no_such_module'"),
         ("math:pi", "math:pi is no subclass of Effect or NoiseEffect"),
         ("dvl_calib_ros.effects.base:Effect", "TypeError"),
