@@ -49,7 +49,8 @@ class Page(HTMLParser):
         self.rows: list[list[str]] = []
         self._text: list[str] = []
         self._in_cell = self._in_style = False
-        self.feed(path.read_text())
+        self.source = path.read_text()
+        self.feed(self.source)
 
     @property
     def text(self) -> str:
@@ -61,7 +62,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
-        self._in_style = tag == "style"
+        self._in_style = tag in ("style", "script")
         if tag == "tr":
             self.rows.append([])
         elif tag in ("td", "th"):
@@ -69,7 +70,7 @@ class Page(HTMLParser):
             self._in_cell = True
 
     def handle_endtag(self, tag):
-        self._in_style = self._in_style and tag != "style"
+        self._in_style = self._in_style and tag not in ("style", "script")
         self._in_cell = self._in_cell and tag not in ("td", "th")
 
     def handle_data(self, data):

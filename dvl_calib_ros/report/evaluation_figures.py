@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
+from .exploring import mark_time
 from .series import running_mean
 from .style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
 from .style import plain_log_ticks as log_ticks
@@ -145,6 +146,7 @@ def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected
     axes.plot(time_s, corrected, color="#1f6fb2", linewidth=0.9, label="DVL corrected")
     axes.plot(time_s, truth, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), label="truth")
     axes.set_xlabel("time, s")
+    mark_time(axes)
     axes.set_ylabel(label)
     axes.margins(x=0.01)
     legend_above(axes)
@@ -154,13 +156,17 @@ def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected
 def error_of_trace(time_s: Array, uncorrected: Array, corrected: Mapping[str, Array]) -> Figure:
     """Running RMS of the velocity error before correction, and after it with several models, from (N,) lengths m/s."""
     figure, axes = new_figure(height=3.2)
-    axes.plot(*_running_rms(time_s, uncorrected), color=UNCALIBRATED_COLOUR, linestyle=":", linewidth=1.4)
+    axes.plot(
+        *_running_rms(time_s, uncorrected), color=UNCALIBRATED_COLOUR, linestyle=":", linewidth=1.4,
+        label="uncalibrated",
+    )  # fmt: skip
     for (name, error), width in zip(corrected.items(), line_widths(list(corrected)), strict=True):
         colour, dashes = MODEL_STYLES[name]
-        axes.plot(*_running_rms(time_s, error), color=colour, linestyle=dashes, linewidth=width)
+        axes.plot(*_running_rms(time_s, error), color=colour, linestyle=dashes, linewidth=width, label=name)
     axes.set_yscale("log")
     log_ticks(axes.yaxis)
     axes.set_xlabel("time, s")
+    mark_time(axes)
     axes.set_ylabel("velocity error, m/s rms")
     axes.margins(x=0.01)
     return figure

@@ -1,11 +1,13 @@
 """From data to a page: the template engine, tables, and the writing of the file.
 
-Everything that comes from a bag or a folder is escaped by the engine, and the page forbids scripts and any access to
-the network by its content security policy.
+Everything that comes from a bag or a folder is escaped by the engine. By its content security policy the page runs
+the two scripts that stand in it, known by their hashes, and nothing else, and has no access to the network.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup
 
 from .. import __version__
 from ..files.atomic import save_text
@@ -80,7 +83,17 @@ def _environment() -> jinja2.Environment:
 
 def render_page(template: str, context: Mapping[str, Any]) -> str:
     """HTML of a page."""
-    return _environment().get_template(template).render(version=__version__, styles=MODEL_STYLES, **context)
+    environment = _environment()
+    # uPlot (MIT, uplot.LICENSE) draws, explore.js gives it the data of the figures
+    scripts = [Markup(environment.get_template(name).render().strip()) for name in ("uplot.js", "explore.js")]
+    sources = Markup(" ".join(f"'sha256-{_digest(script)}'" for script in scripts))
+    return environment.get_template(template).render(
+        version=__version__, styles=MODEL_STYLES, scripts=scripts, script_sources=sources, **context
+    )
+
+
+def _digest(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def write_page(path: Path, template: str, context: Mapping[str, Any]) -> None:

@@ -44,7 +44,7 @@ def estimate_over_time(time: TimeAxis, stamps_ns: Array, lines: Sequence[Line], 
         value, std = line.value[kept], line.std[kept]
         strong = line.model == selected
         axes.fill_between(t, value - std, value + std, color=colour, alpha=0.25 if strong else 0.12, linewidth=0)
-        axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
+        axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=line.model)
     axes.set_ylim(*_settled_range(lines))
     axes.set_ylabel(label)
     time.dress(axes)
@@ -137,7 +137,9 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
             continue
         colour, dashes = MODEL_STYLES[name]
         where, mean = running_mean(t[used], np.log10(values[used]), points=9)
-        axes.plot(where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width)
+        axes.plot(
+            where, 10.0**mean, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=name
+        )
     axes.axhline(1.0, color=INK, linewidth=0.8)
     axes.set_yscale("log")
     plain_log_ticks(axes.yaxis)

@@ -7,7 +7,7 @@ import numpy as np
 from ..calibration.frames import Array
 
 # Points of a line: more cannot be seen at this width
-LINE_POINTS = 300
+LINE_POINTS = 600
 
 
 def thin(n: int) -> slice:

@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ..calibration.models import MODELS
+from .exploring import explorable
 
 # Inches. Narrow, so that the text is still legible where a phone shows the figure 340 pixels wide.
 WIDTH, HEIGHT = 4.6, 2.9
@@ -93,12 +94,16 @@ MODEL_STYLES = _styles()
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on a page. title and caption are text beside it, alt what it shows for who cannot see it."""
+    """A figure on a page. title and caption are text beside it, alt what it shows for who cannot see it.
+
+    plot: a figure over time as data, for the script of the page; "" for any other.
+    """
 
     title: str
     alt: str
     svg: bytes
     caption: str = ""
+    plot: str = ""
 
     @property
     def data_uri(self) -> str:
@@ -147,7 +152,7 @@ def picture(title: str, alt: str, draw: Callable[..., Figure], *arguments: Any, 
         figure = draw(*arguments)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata={"Date": None})
-    return Picture(title, alt, _PATH_DATA.sub(_rounded, buffer.getvalue()), caption)
+    return Picture(title, alt, _PATH_DATA.sub(_rounded, buffer.getvalue()), caption, explorable(figure))
 
 
 # matplotlib writes paths to a millionth of a point; a hundredth cannot be seen and takes half the space

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from ..calibration.frames import Array
+from .exploring import BREAK_MARK, mark_time
 
 # A gap is cut out if it is longer than this (s) and than this share of what was recorded in all ...
 CUT_FROM_S, CUT_SHARE = 60.0, 0.2
@@ -46,7 +47,11 @@ class TimeAxis:
 
     def dress(self, axes: Axes) -> None:
         """Label the axis and mark what was cut out."""
+        mark_time(axes, self._first_ns)
         axes.set_xlabel(self.label)
         axes.set_xlim(self._shown[0], max(self._shown[-1], 1e-3))
         for start, end in self.breaks:
-            axes.axvspan(start, end, facecolor="white", edgecolor="#c5cbd0", hatch="////", linewidth=0.0, zorder=3)
+            axes.axvspan(
+                start, end, facecolor="white", edgecolor="#c5cbd0", hatch="////", linewidth=0.0, zorder=3,
+                gid=BREAK_MARK,
+            )  # fmt: skip

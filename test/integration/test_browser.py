@@ -56,7 +56,7 @@ def opened(browser, report: Path, size: tuple[int, int]):
     page.on("dialog", lambda dialog: (problems.append(dialog.message), dialog.dismiss()))
     page.on("request", lambda request: problems.append(request.url) if request.url != report.as_uri() else None)
     page.goto(report.as_uri())
-    page.wait_for_load_state("load")
+    page.wait_for_selector("html[data-explorable=ready]", state="attached")
     problems = [problem for problem in problems if not problem.startswith("data:")]
     return page, problems
 
@@ -67,10 +67,11 @@ def test_a_report_opens_without_an_error_and_shows_every_figure(browser, report,
     assert problems == []
     images = page.evaluate(
         """() => [...document.images].map(i => {
-             const box = i.getBoundingClientRect();
+             const chart = i.parentElement.querySelector('.chart .u-wrap');  // what stands in a picture's place
+             const box = (chart ?? i).getBoundingClientRect();
              return [i.complete, i.naturalWidth, box.width, box.height, box.right, i.alt.length]; })"""
     )
-    assert len(images) == report.read_text().count("<figure>") > 10
+    assert len(images) == report.read_text().count("<figure") > 10
     for complete, natural_width, width, height, right, alt in images:
         assert complete and natural_width > 100 and alt > 10
         assert width > 250 and height > 60 and right <= size[0]
@@ -102,6 +103,59 @@ def test_a_wide_table_can_be_read_on_a_phone_by_scrolling_it(browser, reports):
     for scroll_left, row_name_left in scrolled:
         assert scroll_left > 0 and row_name_left >= 0  # the row's name stays in sight
     page.close()
+
+
+def test_one_cursor_shows_the_values_of_that_time_in_every_figure_of_the_run(browser, reports):
+    page, problems = opened(browser, reports["replay"], DESKTOP)
+    figures = page.locator("figure.explorable")
+    assert figures.count() > 8
+    hover(page, figures.first, 0.5)
+    times = page.locator("figure.explorable .u-legend tr:first-child .u-value").all_text_contents()
+    shown = [float(text) for text in times if text != "–"]
+    # of every figure that has a value there, the nearest sample's time
+    assert len(shown) == figures.count() and max(shown) - min(shown) < 0.05 * max(shown)
+    assert problems == []
+    page.close()
+
+
+def test_a_zoom_is_shared_and_escape_or_the_button_shows_the_whole_run_again(browser, reports):
+    page, problems = opened(browser, reports["replay"], DESKTOP)
+    figures = page.locator("figure.explorable")
+    bar, last = page.locator(".zoom"), figures.last
+    for leave in (lambda: page.keyboard.press("Escape"), lambda: bar.get_by_text("whole run").click()):
+        assert bar.is_hidden()
+        hover(page, figures.first, 0.25)
+        page.mouse.down()
+        hover(page, figures.first, 0.5)
+        page.mouse.up()
+        assert bar.is_visible()
+        low, high = (float(word) for word in bar.locator("span").text_content().split() if word[0].isdigit())
+        hover(page, last, 0.999)
+        at_the_end = float(last.locator(".u-legend tr:first-child .u-value").text_content())
+        assert low < at_the_end <= high * 1.02
+        leave()
+    assert bar.is_hidden() and problems == []
+    page.close()
+
+
+def hover(page, figure, share: float) -> None:
+    """Put the mouse over a chart, at this share of its width."""
+    area = figure.locator(".u-over")
+    area.scroll_into_view_if_needed()
+    box = area.bounding_box()
+    page.mouse.move(box["x"] + share * box["width"], box["y"] + 0.3 * box["height"], steps=4)
+
+
+def test_without_scripts_and_on_paper_the_pictures_are_shown(browser, reports):
+    for options, media in (({"java_script_enabled": False}, "screen"), ({}, "print")):
+        context = browser.new_context(**options)
+        page = context.new_page()
+        page.goto(reports["replay"].as_uri())
+        page.emulate_media(media=media)
+        images = page.locator("figure img")
+        assert images.count() > 10 and all(image.is_visible() for image in images.all())
+        assert not any(chart.is_visible() for chart in page.locator(".chart").all())
+        context.close()
 
 
 def test_nothing_is_cut_off_when_a_report_is_printed(browser, report):

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import json
+import re
 import sys
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +23,8 @@ from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.report import write_evaluation_report
+from dvl_calib_ros.report.exploring import explorable
+from dvl_calib_ros.report.replay_figures import Line, estimate_over_time, held_out_errors
 from dvl_calib_ros.report.replay_report import write_replay_report
 from dvl_calib_ros.report.style import MODEL_STYLES
 from dvl_calib_ros.report.time_axis import TimeAxis
@@ -127,14 +133,18 @@ def test_the_same_data_gives_the_same_figures(tmp_path, made):
 # ------------------------------------------------------------------ self-contained and safe
 
 
-def test_the_page_loads_nothing_and_runs_nothing(made, evaluated):
+def test_the_page_loads_nothing_and_runs_only_its_own_two_scripts(made, evaluated):
     for page in (made[0], evaluated):
-        names = {tag for tag, _ in page.tags}
-        assert not names & {"script", "iframe", "object", "form"}
+        names = [tag for tag, _ in page.tags]
+        assert not {*names} & {"iframe", "object", "form"}
+        assert names.count("script") == 2
         sources = [value for _, attributes in page.tags for key, value in attributes.items() if key in ("src", "href")]
         assert sources and all(source.startswith("data:") for source in sources)
         policy = next(attributes["content"] for tag, attributes in page.tags if "http-equiv" in attributes)
-        assert "default-src 'none'" in policy and "script" not in policy
+        scripts = re.findall(r"<script>(.*?)</script>", page.source, re.DOTALL)
+        hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+        allowed = [part.split() for part in policy.split("; ") if part.startswith("script-src")]
+        assert "default-src 'none'" in policy and allowed == [["script-src", *(f"'sha256-{each}'" for each in hashes)]]
 
 
 def test_nothing_in_a_bag_becomes_markup(tmp_path):
@@ -143,7 +153,7 @@ def test_nothing_in_a_bag_becomes_markup(tmp_path):
     path, replayed = replay_page(folder, dvl_frame='x"><img src=x onerror=alert(2)>')
     assert replayed.dvl_frame.startswith('x">')
     page = Page(path)
-    assert "script" not in {tag for tag, _ in page.tags}
+    assert [tag for tag, _ in page.tags].count("script") == 2
     assert all(image["src"].startswith("data:image/svg+xml;base64,") for image in page.images())
     assert "<script>alert(1)<" in page.text and "onerror=alert(2)" in page.text
 
@@ -153,6 +163,24 @@ def test_names_of_trajectories_are_text_in_tables_and_figures(evaluated):
     assert not {"b>", "i"} & {tag for tag, _ in evaluated.tags}
     figures = [base64.b64decode(image["src"].split(",")[1]) for image in evaluated.images()]
     assert not any(b"mathdefault" in figure for figure in figures)
+
+
+def test_the_data_of_an_explorable_figure_is_what_the_figure_draws():
+    seconds = np.arange(3000)
+    time = TimeAxis(SECOND * seconds)
+    value = np.where(seconds == 7, np.nan, np.sin(seconds / 300.0))
+    figure = estimate_over_time(time, SECOND * seconds, [Line("G1", value, 0.5 + 0.0 * value)], "G1", "roll, °")
+    plot = json.loads(zlib.decompress(base64.b64decode(explorable(figure))))
+    (line,), (sleeve,) = plot["lines"], plot["sleeves"]
+    assert (line["name"], plot["y_label"], plot["x_label"]) == ("G1", "roll, °", "time from the start, min")
+    assert 500 <= len(line["x"]) == len(line["y"]) <= 1500 and len(sleeve["x"]) > 500
+    expected = np.interp(60.0 * np.array(line["x"]), seconds, np.sin(seconds / 300.0))
+    np.testing.assert_allclose(np.array(line["y"], dtype=float), expected, atol=1e-3)
+    np.testing.assert_allclose(np.subtract(sleeve["high"], sleeve["low"]), 1.0, atol=1e-3)
+
+
+def test_a_figure_that_is_not_over_time_has_no_data_for_the_script():
+    assert explorable(held_out_errors(["G1"], *np.ones((3, 1)))) == ""
 
 
 # ------------------------------------------------------------------ unusual data

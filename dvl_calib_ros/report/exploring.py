@@ -1,0 +1,97 @@
+"""Figures over time as data, from which the script of the page draws them anew: with a cursor and a zoom for all.
+
+The figure stays the one description of what is shown: its lines, sleeves and limits are read back from matplotlib.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from ..calibration.frames import Array
+
+# Points of a line or cloud: a zoom of ten times still shows some, and a page stays small enough to be sent from a ship
+POINTS = 1500
+# What marks axes over time and, on them, what was cut out; matplotlib's own free label of an artist
+TIME_MARK, BREAK_MARK = "time", "cut out"
+
+
+def mark_time(axes: Axes, run: object = "") -> None:
+    """Say that the x axis is the time of a run: figures of one run and equal limits share cursor and zoom."""
+    axes.set_gid(f"{TIME_MARK} {run}")
+
+
+def explorable(figure: Figure) -> str:
+    """A figure over time as base64 of deflated JSON; "" for any other figure."""
+    axes = figure.axes[0]
+    mark = axes.get_gid() or ""
+    if not mark.startswith(TIME_MARK):
+        return ""
+    lines = [line for line in axes.get_lines() if line.get_transform() == axes.transData]
+    sleeves = [each for each in axes.collections if isinstance(each, PolyCollection)]
+    if not lines:
+        return ""
+    plot: dict[str, Any] = {
+        "run": f"{mark} {axes.get_xlim()}",
+        "x_label": axes.get_xlabel(),
+        "y_label": axes.get_ylabel(),
+        "x_limits": _numbers(axes.get_xlim(), 9),
+        "y_limits": _numbers(axes.get_ylim()),
+        "log": axes.get_yscale() == "log",
+        "levels": _numbers([np.ravel(line.get_ydata())[0] for line in axes.get_lines() if line not in lines]),
+        "breaks": [
+            _numbers(patch.get_extents().transformed(axes.transData.inverted()).intervalx, 9)
+            for patch in axes.patches
+            if patch.get_gid() == BREAK_MARK
+        ],
+        "lines": [
+            {
+                "name": "" if str(line.get_label()).startswith("_") else line.get_label(),
+                "color": to_hex(line.get_color()),
+                "width": line.get_linewidth(),
+                "dashed": line.get_linestyle() == "--",
+                "points": line.get_linestyle() == "None",
+                "x": _numbers(_thinned(line.get_xdata()), 6),
+                "y": _numbers(_thinned(line.get_ydata())),
+            }
+            for line in sorted(lines, key=lambda line: line.get_zorder())
+        ],
+        "sleeves": [_sleeve(each) for each in sleeves],
+    }
+    return base64.b64encode(zlib.compress(json.dumps(plot, separators=(",", ":")).encode(), 9)).decode()
+
+
+def _sleeve(area: PolyCollection) -> dict[str, Any]:
+    """What fill_between drew: lowest and highest value at each position."""
+    vertices = np.asarray(area.get_paths()[0].vertices)
+    red, green, blue, alpha = np.asarray(area.get_facecolor(), dtype=float)[0]
+    x, group = np.unique(vertices[:, 0], return_inverse=True)
+    low, high = np.full(len(x), np.inf), np.full(len(x), -np.inf)
+    np.minimum.at(low, group, vertices[:, 1])
+    np.maximum.at(high, group, vertices[:, 1])
+    return {
+        "color": to_hex((red, green, blue, alpha), keep_alpha=True),
+        "x": _numbers(_thinned(x), 6),
+        "low": _numbers(_thinned(low)),
+        "high": _numbers(_thinned(high)),
+    }
+
+
+def _thinned(values: ArrayLike) -> Array:
+    values = np.asarray(values, dtype=float)
+    return np.asarray(values[:: max(1, -(-len(values) // POINTS))])
+
+
+def _numbers(values: Iterable[float], digits: int = 4) -> list[float | None]:
+    """Numbers to so many digits, None for what is none."""
+    return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values]
