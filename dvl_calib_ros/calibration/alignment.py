@@ -502,9 +502,11 @@ class Aligner:
         )  # fmt: skip
 
     def _take_ordered(self, screened: ScreenedStreams, chunk: OrderedStreams) -> bool:
-        """Take columns without jumps; False, and nothing is changed, if rows may get their partner by waiting.
+        """Take columns without jumps; False, and nothing is changed, where rows go on in no simple order.
 
-        (A row whose reference is overdue may, while attitude is waited for, see it come after all.)
+        That is if the horizon falls back, because a stream that it went by runs away from the DVL, or if rows may get
+        their partner by waiting: one whose reference is overdue may, while attitude is waited for, see it come after
+        all.
         """
         dvl, reference, imu = screened.streams
         events = Events.of(
@@ -517,7 +519,7 @@ class Aligner:
             self._count_columns(screened, chunk, NO_DECISIONS, events)
             self._n_messages += len(dvl)
             return True
-        decisions = self._decisions(chunk, events)
+        decisions = None if (np.diff(events.horizon_ns) < 0).any() else self._decisions(chunk, events)
         if decisions is None:
             return False
         self._count_columns(screened, chunk, decisions, events)

@@ -20,6 +20,9 @@ from .tables import Table
 LONG_AGO_NS = -(2**62)
 # The past that is kept for who needs more than pairing does, at most: a DVL that is silent must not fill the memory.
 LONGEST_NS = 600_000_000_000
+# So many are never forgotten for that: ten minutes at 400 Hz, 26 MB. A stamp that leaps ahead is no silence, and
+# what goes with it must not depend on whether samples come one by one or in columns.
+MOST_KEPT = 240_000
 
 
 class Stamped(Protocol):
@@ -192,7 +195,10 @@ class Track(Table):
         if self.size > self.begin:
             oldest_ns = int(self.stamps_ns[self.size - 1]) - self.retention_ns - self.max_gap_ns
             if self.needed_from_ns is not None:
-                oldest_ns = min(oldest_ns, max(self.needed_from_ns, int(self.stamps_ns[self.size - 1]) - LONGEST_NS))
+                wanted_ns = self.needed_from_ns
+                if self.size - self.begin > MOST_KEPT:
+                    wanted_ns = max(wanted_ns, int(self.stamps_ns[self.size - 1]) - LONGEST_NS)
+                oldest_ns = min(oldest_ns, wanted_ns)
             self.begin += int(np.searchsorted(self.stamps_ns[self.begin : self.size], oldest_ns))
 
     def decided(self, stamp_ns: int, horizon_ns: int) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from runs import SECOND, START_NS, feed
 
@@ -158,6 +158,9 @@ OPTIONS = (
     size=st.sampled_from([1, 7, 70, 512, 10_000]),
     options=st.sampled_from(OPTIONS),
 )
+@example(seed=3844923, unruly=0.0, lag_s=60.0, size=70, options={})  # an IMU that runs away from a DVL which lags
+@example(seed=3844923, unruly=0.01, lag_s=60.0, size=10_000, options={})  # stamps leap by years, G2 still needs before
+@example(seed=2416835433, unruly=0.01, lag_s=0.9, size=1, options=OPTIONS[4])
 def test_columns_cut_anywhere_give_what_one_by_one_gives(seed, unruly, lag_s, size, options):
     streams, parameters = hostile_streams(seed, unruly, lag_s), Parameters(gnss_hysteresis=1.0, **options)
     found = []
