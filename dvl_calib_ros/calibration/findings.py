@@ -211,6 +211,18 @@ _KINDS = (
         "stop the second calibration node or the bag that plays a recorded one, or give one a namespace "
         "(--ros-args -r __ns:=/port) and its own result_file",
     ),
+    FindingKind(
+        "TF_TWICE",
+        "another node publishes a transform to {frame!r}, beside publish_tf",
+        "Usually the robot_state_publisher with the nominal mounting. Which of the two a listener has is chance.",
+        "turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
+    ),
+    FindingKind(
+        "TF_NOT_THERE",
+        "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, no transform is",
+        "ROS from PyPI has no tf2_ros; a ROS installation has.",
+        "install ros-$ROS_DISTRO-tf2-ros-py, and source its setup.bash",
+    ),
     # frames
     FindingKind(
         "DVL_FRAME",

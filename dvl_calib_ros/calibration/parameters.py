@@ -156,6 +156,11 @@ class Parameters:
         "Take mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description, where they are at their "
         "default and the transforms have the DVL's frame.",
     )
+    publish_tf: bool = _parameter(
+        False,
+        "Broadcast the calibrated mounting, as in ~/mounting, as a static transform from base_frame to the DVL's frame "
+        "(live, where tf2_ros is installed). Not beside another node that publishes that transform.",
+    )
     dvl_frame: str = _parameter(
         "",
         "frame_id that DVL messages must carry. Empty: any but a body or earth frame, and the first one seen.",

@@ -19,8 +19,9 @@ from .. import __version__
 from ..calibration.frames import FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.mounting_pose import mounting_pose, scale_and_delay
 from ..calibration.observability import Convergence
-from ..calibration.parameters import FLU, FRD
+from ..calibration.parameters import FLU, FRD, Parameters
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
 from ..errors import InputError, printable
@@ -59,6 +60,10 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
     verification = result.verifications.get(result.selected)
     parent, child = parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
     lever_arm = estimate.lever_arm(parameters["lever_arm"]).tolist()
+    model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance)
+    checked = Parameters.from_mapping(parameters)
+    pose = mounting_pose(model, state, checked, turned)
+    beside = scale_and_delay(model, state, checked)
     return {
         "format": FORMAT,
         "software": f"dvl_calib_ros {__version__}",
@@ -75,7 +80,11 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
             "corrected_quaternion_xyzw": list(quaternion),
             "scale_error_xyz": estimate.scale.tolist(),
             "lever_arm": lever_arm,
-            "dvl_time_offset": estimate.dvl_time_offset(parameters["dvl_time_offset"]),
+            "pose_covariance": pose.covariance.tolist(),
+            "scale_error_ahead": beside.scale,
+            "scale_error_ahead_std": beside.scale_std,
+            "dvl_time_offset": beside.time_offset,
+            "dvl_time_offset_std": beside.time_offset_std,
             "dvl_data_axes": FRD if turned else FLU,
             "frame_id": parent,
             "child_frame_id": child,

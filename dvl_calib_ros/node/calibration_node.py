@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -24,6 +25,7 @@ from ..calibration.correction import NOT_ESTIMATED, Correction, lever_arm, twist
 from ..calibration.findings import Finding, finding
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
+from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..discovery.placement import Frames, not_default, placement
@@ -46,6 +48,7 @@ from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
 from .message_types import message_class
+from .mounting import MountingOutput
 from .parameters import declare_parameters
 from .pauses import Pauses, steady_s
 from .status import status_name
@@ -87,7 +90,7 @@ class CalibrationNode(Node):
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._correction: Correction | None = None
         self._corrected_by = ""
-        self._published = ("", 0)
+        self._published = self._mounting_published = ("", 0)
         self._pauses = Pauses(steady_s())
         self._silence, self._recent = Silence(self._pauses.running_s(steady_s())), RecentCounts()
         self._save_problem: Finding | None = None
@@ -102,6 +105,8 @@ class CalibrationNode(Node):
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
         self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
+        self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", latched)
+        self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self._warn)
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
@@ -149,7 +154,7 @@ class CalibrationNode(Node):
         self.get_logger().info(f"{found.said}; the calibration begins with it (use_transforms: false does without)")
         self._begin(parameters.replace(**found.values), None)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
-        self._recent, self._correction = RecentCounts(), None
+        self._recent, self._correction, self._mounting_published = RecentCounts(), None, ("", 0)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Any:
         # every event callback is one more thing that the executor looks at for every message
@@ -275,9 +280,25 @@ class CalibrationNode(Node):
         message.twist.covariance.reshape(6, 6)[:3, :3] = covariance
         self._corrected_publisher.publish(message)
 
+    def _publish_mounting(self) -> None:
+        """Once a second at most: who wants every sample's has ~/estimate."""
+        calibrator = self._calibrator
+        model = MODELS[calibrator.selected]
+        state_of = (model.name, calibrator.n_given(model.name))
+        if state_of == self._mounting_published or calibrator.last_ns is None:
+            return
+        self._mounting_published = state_of
+        stamp = Time()
+        _set_stamp(stamp, calibrator.last_ns)
+        parameters, decoder = calibrator.parameters, self._feed.decoder
+        pose = mounting_pose(model, calibrator.state(model.name), parameters, decoder.turns_dvl)
+        self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
+
     def _publish_diagnostics(self) -> None:
+        self._publish_mounting()
         decoder = self._feed.decoder
         problems = [*decoder.problems.values(), *self._topic_problems()]
+        problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
         if self._save_problem:
             problems.append(self._save_problem)
         now_s = self._pauses.running_s(steady_s())
@@ -295,7 +316,7 @@ class CalibrationNode(Node):
         problems: list[Finding] = []
         for topic, subscription in self._inputs.items():
             problems += input_problems(self, subscription, type_parameters.get(topic))
-        for publisher in (self._estimate_publisher, self._corrected_publisher):
+        for publisher in (self._estimate_publisher, self._corrected_publisher, self._mounting_publisher):
             problems += output_problems(self, publisher)
         return problems + twin_problems(self, self._estimate_publisher)
 
@@ -306,7 +327,7 @@ class CalibrationNode(Node):
         self._feed.decoder.forget()
         self._recent = RecentCounts()
         self._pauses.forget()
-        self._correction = None
+        self._correction, self._mounting_published = None, ("", 0)
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"
         return response

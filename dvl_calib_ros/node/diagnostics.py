@@ -12,7 +12,10 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from ..calibration.advice import consistency_advice, data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.findings import Finding, Severity, finding
+from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.mounting_pose import scale_and_delay
+from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate
 from ..messages.drivers import VelocityType
 
@@ -131,6 +134,7 @@ def diagnose(
         "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
         **_estimate_values(estimate),
+        **_beside_the_pose(estimate, calibrator.parameters),
         **_count_values(estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
     }
@@ -176,6 +180,18 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     values["NIS ratio"] = f"{estimate.mean_nis / rows:.4f}"
     values["NIS ratio low"], values["NIS ratio high"] = f"{low / rows:.4f}", f"{high / rows:.4f}"
     return values
+
+
+def _beside_the_pose(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
+    """What ~/mounting cannot hold, whichever model runs; keys of its states begin with std, so these do not."""
+    state = GaussianState(estimate.state, estimate.covariance)
+    beside = scale_and_delay(MODELS[estimate.model], state, parameters)
+    values = {"scale error ahead [%]": 100.0 * beside.scale, "dvl_time_offset [s]": beside.time_offset}
+    stds = (None if beside.scale_std is None else 100.0 * beside.scale_std, beside.time_offset_std)
+    words = {name: f"{value:.4f}" for name, value in values.items()}
+    for name, std in zip(values, stds, strict=True):
+        words[f"sigma {name}"] = "not estimated" if std is None else f"{std:.4f}"
+    return words
 
 
 def _count_values(estimate: Estimate, counts: Counts) -> dict[str, str]:

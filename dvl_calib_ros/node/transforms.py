@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 from rclpy.node import Node
@@ -12,6 +13,8 @@ from ..discovery.transforms import FrameTree
 
 # Transforms that are kept; more is garbage.
 MOST_TRANSFORMS = 1000
+# What this node broadcasts itself comes back within this many of its own.
+OWN_TRANSFORMS = 100
 _LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -20,6 +23,7 @@ class Transforms:
 
     def __init__(self, node: Node) -> None:
         self._transforms: dict[str, Any] = {}
+        self._own: deque[Any] = deque(maxlen=OWN_TRANSFORMS)
         self._description = ""
         self.heard = 0
         self._subscriptions = [node.create_subscription(String, "robot_description", self._on_description, _LATCHED)]
@@ -34,10 +38,19 @@ class Transforms:
         self.heard += 1
 
     def _on_transforms(self, message: Any) -> None:
-        for each in message.transforms:
+        others = [each for each in message.transforms if each not in self._own]
+        for each in others:
             if len(self._transforms) < MOST_TRANSFORMS:
                 self._transforms[each.child_frame_id] = each
-        self.heard += 1
+        self.heard += bool(others)
+
+    def own(self, transform: Any) -> None:
+        """Let what this node is about to broadcast not be taken for another's: it would begin anew with its own."""
+        self._own.append(transform)
+
+    def has(self, frame: str) -> bool:
+        """Whether another node has published a transform to this frame."""
+        return frame in self._transforms
 
     def tree(self) -> FrameTree:
         """What is known by now."""

@@ -1,0 +1,80 @@
+"""Where and how the DVL sits, as others take it: a pose in the body frame with its covariance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .correction import NOT_ESTIMATED, lever_arm
+from .error_model import corrected_mounting
+from .frames import FLU_FROM_FRD, Array
+from .kalman import GaussianState
+from .models import Model
+from .observability import scale_std_ahead
+from .parameters import Parameters
+
+_ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
+
+
+class MountingPose(NamedTuple):
+    """A DVL's frame in the body.
+
+    position: (3,) m from the reference point, body frame. rotation_body_from_dvl: (3, 3), of the frame that the
+    driver's data are in. covariance: (6, 6) of position (m²) and of a small turn about the body's axes (rad²), as in
+    geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of what the model does not estimate.
+    """
+
+    position: tuple[float, float, float]
+    rotation_body_from_dvl: Array
+    covariance: Array
+
+
+def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, turned: bool = False) -> MountingPose:
+    """Pose of the DVL by one model's state, to first order in its misalignment.
+
+    Parameters
+    ----------
+    model: Whose state it is.
+    state: x (n,), P (n, n).
+    parameters: Nominal mounting and lever arm.
+    turned: Whether the driver's data are forward-right-down, and were turned.
+
+    """
+    t = parameters.rotation_dvl_from_body
+    misalignment = (model.error_terms_from_state @ state.x)[:3]
+    rotation = corrected_mounting(misalignment, t)
+    # R = Tᵀ (I + [φ×])ᵀ, so φ turns the DVL by -Tᵀφ about the body's axes
+    terms = np.zeros((6, model.n_state))
+    names = model.state_names
+    for row, name in enumerate(_ARM):
+        if name in names:
+            terms[row, names.index(name)] = 1.0
+    terms[3:] = -t.T @ model.error_terms_from_state[:3]
+    covariance = terms @ state.p @ terms.T
+    missing = ~terms.any(axis=1)
+    covariance[missing, missing] = NOT_ESTIMATED
+    return MountingPose(
+        lever_arm(model, state, parameters.lever_arm), rotation @ FLU_FROM_FRD if turned else rotation, covariance
+    )
+
+
+class ScaleAndDelay(NamedTuple):
+    """What a pose does not hold. scale: of motion ahead, dimensionless. time_offset: of the DVL's stamps, s, positive
+    late, as the parameters say and what was found. Each with its σ, None where the model does not estimate it."""
+
+    scale: float
+    scale_std: float | None
+    time_offset: float
+    time_offset_std: float | None
+
+
+def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) -> ScaleAndDelay:
+    """Scale ahead and delay by one model's state, x (n,), P (n, n)."""
+    ahead = parameters.rotation_dvl_from_body[:, 0] ** 2 @ model.error_terms_from_state[3:]
+    std = scale_std_ahead(model, state.p, parameters)
+    delay, delay_std = parameters.dvl_time_offset, None
+    if "time_offset" in model.state_names:
+        index = model.state_names.index("time_offset")
+        delay, delay_std = delay + float(state.x[index]), float(np.sqrt(state.p[index, index]))
+    return ScaleAndDelay(float(ahead @ state.x), float(std[0]) if len(std) else None, delay, delay_std)

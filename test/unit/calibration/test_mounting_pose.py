@@ -1,0 +1,52 @@
+"""The mounting as a pose: its covariance is that of poses drawn from the state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.mounting_pose import mounting_pose, scale_and_delay
+from dvl_calib_ros.calibration.parameters import Parameters
+
+PARAMETERS = Parameters(mounting_rpy=(0.3, -0.2, 2.1), lever_arm=(0.5, 0.0, 0.2), dvl_time_offset=0.25)
+
+
+def state_of(name: str, rng) -> GaussianState:
+    n = MODELS[name].n_state
+    root = rng.normal(0.0, 0.003, (n, n))
+    return GaussianState(rng.normal(0.0, 0.02, n), root @ root.T)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_covariance_is_that_of_poses_drawn_from_the_state(rng, turned):
+    model, state = MODELS["G2"], state_of("G2", rng)
+    found = mounting_pose(model, state, PARAMETERS, turned)
+    middle = Rotation.from_matrix(found.rotation_body_from_dvl)
+    drawn = []
+    for x in rng.multivariate_normal(state.x, state.p, 20000):
+        pose = mounting_pose(model, GaussianState(x, state.p), PARAMETERS, turned)
+        turn = Rotation.from_matrix(pose.rotation_body_from_dvl) * middle.inv()
+        drawn.append([*np.subtract(pose.position, found.position), *turn.as_rotvec()])
+    scale = np.sqrt(np.diag(found.covariance))
+    np.testing.assert_allclose(
+        np.cov(np.transpose(drawn)) / np.outer(scale, scale), found.covariance / np.outer(scale, scale), atol=0.06
+    )
+
+
+def test_what_a_model_does_not_estimate_is_the_parameters_with_variance_minus_one(rng):
+    found = mounting_pose(MODELS["G1"], state_of("G1", rng), PARAMETERS)
+    assert found.position == PARAMETERS.lever_arm
+    np.testing.assert_array_equal(found.covariance[:3, :3], -np.eye(3))
+    beside = scale_and_delay(MODELS["F1"], state_of("F1", rng), PARAMETERS)
+    assert (beside.scale, beside.scale_std, beside.time_offset, beside.time_offset_std) == (0.0, None, 0.25, None)
+
+
+def test_scale_and_delay_are_what_was_set_and_what_was_found(rng):
+    state = state_of("G2", rng)
+    beside = scale_and_delay(MODELS["G2"], state, Parameters(mounting_rpy=(0.0, 0.0, np.pi / 2), dvl_time_offset=0.25))
+    assert beside.time_offset == pytest.approx(0.25 + state.x[9])
+    assert beside.scale == pytest.approx(state.x[4])  # the DVL's y looks ahead
+    assert beside.scale_std == pytest.approx(np.sqrt(state.p[4, 4]))
