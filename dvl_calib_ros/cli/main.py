@@ -14,9 +14,37 @@ from typing import NoReturn
 
 from .. import __version__
 from ..streams import give_up_stdout, open_streams, say
-from . import apply, demo, diagnose, doctor, evaluate, import_, parameters, replay, run, salvage, simulate, watch
+from . import (
+    apply,
+    compare,
+    demo,
+    diagnose,
+    doctor,
+    evaluate,
+    import_,
+    parameters,
+    replay,
+    run,
+    salvage,
+    simulate,
+    watch,
+)
 
-COMMANDS = (run, watch, doctor, replay, salvage, apply, diagnose, evaluate, simulate, import_, parameters, demo)
+COMMANDS = (
+    run,
+    watch,
+    doctor,
+    replay,
+    salvage,
+    apply,
+    compare,
+    diagnose,
+    evaluate,
+    simulate,
+    import_,
+    parameters,
+    demo,
+)
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):

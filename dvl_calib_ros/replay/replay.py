@@ -14,8 +14,11 @@ from .. import __version__
 from ..bags.reader import BagReader
 from ..calibration.advice import data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
+from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.findings import Finding, finding
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
+from ..calibration.kalman import GaussianState
+from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.samples import AlignedBlock, Stream, VelocityFrame
@@ -127,6 +130,22 @@ def replay(
         decoder.frame_of_reference,
         decoder.dvl_type.name,
         decoder.turns_dvl,
+    )
+
+
+def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
+    """What the selected model found, to be compared; None if it used no sample."""
+    result = replayed.result
+    estimate = result.estimate
+    if not estimate.used or result.first_ns is None or result.last_ns is None:
+        return None
+    return extrinsics_of(
+        name,
+        MODELS[estimate.model],
+        GaussianState(estimate.state, estimate.covariance),
+        Parameters.from_mapping(result.parameters),
+        (result.first_ns, result.last_ns),
+        estimate.used,
     )
 
 

@@ -1,0 +1,164 @@
+"""Where a calibration says that the DVL sits and how it measures, in terms that calibrations of any model share.
+
+A model's angles are relative to the mounting that it was given, and its states are its own. What two calibrations can
+be compared in is the whole: the corrected mounting in the body, the lever arm, the scale of motion ahead and the delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .error_model import corrected_mounting
+from .frames import Array, skew
+from .kalman import GaussianState
+from .models import Model
+from .observability import OBSERVED_SHARE
+from .parameters import Parameters
+
+COMPONENTS = (
+    "turn_x", "turn_y", "turn_z", "lever_arm_x", "lever_arm_y", "lever_arm_z", "scale", "time_offset",
+)  # fmt: skip
+N_COMPONENTS = len(COMPONENTS)
+TURN, LEVER_ARM, SCALE, TIME_OFFSET = slice(0, 3), slice(3, 6), 6, 7
+# For derivatives by differences: of angles of some degrees exact to nine digits
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Extrinsics:
+    """One calibration of a DVL.
+
+    Parameters
+    ----------
+    name
+        What people know it by: a file, a bag.
+    model
+        Name of the model that found it.
+    first_ns, last_ns
+        Stamps of the data that it was found from.
+    rotation_body_from_dvl
+        (3, 3), corrected mounting.
+    lever_arm
+        (3,) m, body frame: found, else as the parameters said.
+    scale
+        Scale-factor error of motion ahead, dimensionless; 0 where the model has none.
+    time_offset
+        By how much the DVL's stamps are late, s: found, else as the parameters said.
+    covariance
+        (8, 8) of `COMPONENTS`: a turn of the mounting about the body's axes (rad), lever arm, scale and delay; zero
+        where `shown` is not.
+    shown
+        (8,) which of them the data showed.
+    used
+        Samples.
+    remarks
+        What to know when it is believed, in sentences.
+    """
+
+    name: str
+    model: str
+    first_ns: int
+    last_ns: int
+    rotation_body_from_dvl: Array
+    lever_arm: Array
+    scale: float
+    time_offset: float
+    covariance: Array
+    shown: NDArray[np.bool_]
+    used: int
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def std(self) -> Array:
+        """(8,) standard deviations, nan for what was not shown."""
+        return np.where(self.shown, np.sqrt(np.diag(self.covariance)), np.nan)
+
+
+def extrinsics_of(
+    name: str,
+    model: Model,
+    state: GaussianState,
+    parameters: Parameters,
+    span_ns: tuple[int, int],
+    used: int,
+    remarks: Sequence[str] = (),
+) -> Extrinsics:
+    """What a state (n,) of a model says of the DVL, with the parameters that it was found with.
+
+    span_ns: stamps of the first and last sample. A component counts as shown if its σ is at most half of what the
+    parameters say is known without data, as for observability.
+    """
+    found = _components(model, state.x, parameters)
+    jacobian = np.empty((N_COMPONENTS, len(state.x)))
+    for index in range(len(state.x)):
+        step = np.zeros(len(state.x))
+        step[index] = _STEP
+        up, down = (_components(model, state.x + way * step, parameters) for way in (1.0, -1.0))
+        turn = rotation_vector(up[0] @ found[0].T) - rotation_vector(down[0] @ found[0].T)
+        jacobian[:, index] = np.concatenate([turn, up[1] - down[1]]) / (2.0 * _STEP)
+    covariance = jacobian @ state.p @ jacobian.T
+    std = np.sqrt(np.diag(covariance))
+    shown = jacobian.any(axis=1) & (std <= OBSERVED_SHARE * _unknown(parameters))
+    covariance[~shown] = 0.0
+    covariance[:, ~shown] = 0.0
+    rotation, rest = found
+    return Extrinsics(
+        name=name,
+        model=model.name,
+        first_ns=span_ns[0],
+        last_ns=span_ns[1],
+        rotation_body_from_dvl=rotation,
+        lever_arm=rest[:3],
+        scale=float(rest[3]),
+        time_offset=float(rest[4]),
+        covariance=0.5 * (covariance + covariance.T),
+        shown=shown,
+        used=used,
+        remarks=tuple(remarks),
+    )
+
+
+def _components(model: Model, x: Array, p: Parameters) -> tuple[Array, Array]:
+    """Corrected mounting (3, 3), and lever arm, scale and delay (5,)."""
+    errors = model.error_terms_from_state @ x
+    rotation = corrected_mounting(errors[:3], p.rotation_dvl_from_body)
+    own = dict(zip(model.state_names, x.tolist(), strict=True))
+    arm = [known + own.get(f"lever_arm_{axis}", 0.0) for axis, known in zip("xyz", p.lever_arm, strict=True)]
+    scale = float(rotation[0] ** 2 @ errors[3:])
+    return rotation, np.array([*arm, scale, p.dvl_time_offset + own.get("time_offset", 0.0)])
+
+
+def _unknown(p: Parameters) -> Array:
+    """(8,) standard deviations without data."""
+    angle, scale = p.initial_std_misalignment, p.initial_std_scale
+    return np.array([*[angle] * 3, *[p.initial_std_lever_arm] * 3, scale, p.initial_std_time_offset])
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """Axis times angle (3,) rad of a rotation (3, 3); exact for small and for large angles."""
+    axis = 0.5 * np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine = float(np.linalg.norm(axis))
+    cosine = 0.5 * (float(np.trace(rotation)) - 1.0)
+    if sine > 1e-9:
+        return np.asarray(axis * (np.arctan2(sine, cosine) / sine))
+    if cosine > 0.0:
+        return axis
+    # half a turn: the axis is the eigenvector of 1, its sign is free
+    column = int(np.argmax(np.diag(rotation)))
+    along = rotation[:, column] + np.eye(3)[column]
+    return np.asarray(np.pi * along / np.linalg.norm(along))
+
+
+def rotation_of(vector: Array) -> Array:
+    """Inverse of `rotation_vector`: (3,) rad -> (3, 3) (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    k = skew(np.asarray(vector) / angle)
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)

@@ -1,0 +1,106 @@
+"""`dvl-calib compare`: result files and bags, exit codes, pictures, and one line for what cannot be compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import fail
+
+from dvl_calib_ros.cli.main import main
+
+SHORT = ("--trajectory", "box", "--duration", "120", "--gnss-std", "0.05")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """Bags a, b of one mounting and c of one that is turned by 1°, with result files."""
+    folder = tmp_path_factory.mktemp("compare")
+    for seed, (name, yaw) in enumerate((("a", "2"), ("b", "2"), ("c", "3"))):
+        bag = str(folder / name)
+        assert main(["simulate", bag, *SHORT, "--seed", str(seed), "--misalignment", "1", "-1", yaw]) == 0
+        assert main(["replay", bag, "--save", f"{bag}.yaml"]) == 0
+    for day, name in enumerate("abc"):
+        document = yaml.safe_load((folder / f"{name}.yaml").read_text())
+        for key in document["time_span"]:
+            document["time_span"][key] += day * 86_400_000_000_000
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+    return folder
+
+
+def test_the_same_mounting_is_exit_code_0_and_a_moved_one_1_with_a_sentence(place, capsys):
+    a, b, c = (str(place / f"{name}.yaml") for name in "abc")
+    capsys.readouterr()
+    assert main(["compare", a, b]) == 0
+    assert capsys.readouterr().out.startswith("same: The same mounting within σ")
+    assert main(["compare", c, a, b]) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.startswith("moved: The mounting has moved by") and "about z between" in said and "(c.yaml)" in said
+    assert "Each less all others together" in said
+
+
+def test_a_bag_is_calibrated_to_be_compared(place, capsys):
+    assert main(["compare", str(place / "a.yaml"), str(place / "b")]) == 0
+    assert main(["compare", str(place / "a"), str(place / "c")]) == 1
+
+
+def test_json_and_pictures_say_the_same(place, tmp_path, capsys):
+    out, page, png = tmp_path / "c.json", tmp_path / "c.html", tmp_path / "c.png"
+    results = [str(place / f"{name}.yaml") for name in "abc"]
+    assert main(["compare", *results, "--json", str(out), "--report", str(page)]) == 1
+    document = json.loads(out.read_text())
+    assert document["same_mounting"] is False and len(document["pairs"]) == 3
+    (moved,) = document["moved"]
+    assert (moved["last_before"], moved["first_after"]) == ("b.yaml", "c.yaml")
+    assert abs(moved["value"]["turn_z"] - 0.01745) < 3 * moved["std"]["turn_z"]
+    text = page.read_text()
+    assert document["says"][0] in text and text.count("<img") >= 2
+    assert main(["compare", *results, "--report", str(png)]) == 1
+    assert png.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "content, says",
+    [
+        ("", "not a result file"),
+        ("[1, 2", "not valid YAML"),
+        ("\x00\x01", "no result file"),
+        ("format: dvl_calib_ros result 1\n", "damaged"),
+    ],
+)
+def test_garbage_is_one_line(place, tmp_path, capsys, content, says):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(content)
+    error = fail(capsys, "compare", place / "a.yaml", bad)
+    assert "bad.yaml" in error and says in error
+
+
+def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp_path, capsys):
+    document = yaml.safe_load((place / "b.yaml").read_text())
+    for path, says in (
+        (("time_span",), "damaged"), (("mounting", "corrected_rpy"), "damaged"), (("model",), "damaged"),
+        (("parameters",), "damaged"),
+    ):  # fmt: skip
+        broken = yaml.safe_load(yaml.safe_dump(document))
+        part = broken
+        for key in path[:-1]:
+            part = part[key]
+        del part[path[-1]]
+        bad = tmp_path / "broken.yaml"
+        bad.write_text(yaml.safe_dump(broken, sort_keys=False))
+        assert says in fail(capsys, "compare", place / "a.yaml", bad)
+    for estimate in document["models"].values():
+        estimate["used"] = 0
+    empty = tmp_path / "empty.yaml"
+    empty.write_text(yaml.safe_dump(document, sort_keys=False))
+    assert "used no sample" in fail(capsys, "compare", place / "a.yaml", empty)
+
+
+def test_one_alone_twice_the_same_and_a_file_that_is_not_there_are_one_line(place, tmp_path, capsys):
+    a = place / "a.yaml"
+    assert "one alone" in fail(capsys, "compare", a)
+    assert "named twice" in fail(capsys, "compare", a, a)
+    assert "no such" in fail(capsys, "compare", a, tmp_path / "nothing.yaml")
+    assert "a.yaml" in fail(capsys, "compare", a, place / "b.yaml", "--json", a)

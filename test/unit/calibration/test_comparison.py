@@ -1,0 +1,172 @@
+"""Comparing calibrations: what is said to have moved has, what is within σ is not, and totals are compared."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.calibration.comparison import MOUNTING, Difference, compare, fused, remarks, sentences
+from dvl_calib_ros.calibration.error_model import corrected_mounting
+from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of, rotation_of, rotation_vector
+from dvl_calib_ros.calibration.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.errors import InputError
+
+DAY_NS = 86_400_000_000_000
+STD = np.array([*[math.radians(0.05)] * 3, *[0.02] * 3, 0.001, 0.01])
+
+
+def extrinsics(day: int, turn=(0.0, 0.0, 0.0), arm=(0.0, 0.0, 0.0), scale=0.0, late=0.0, **fields) -> Extrinsics:
+    first_ns = 1_750_000_000_000_000_000 + day * DAY_NS
+    made = {
+        "name": f"day{day}", "model": "G2", "first_ns": first_ns, "last_ns": first_ns + DAY_NS // 24,
+        "rotation_body_from_dvl": rotation_of(np.radians(turn)), "lever_arm": np.array(arm), "scale": scale,
+        "time_offset": late, "covariance": np.diag(STD**2), "shown": np.ones(8, dtype=bool), "used": 1000,
+    }  # fmt: skip
+    return Extrinsics(**(made | fields))
+
+
+def noisy(day: int, rng: np.random.Generator, turn_deg=(0.0, 0.0, 0.0)) -> Extrinsics:
+    e = rng.normal(0.0, STD)
+    return extrinsics(day, np.add(turn_deg, np.degrees(e[:3])), e[3:6], e[6], e[7])
+
+
+def test_a_rotation_vector_and_its_rotation_are_inverse_for_small_and_for_large_angles():
+    rng = np.random.default_rng(1)
+    for angle in (0.0, 1e-12, 1e-5, 0.1, 2.0, 3.1, math.pi):
+        axis = rng.normal(size=3)
+        vector = angle * axis / np.linalg.norm(axis)
+        again = rotation_of(rotation_vector(rotation_of(vector)))
+        assert np.allclose(again, rotation_of(vector), atol=1e-9)
+        if angle < 3.1:
+            assert np.allclose(rotation_vector(rotation_of(vector)), vector, atol=1e-9)
+
+
+def test_a_mounting_that_moved_is_said_with_its_size_sigma_axis_and_dates():
+    before, after = [extrinsics(day) for day in (0, 1)], [extrinsics(day, (0.0, 0.0, 0.7)) for day in (2, 3)]
+    found = compare([*after, *before])  # in any order
+    assert [each.name for each in found.calibrations] == ["day0", "day1", "day2", "day3"]
+    assert not found.same_mounting
+    assert sentences(found) == [
+        "The mounting has moved by 0.70° ± 0.05° about z between 2025-06-16 16:06 (day1) and 2025-06-17 15:06 (day2)."
+    ]
+
+
+def test_two_moves_are_both_found_and_a_clock_or_a_speed_of_sound_is_none():
+    turns = [(0, 0, 0), (0, 0, 0), (1, 0, 0), (1, 0, 0), (0, 0, 0), (0, 0, 0)]
+    series = [extrinsics(day, turn, late=0.5 * (day % 2), scale=0.01 * (day > 2)) for day, turn in enumerate(turns)]
+    found = compare(series)
+    assert [change.first_after.name for change in found.moved] == ["day2", "day4"]
+    assert [change.first_after.name for change in found.scale_changed] == ["day3"]
+    assert found.clock_changed
+    only = compare([extrinsics(0), extrinsics(1, late=0.5, scale=0.02)])
+    assert only.same_mounting and only.clock_changed and only.scale_changed
+    said = sentences(only)
+    assert said[0].startswith("The same mounting within σ")
+    assert "+2.00 % ± 0.14 %" in said[1] and "0.50 s ± 0.01 s later" in said[2]
+
+
+def test_a_dvl_that_was_put_elsewhere_is_said_by_its_lever_arm():
+    found = compare([extrinsics(0), extrinsics(1, arm=(0.5, 0.0, 0.0))])
+    assert sentences(found)[0].startswith(
+        "The mounting has moved in its place (lever arm x +0.50 m ± 0.03 m, y +0.00 m ± 0.03 m, z +0.00 m ± 0.03 m) "
+    )
+
+
+@pytest.mark.parametrize("n", [2, 5])
+def test_what_only_chance_makes_differ_is_the_same_in_99_of_100(n):
+    rng = np.random.default_rng(n)
+    moved = sum(not compare([noisy(day, rng) for day in range(n)]).same_mounting for _ in range(100))
+    assert moved <= 4  # of 100 at 1 % or less: more than 4 by chance four times in a thousand
+
+
+def test_chi_square_of_a_pair_and_of_each_against_the_rest_is_that_of_the_covariances():
+    rng = np.random.default_rng(3)
+    draws = [compare([noisy(day, rng) for day in range(4)]) for _ in range(100)]
+    pairs = [pair.test().value for found in draws for pair in found.pairs[:1]]
+    rest = [found.against_rest[2].test().value for found in draws]
+    assert np.mean(pairs) == pytest.approx(8.0, abs=1.6) and np.mean(rest) == pytest.approx(8.0, abs=1.6)
+    p = [found.pairs[0].test(MOUNTING).p for found in draws]
+    assert 0.4 < np.mean(p) < 0.6
+
+
+def test_the_turn_sigma_is_worth_what_simulated_states_scatter_by():
+    """Of a DVL mounted at an angle, for a model in the DVL's frame: against Monte Carlo through the error model."""
+    parameters = Parameters(mounting_rpy=(0.1, -0.2, 0.8))
+    model, rng = MODELS["G1"], np.random.default_rng(5)
+    x = np.array([0.03, -0.02, 0.05, 0.004, -0.002, 0.01])
+    root = np.tril(rng.normal(size=(6, 6))) * 1e-3 + np.eye(6) * 1e-3
+    made = extrinsics_of("a", model, GaussianState(x, root @ root.T), parameters, (0, 1), 100)
+    draws = x + rng.normal(size=(3000, 6)) @ root.T
+    turns = np.array(
+        [
+            rotation_vector(
+                corrected_mounting(draw[:3], parameters.rotation_dvl_from_body) @ made.rotation_body_from_dvl.T
+            )
+            for draw in draws
+        ]
+    )
+    assert np.allclose(np.cov(turns.T), made.covariance[:3, :3], rtol=0.1, atol=1e-7)
+
+
+def test_totals_are_compared_so_the_same_dvl_under_another_nominal_mounting_is_the_same():
+    model, p = MODELS["G1"], np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-4])
+    flat, turned = Parameters(), Parameters(mounting_rpy=(0.0, 0.0, math.radians(3.0)))
+    total = rotation_from_rpy((0.0, 0.0, math.radians(2.0)))
+    states = []
+    for parameters in (flat, turned):
+        phi = -np.tan(rotation_vector(parameters.rotation_dvl_from_body @ total))
+        states.append(GaussianState(np.array([*phi, 0.0, 0.0, 0.0]), p))
+    a, b = (
+        extrinsics_of(name, model, state, parameters, (0, 1), 10)
+        for name, state, parameters in zip("ab", states, (flat, turned), strict=True)
+    )
+    difference = Difference.between(a, b)
+    assert np.allclose(difference.value[:3], 0.0, atol=1e-9) and compare([a, b]).same_mounting
+
+
+def test_what_one_of_two_has_not_shown_is_not_compared():
+    shown = np.array([False, True, True, False, False, False, False, False])
+    other = extrinsics(1, (0.0, 0.0, 0.7), shown=shown, model="M7", covariance=np.diag(np.where(shown, STD**2, 0.0)))
+    found = compare([extrinsics(0), other])
+    assert [name for name, known in zip(COMPONENTS, found.pairs[0].compared, strict=True) if known] == [
+        "turn_y",
+        "turn_z",
+    ]
+    assert not found.same_mounting and np.isnan(found.pairs[0].std[0])
+    assert any("the models differ (G2, M7)" in remark for remark in remarks(found))
+
+
+def test_a_lever_arm_that_is_taken_as_known_and_is_another_is_remarked():
+    assumed = np.array([True] * 3 + [False] * 3 + [True] * 2)
+    found = compare([
+        extrinsics(0, arm=(-1.9, 0.0, 0.0)),
+        extrinsics(1, shown=assumed, covariance=np.diag(np.where(assumed, STD**2, 0.0))),
+    ])  # fmt: skip
+    assert "-p lever_arm:=[-1.90, 0.00, 0.00]" in " ".join(remarks(found))
+
+
+def test_nothing_shown_by_two_is_one_line():
+    blank = {"shown": np.zeros(8, dtype=bool), "covariance": np.zeros((8, 8))}
+    with pytest.raises(InputError, match="no angle that two of them have shown"):
+        compare([extrinsics(0), extrinsics(1, **blank)])
+    with pytest.raises(InputError, match="one alone"):
+        compare([extrinsics(0)])
+
+
+def test_several_together_are_their_weighted_mean():
+    tight = extrinsics(1, (0.0, 0.0, 0.3), covariance=np.diag(STD**2) / 4.0)
+    both = fused([extrinsics(0), tight])
+    assert math.degrees(rotation_vector(both.rotation_body_from_dvl)[2]) == pytest.approx(0.8 * 0.3)
+    assert both.std[2] == pytest.approx(STD[2] / math.sqrt(5.0))
+
+
+def test_a_scatter_beyond_sigma_without_an_instant_is_said_to_be_a_sigma_too_small():
+    found = compare([extrinsics(day, [0.1 * (-1) ** day] * 3) for day in range(12)])
+    assert found.same_mounting
+    assert sentences(found)[0].startswith("The mounting has moved at no one instant: 12 calibrations differ by at most")
+    assert "scatter by 1.5 times their σ" in sentences(found)[-1]
