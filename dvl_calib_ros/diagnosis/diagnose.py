@@ -16,6 +16,7 @@ from ..effects.registry import EFFECTS
 from ..replay.replay import Topics
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
+from .dvl import dvl_seen
 from .fitting import prior_std
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
@@ -110,6 +111,7 @@ def diagnose_recordings(
         compared_axes=_compared_axes(selection),
         recordings=tuple((recording.name, recording.first_ns) for recording in recordings),
         twins=twins(selection),
+        dvl=dvl_seen(selection, parameters),
     )
 
 

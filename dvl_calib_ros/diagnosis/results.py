@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Any
 
 from .closure import Gap
+from .dvl import DvlSeen
 from .noise_findings import NoiseFinding
 from .series import DiagnosisSeries
 from .twin import Twin
@@ -43,7 +44,7 @@ class FoundEffect:
 class Diagnosis:
     """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any.
     calibration: value, low, high of φ (rad) and δk, three of each, beside the effects. compared_axes: in words.
-    recordings: names and first stamps (ns). twins: of the recordings.
+    recordings: names and first stamps (ns). twins: of the recordings. dvl: as another simulator has to be told of it.
     """
 
     verdict: Verdict
@@ -61,6 +62,7 @@ class Diagnosis:
     compared_axes: str = "xyz"
     recordings: tuple[tuple[str, int], ...] = ()
     twins: tuple[Twin, ...] = ()
+    dvl: DvlSeen | None = None
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -116,6 +118,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
             "phi_rad": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[:3], strict=False)},
             "delta_k": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[3:], strict=False)},
         },
+        **({} if diagnosis.dvl is None else {"dvl": _dvl(diagnosis.dvl)}),
         "compared_axes": diagnosis.compared_axes,
         "notes": list(diagnosis.notes),
     }
@@ -125,6 +128,19 @@ def _by_recording(effect: FoundEffect) -> dict[str, Any]:
     if not effect.by_recording:
         return {}
     return {"by_recording": {name: _parameters(values) for name, values in effect.by_recording.items()}}
+
+
+def _dvl(dvl: DvlSeen) -> dict[str, Any]:
+    return {
+        "mounting_rpy": list(dvl.mounting_rpy),
+        "lever_arm_m": list(dvl.lever_arm),
+        "time_offset_s": dvl.time_offset,
+        "clock_drift": dvl.clock_drift,
+        "rate_hz": dvl.rate_hz,
+        "noise_std_mps": list(dvl.noise_std),
+        "speed_mps": list(dvl.speed),
+        "sizes_mps": dict(dvl.sizes),
+    }
 
 
 def _parameters(parameters: Mapping[str, tuple[float, float, float]]) -> dict[str, Any]:

@@ -36,13 +36,13 @@ def twins(selection: Selection) -> tuple[Twin, ...]:
     problem = selection.fitter.problem
     found = []
     for index, recording in enumerate(problem.recordings):
-        without, with_effects = (_simulated(problem, fit.hypothesis, index) for fit in (selection.base, selection.fit))
+        without, with_effects = (simulated(problem, fit.hypothesis, index) for fit in (selection.base, selection.fit))
         dvl = recording.dvl
         found.append(Twin(recording, dvl.time, dvl.values, without, with_effects))
     return tuple(found)
 
 
-def _simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
+def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     """(N, 3) m/s: the composed model forwards, from the reference's motion to what the DVL measures."""
     recording, injections = problem.recordings[index], hypothesis.injections(index)
     time = recording.dvl.time

@@ -1,0 +1,75 @@
+"""Write what was found of a DVL as the settings of another simulator, and what that simulator cannot represent.
+
+Mounting with misalignment, lever arm, noise and rate are from the diagnosis; everything else is at the simulator's
+defaults, and named so. What cannot be represented is printed, each with the error in m/s that stays, and written
+beside it as FILE.missing.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import common
+
+if TYPE_CHECKING:
+    from ..export.simulator import Export
+
+NAME = "export"
+HELP = "write what was found of a DVL as the settings of another simulator"
+EXAMPLE = "dvl-calib export gazebo diagnosis.json -o dvl.sdf"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    from ..export.simulators import SIMULATORS
+
+    parser.add_argument("simulator", choices=tuple(SIMULATORS), metavar="SIMULATOR", help=", ".join(SIMULATORS))
+    parser.add_argument(
+        "source", type=Path, metavar="DIAGNOSIS", help="what diagnose --json wrote; or a calibration's result file"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="settings to write")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Read, write both files, print."""
+    from .. import __version__
+    from ..export.description import load_description
+    from ..export.simulator import export, export_document
+    from ..export.simulators import SIMULATORS
+    from ..files.atomic import own_stream, save_text
+
+    is_file = own_stream(arguments.output) is None
+    if is_file:
+        arguments.missing = arguments.output.with_name(f"{arguments.output.name}.missing.json")
+    common.check_outputs(arguments, "output", "missing")
+    description = load_description(arguments.source)
+    exported = export(arguments.simulator, SIMULATORS[arguments.simulator], description)
+    save_text(arguments.output, exported.settings.text)
+    if is_file:
+        common.write_json(arguments.missing, export_document(exported, description, __version__))
+        _print(exported, arguments)
+
+
+def _print(exported: Export, arguments: argparse.Namespace) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    out = common.console()
+    out.print(f"wrote {arguments.output}: {', '.join(exported.settings.found)}", soft_wrap=True, markup=False)
+    if exported.settings.defaults:
+        names = ", ".join(exported.settings.defaults)
+        out.print(f"at the simulator's defaults: {names}", soft_wrap=True, markup=False)
+    for remark in exported.remarks:
+        out.print(f"note: {remark}", soft_wrap=True, markup=False)
+    if not exported.missing:
+        out.print(f"{arguments.simulator} can represent everything that was found")
+        return
+    table = Table(title=f"{arguments.simulator} cannot represent", title_justify="left")
+    for column in ("what", "error that stays, mm/s", "why"):
+        table.add_column(column)
+    for each in exported.missing:
+        error = "-" if each.error is None else f"{1e3 * each.error:.1f}"
+        table.add_row(each.name, error, escape(each.says))
+    out.print(table)

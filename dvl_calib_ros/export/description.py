@@ -1,0 +1,189 @@
+"""One description of a DVL for all writers, from a diagnosis or a calibration's result file."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..calibration.frames import rotation_from_rpy, rpy_from_rotation
+from ..effects.base import ActsOn, AnyEffect
+from ..effects.registry import EFFECTS, NOISE_EFFECTS
+from ..errors import InputError
+from ..files.result_file import FORMAT, load_result
+
+Three = tuple[float, float, float]
+# What a description holds as numbers, and simulators may have settings for; everything else is `others`
+GIVEN_AS_NUMBERS = ("lever_arm", "velocity_bias")
+_OF_THE_REFERENCE = (ActsOn.REFERENCE, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
+# A diagnosis has some ten thousand bytes; what is much larger is none, and is not read to find out
+LARGEST_FILE = 1 << 24
+
+
+@dataclass(frozen=True)
+class Other:
+    """An effect that was found and that is no number of the description.
+
+    size: RMS, m/s, of what it changes; None where that is not known. of_the_reference: it is in the reference or the
+    attitude, not in the DVL.
+    """
+
+    name: str
+    parameters: Mapping[str, float]
+    size: float | None = None
+    of_the_reference: bool = False
+
+
+@dataclass(frozen=True)
+class DvlDescription:
+    """A DVL as it is: SI, forward-left-up.
+
+    mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included. lever_arm: (3,) m, of the
+    DVL from the reference point, body frame. scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
+    noise_std: (3,) m/s, of its axes; rate_hz: None where not known. speed: (3,) m/s, RMS along its axes. sizes: m/s, by
+    name (`misalignment`, `scale`, effects). others: effects that are none of these. source: file that it is from.
+    ambiguous: sets of effects that the data could not tell apart, of which the first is taken.
+
+    Raises InputError for numbers that are not finite, or no rate or noise.
+    """
+
+    source: str
+    mounting_rpy: Three
+    lever_arm: Three = (0.0, 0.0, 0.0)
+    scale: Three = (0.0, 0.0, 0.0)
+    velocity_bias: Three = (0.0, 0.0, 0.0)
+    noise_std: Three | None = None
+    rate_hz: float | None = None
+    speed: Three | None = None
+    sizes: Mapping[str, float] = field(default_factory=dict)
+    others: tuple[Other, ...] = ()
+    ambiguous: tuple[tuple[str, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        vectors = (self.mounting_rpy, self.lever_arm, self.scale, self.velocity_bias, self.noise_std or ())
+        if not all(math.isfinite(value) for vector in vectors for value in vector):
+            raise InputError(f"{self.source}: holds numbers that are not finite; diagnose again")
+        if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
+            raise InputError(f"{self.source}: a rate of {self.rate_hz:g} Hz is none; diagnose again")
+        if any(std < 0.0 for std in self.noise_std or ()):
+            raise InputError(f"{self.source}: a negative standard deviation is none; diagnose again")
+
+
+def load_description(path: Path) -> DvlDescription:
+    """Of a diagnosis (JSON) or a result file (YAML). Raises InputError."""
+    document = _json(path)
+    if document is None:
+        return _of_result(path)
+    if not isinstance(document, dict) or "effects" not in document or "calibration" not in document:
+        raise InputError(f"{path}: no diagnosis; give what dvl-calib diagnose --json writes, or a result file")
+    if "dvl" not in document:
+        raise InputError(
+            f"{path}: holds no mounting, rate and noise of the DVL: nothing could be compared, or an older version "
+            "wrote it; diagnose again (--json)"
+        )
+    try:
+        return _of_diagnosis(path, document)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: damaged diagnosis ({type(error).__name__}: {error}); diagnose again") from error
+
+
+def _json(path: Path) -> Any | None:
+    """Content of a JSON file; None if it is a result file. Raises InputError."""
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise InputError(f"{path}: is too large for a diagnosis; give what dvl-calib diagnose --json writes")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); name a diagnosis or a result file") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text; give what dvl-calib diagnose --json writes") from error
+    if text.lstrip().startswith("{"):
+        try:
+            return json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: no valid JSON ({error}); diagnose again") from error
+    if f"format: {FORMAT}" in text:
+        return None
+    raise InputError(f"{path}: neither a diagnosis (JSON) nor a result file (YAML); see dvl-calib diagnose --json")
+
+
+def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
+    dvl, sizes = document["dvl"], {name: float(size) for name, size in document["dvl"]["sizes_mps"].items()}
+    found = {each["name"]: _values(each["parameters"]) for each in document["effects"]}
+    arm = found.get("lever_arm", {})
+    bias = found.get("velocity_bias", {})
+    phi, scale = (_values(document["calibration"][name]) for name in ("phi_rad", "delta_k"))
+    turned = Rotation.from_rotvec([phi.get(axis, 0.0) for axis in "xyz"]).as_matrix()
+    body_from_dvl = rotation_from_rpy(_three(dvl["mounting_rpy"])) @ turned.T
+    return DvlDescription(
+        source=str(path),
+        mounting_rpy=_three(rpy_from_rotation(body_from_dvl)),
+        lever_arm=_three(
+            [known + arm.get(f"{axis}_m", 0.0) for axis, known in zip("xyz", dvl["lever_arm_m"], strict=True)]
+        ),
+        scale=_three([scale.get(axis, 0.0) for axis in "xyz"]),
+        velocity_bias=_three([bias.get(f"{axis}_mps", 0.0) for axis in "xyz"]),
+        noise_std=_three(dvl["noise_std_mps"]),
+        rate_hz=float(dvl["rate_hz"]),
+        speed=_three(dvl["speed_mps"]),
+        sizes=sizes,
+        others=_others(document, found, sizes),
+        ambiguous=tuple(
+            (each["name"], *each["equivalent_to"]) for each in document["effects"] if each.get("equivalent_to")
+        ),
+    )
+
+
+def _others(
+    document: Mapping[str, Any], found: Mapping[str, Mapping[str, float]], sizes: Mapping[str, float]
+) -> tuple[Other, ...]:
+    systematic = {name: dict(values) for name, values in found.items() if name not in GIVEN_AS_NUMBERS}
+    dvl = document["dvl"]
+    for name, parameter, before in (
+        ("dvl_time_offset", "seconds", dvl["time_offset_s"]),
+        ("clock_drift", "seconds_per_hour", 3600.0 * dvl["clock_drift"]),
+    ):
+        if before:
+            systematic.setdefault(name, {parameter: 0.0})[parameter] += before
+    others = [Other(name, values, sizes.get(name), _is_of_reference(name)) for name, values in systematic.items()]
+    others.sort(key=lambda each: -(each.size or 0.0))
+    noise = [Other(each["name"], _values(each["parameters"])) for each in document.get("noise", [])]
+    return (*others, *(Other(each.name, each.parameters, None, _is_of_reference(each.name)) for each in noise))
+
+
+def _is_of_reference(name: str) -> bool:
+    effect: AnyEffect | None = EFFECTS.get(name) or NOISE_EFFECTS.get(name)
+    return effect is not None and effect.acts_on in _OF_THE_REFERENCE
+
+
+def _values(parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Values of a diagnosis' parameters; null is no limit."""
+    values = {name: each["value"] for name, each in parameters.items()}
+    return {name: math.inf if value is None else float(value) for name, value in values.items()}
+
+
+def _three(values: Sequence[float] | Any) -> Three:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _of_result(path: Path) -> DvlDescription:
+    content, _ = load_result(path)
+    try:
+        mounting = content["mounting"]
+        late = float(mounting.get("dvl_time_offset") or 0.0)
+        return DvlDescription(
+            source=str(path),
+            mounting_rpy=_three(mounting["corrected_rpy"]),
+            lever_arm=_three(mounting["lever_arm"]),
+            scale=_three(np.asarray(mounting["scale_error_xyz"], dtype=float)),
+            others=(Other("dvl_time_offset", {"seconds": late}),) if late else (),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged, it holds no mounting ({type(error).__name__}: {error})") from error

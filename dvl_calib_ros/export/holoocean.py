@@ -1,0 +1,57 @@
+"""HoloOcean: a `DVLSensor` of a scenario's agent, as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+
+from .description import DvlDescription
+from .simulator import Settings, Simulator, beams_of, split
+
+TITLE = "HoloOcean"
+ELEVATION_DEG = 22.5
+DEFAULTS = {
+    "Hz": 30.0,
+    "VelSigma": 0.0,
+    "Elevation": ELEVATION_DEG,
+    "DebugLines": False,
+    "ReturnRange": True,
+    "MaxRange": 50.0,
+    "RangeSigma": 0.0,
+}
+
+
+def write(description: DvlDescription) -> Settings:
+    """Noise is that of each beam. Rotations in degrees about fixed axes, roll, pitch, yaw."""
+    beams = beams_of(description.noise_std, math.radians(ELEVATION_DEG))
+    known = {
+        "location": description.lever_arm,
+        "rotation": [math.degrees(angle) for angle in description.mounting_rpy],
+        "Hz": description.rate_hz,
+        "VelSigma": beams and beams.std,
+        "Elevation": math.degrees(beams.angle) if beams and beams.is_found else None,
+    }
+    values, found, own = split(known, DEFAULTS)
+    configuration = {name: values[name] for name in DEFAULTS if name != "Hz"}
+    sensor = {
+        "sensor_type": "DVLSensor",
+        "sensor_name": "DVLSensor",
+        "location": values["location"],
+        "rotation": values["rotation"],
+        "Hz": values["Hz"],
+        "configuration": configuration,
+    }
+    return Settings(
+        json.dumps(sensor, indent=2, allow_nan=False) + "\n",
+        found,
+        own,
+        frozenset({"lever_arm"}),
+        beams and beams.axis_std,
+        remarks=(
+            "no socket is named, so location is from the agent's centre: add what lies between",
+            f"Hz must divide ticks_per_sec of the scenario; this is {values['Hz']:g}",
+        ),
+    )
+
+
+SIMULATOR = Simulator(TITLE, write, 'add the object to the "sensors" of your agent in the scenario')

@@ -1,0 +1,215 @@
+"""What a simulator can be told of a DVL, and what stays: the form that every writer has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .description import DvlDescription
+
+# Noise of one axis that is off by less is not worth telling, as a share of the noise of all
+SAME_NOISE = 0.2
+# DVLs have beams of 20 to 30 degrees from vertical; noise that would tell of others is not that of equal beams
+PLAUSIBLE_ANGLES = (math.radians(12.0), math.radians(40.0))
+_WHY_NOT = "{} has no setting for it"
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Something that was found and that a simulator cannot be told. error: m/s that stay, RMS; None: not known."""
+
+    name: str
+    says: str
+    error: float | None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a writer makes of a description.
+
+    text: the file. found: settings by name that are from what was found; defaults: those that are the simulator's own.
+    represented: what of `lever_arm`, `scale`, `velocity_bias` is in the file. noise_std: (3,) m/s that its axes have
+    with these settings, None where the default noise stands. scale: the one error of all axes. remarks: what whoever
+    uses the file should know.
+    """
+
+    text: str
+    found: Mapping[str, Any]
+    defaults: Mapping[str, Any]
+    represented: frozenset[str]
+    noise_std: tuple[float, float, float] | None = None
+    scale: float = 0.0
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator. title: its name. write: description -> settings. where: what to do with the file."""
+
+    title: str
+    write: Callable[[DvlDescription], Settings]
+    where: str
+
+
+@dataclass(frozen=True)
+class Export:
+    """Settings for one simulator, and what it cannot represent, the largest first."""
+
+    simulator: str
+    settings: Settings
+    missing: tuple[Missing, ...]
+    remarks: tuple[str, ...] = field(default_factory=tuple)
+
+
+def export(name: str, simulator: Simulator, description: DvlDescription) -> Export:
+    """Settings of a simulator for a DVL."""
+    settings = simulator.write(description)
+    missing = sorted(_missing(simulator.title, settings, description), key=lambda each: -(each.error or 0.0))
+    ambiguous = tuple(
+        f"the data could not tell {', '.join(names)} apart; {names[0]} is taken" for names in description.ambiguous
+    )
+    return Export(name, settings, tuple(missing), (*settings.remarks, *ambiguous, simulator.where))
+
+
+def export_document(export: Export, description: DvlDescription, version: str) -> dict[str, Any]:
+    """Plain data for the list beside the file."""
+    return {
+        "simulator": export.simulator,
+        "source": description.source,
+        "missing": [{"name": each.name, "says": each.says, "error_mps": each.error} for each in export.missing],
+        "found": dict(export.settings.found),
+        "defaults": dict(export.settings.defaults),
+        "remarks": list(export.remarks),
+        "version": version,
+    }
+
+
+def _missing(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
+    why = _WHY_NOT.format(title)
+    found = []
+    for name, values, unit in (
+        ("lever_arm", description.lever_arm, "m"),
+        ("velocity_bias", description.velocity_bias, "m/s"),
+    ):
+        if any(values) and name not in settings.represented:
+            says = f"{', '.join(f'{value:.3g}' for value in values)} {unit}; {why}"
+            size = float(np.linalg.norm(values)) if name == "velocity_bias" else description.sizes.get(name)
+            found.append(Missing(name, says, size))
+    found += _scale(title, settings, description)
+    found += _noise(settings, description)
+    for other in description.others:
+        values_said = ", ".join(f"{name} {value:.3g}" for name, value in other.parameters.items())
+        reason = "it is in the reference or attitude, not in the DVL" if other.of_the_reference else why
+        found.append(Missing(other.name, f"{values_said}; {reason}".lstrip("; "), other.size))
+    return found
+
+
+def _scale(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
+    """What is left of the scale-factor errors, where the simulator has none or one for all axes."""
+    left = np.array(description.scale) - settings.scale
+    if not np.any(np.abs(left) > 1e-9):
+        return []
+    error = None if description.speed is None else float(np.linalg.norm(left * description.speed))
+    per_axis = ", ".join(f"{100.0 * value:+.2f}" for value in description.scale)
+    only = "one for all axes" if "scale" in settings.represented else "no setting for it"
+    return [Missing("scale", f"{per_axis} % along x, y, z; {title} has {only}", error)]
+
+
+def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
+    """Noise of axes that differs from what was found."""
+    if description.noise_std is None or settings.noise_std is None:
+        return []
+    has, wanted = np.array(settings.noise_std), np.array(description.noise_std)
+    error = math.sqrt(float(np.abs(has**2 - wanted**2).sum()))
+    if error <= SAME_NOISE * float(np.linalg.norm(wanted)):
+        return []
+    says = " and ".join(
+        f"{', '.join(f'{1e3 * value:.1f}' for value in values)} mm/s {what}"
+        for values, what in ((wanted, "found along x, y, z"), (has, "with these settings"))
+    )
+    return [Missing("noise", says, error)]
+
+
+# ------------------------------------------------------------------ what several writers need
+
+
+def mixed_scale(description: DvlDescription) -> float:
+    """The one scale-factor error that stands best for those of the three axes, at the speeds that were driven."""
+    scale = np.array(description.scale)
+    if description.speed is None:
+        return float(scale[0])  # ahead, where vehicles go
+    weight = np.square(description.speed)
+    return float(scale @ weight / max(float(weight.sum()), 1e-12))
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Four equal Janus beams. angle: rad, from vertical; is_found: from the noise, else as given. std: m/s, each."""
+
+    angle: float
+    is_found: bool
+    std: float
+
+    @property
+    def axis_std(self) -> tuple[float, float, float]:
+        """Noise (3,) m/s of the axes, which are solved from the beams by least squares."""
+        across = self.std / (math.sqrt(2.0) * math.sin(self.angle))
+        return across, across, self.std / (2.0 * math.cos(self.angle))
+
+
+def beams_of(noise_std: tuple[float, float, float] | None, default_angle: float) -> Beams | None:
+    """Beams whose least squares have this noise along the axes, None where it is not known.
+
+    The flatter the beams, the less is the noise across against that along z: their ratio is √2 / tan(angle).
+    """
+    if noise_std is None:
+        return None
+    across, along = math.hypot(noise_std[0], noise_std[1]) / math.sqrt(2.0), noise_std[2]
+    angle = math.atan2(math.sqrt(2.0) * along, across) if across > 0.0 else 0.0
+    is_found = PLAUSIBLE_ANGLES[0] <= angle <= PLAUSIBLE_ANGLES[1]
+    angle = angle if is_found else default_angle
+    return Beams(angle, is_found, math.sqrt(2.0) * math.sin(angle) * across)
+
+
+def equal_std(noise_std: tuple[float, float, float]) -> float:
+    """The noise of three equal axes with as much in all."""
+    return float(np.linalg.norm(noise_std)) / math.sqrt(3.0)
+
+
+def tidy(value: Any) -> Any:
+    """Numbers to nine digits, which is more than any is known to; and no -0.0."""
+    if isinstance(value, list | tuple):
+        return [tidy(each) for each in value]
+    return float(f"{value:.9g}") + 0.0 if isinstance(value, float) else value
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Numbers in a row."""
+    return " ".join(str(tidy(float(value))) for value in values)
+
+
+def split(
+    known: Mapping[str, Any], defaults: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Settings in all, those found, and those at the simulator's own. known: None where it was not found."""
+    found = {name: tidy(value) for name, value in known.items() if value is not None}
+    own = {name: value for name, value in defaults.items() if name not in found}
+    return {**defaults, **found}, found, own
+
+
+def comment(title: str, description: DvlDescription, found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
+    """Where a file comes from, for its first lines; as XML comments may be, without two hyphens in a row."""
+    lines = [
+        f"DVL for {title}, from {description.source} (dvl-calib export).",
+        f"From what was found: {', '.join(found)}.",
+        f"At {title}'s defaults: {', '.join(own) or 'nothing'}.",
+        "What cannot be represented is listed in the .missing.json beside it.",
+    ]
+    text = "\n".join(" ".join(line.split()) for line in lines)
+    while "--" in text:
+        text = text.replace("--", "- -")
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
