@@ -37,7 +37,7 @@ def write(description: DvlDescription) -> Settings:
     known = {
         "pose": numbers((*description.lever_arm, *description.mounting_rpy)),
         "updateRateHZ": description.rate_hz,
-        "gaussianNoiseBeamVel": beams and beams.std,
+        "gaussianNoiseBeamVel": beams.std if beams else None,
         "beamAngleDeg": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
     values, found, own = split(known, DEFAULTS)
@@ -59,7 +59,7 @@ def write(description: DvlDescription) -> Settings:
     }
     for name, value in (names | {name: values[name] for name in DEFAULTS}).items():
         ET.SubElement(plugin, name).text = value if isinstance(value, str) else repr(value)
-    return Settings(xml_text(root), found, own, frozenset({"lever_arm"}), beams and beams.axis_std)
+    return Settings(xml_text(root), found, own, frozenset({"lever_arm"}), beams.axis_std if beams else None)
 
 
 SIMULATOR = Simulator(

@@ -58,7 +58,7 @@ def write(description: DvlDescription) -> Settings:
         "sample_time": None if description.rate_hz is None else 1.0 / description.rate_hz,
         "seed": SEED,
         "use_constant_seed": True,
-        "beam_velocity_noise_std": beams and beams.std,
+        "beam_velocity_noise_std": beams.std if beams else None,
         "beam_angle": math.degrees(beams.angle) if beams and beams.is_found else None,
         "interval_initial_scale_factor": float(100.0 * scale / drawn[0]),
         "lever_arm_body_to_sensor_frame": (body_from_dvl.T @ np.array(description.lever_arm)).tolist(),
@@ -87,7 +87,7 @@ def write(description: DvlDescription) -> Settings:
         found,
         own,
         frozenset({"lever_arm", "scale", "velocity_bias"}),
-        beams and beams.axis_std,
+        beams.axis_std if beams else None,
         scale,
         (
             f"the intervals of scale and biases are made for the constant seed {SEED}: leave it; every run then has "

@@ -35,7 +35,7 @@ def write(description: DvlDescription) -> Settings:
     known = {
         "pose": numbers((*description.lever_arm, *description.mounting_rpy)),
         "update_rate": description.rate_hz,
-        "stddev": beams and beams.std,
+        "stddev": beams.std if beams else None,
         "tilt": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
     values, found, own = split(known, DEFAULTS)
@@ -64,7 +64,7 @@ def write(description: DvlDescription) -> Settings:
     for name in ("resolution", "maximum_range", "minimum_range"):
         ET.SubElement(dvl, name).text = repr(values[name])
     ET.SubElement(dvl, "reference_frame").text = values["reference_frame"]
-    return Settings(xml_text(root), found, own, frozenset({"lever_arm"}), beams and beams.axis_std)
+    return Settings(xml_text(root), found, own, frozenset({"lever_arm"}), beams.axis_std if beams else None)
 
 
 SIMULATOR = Simulator(

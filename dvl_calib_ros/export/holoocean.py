@@ -28,7 +28,7 @@ def write(description: DvlDescription) -> Settings:
         "location": description.lever_arm,
         "rotation": [math.degrees(angle) for angle in description.mounting_rpy],
         "Hz": description.rate_hz,
-        "VelSigma": beams and beams.std,
+        "VelSigma": beams.std if beams else None,
         "Elevation": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
     values, found, own = split(known, DEFAULTS)
@@ -46,7 +46,7 @@ def write(description: DvlDescription) -> Settings:
         found,
         own,
         frozenset({"lever_arm"}),
-        beams and beams.axis_std,
+        beams.axis_std if beams else None,
         remarks=(
             "no socket is named, so location is from the agent's centre: add what lies between",
             f"Hz must divide ticks_per_sec of the scenario; this is {values['Hz']:g}",

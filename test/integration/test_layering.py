@@ -20,6 +20,7 @@ MAY_IMPORT = {
     "messages": {"bags", "calibration", "errors"},
     "files": {"bags", "messages", "calibration", "errors"},
     "diagnosis": {"bags", "messages", "replay", "effects", "calibration", "errors"},
+    "export": {"files", "effects", "calibration", "errors"},
     "report": {"diagnosis", "evaluation", "replay", "files", "effects", "calibration", "errors"},
 }
 WIRING = {"cli", "node", "demo"}
