@@ -67,7 +67,8 @@ def fuzz_apart(name: str, inputs: int, corpus: Path) -> bool:
 
 def _environment() -> dict[str, str]:
     root = str(HERE.parents[1])
-    return os.environ | {"PYTHONPATH": os.pathsep.join([root, str(HERE.parent), str(HERE)])}
+    before = os.environ.get("PYTHONPATH", "")
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [root, str(HERE.parent), str(HERE), before]))}
 
 
 def main() -> int:
@@ -82,7 +83,9 @@ def main() -> int:
     parser.add_argument("--corpus", type=Path, default=Path("fuzz_corpus"), help="folder; default: %(default)s")
     arguments = parser.parse_args()
     os.nice(max(0, 15 - os.nice(0)))
-    names = arguments.targets or list(SHARES)
+    from targets import TARGETS
+
+    names = arguments.targets or [name for name in SHARES if name in TARGETS]  # without ROS 2 no live node
     total = sum(SHARES[name] for name in names)
     clean = [fuzz_apart(name, round(arguments.inputs * SHARES[name] / total), arguments.corpus) for name in names]
     return 0 if all(clean) else 1
