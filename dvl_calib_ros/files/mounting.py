@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import yaml
 
 from .. import __version__
 from ..calibration.correction import lever_arm
@@ -20,17 +19,21 @@ from ..calibration.error_model import corrected_mounting
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
+from ..calibration.mounting_pose import scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
 from ..calibration.verification import Word
 from ..errors import InputError
-from .parameter_files import NODE_NAME, changed_parameters
+from .parameter_edit import as_yaml, new_file, with_parameters
+from .parameter_files import NODE_NAME, changed_parameters, load_parameters
 from .result_file import load_result, static_transform_arguments
 from .urdf import Mounting, Urdf, numbers
 
 # A mounting written by hand with three digits is meant to be the one that the calibration began with, rad.
 SAME_MOUNTING = 2e-3
-# Below this there is nothing to write, rad.
+# A position written by hand in centimetres is meant to be the one that the calibration began with, m.
+SAME_POSITION = 0.011
+# Below this there is nothing to write, rad and m: nine digits are written.
 ALREADY = 1e-7
 FUSION_NODE = "ekf_filter_node"
 
@@ -41,9 +44,9 @@ class CalibratedMounting:
 
     rotation_body_from_dvl (3, 3): corrected, of the forward-left-up axes that are calibrated. turned: whether the
     driver's data, in dvl_frame, are forward-right-down, and were turned to those. scale (3,): δk per DVL axis, 0 where
-    not estimated; scale_ahead: of motion ahead. lever_arm (3,): m from the reference point, body frame, as it was
-    found, else as the parameters say. objections: why it should not be applied; doubts: what to know when it
-    is; both in sentences.
+    not estimated; scale_ahead: of motion ahead. lever_arm (3,): m from the reference point, body frame, and
+    dvl_time_offset: s, positive late; as they were found, else as the parameters say. objections: why it should not be
+    applied; doubts: what to know when it is; both in sentences.
     """
 
     path: Path
@@ -57,6 +60,23 @@ class CalibratedMounting:
     doubts: tuple[str, ...]
     turned: bool = False
     lever_arm: tuple[float, ...] = (0.0, 0.0, 0.0)
+    dvl_time_offset: float = 0.0
+
+    @property
+    def lever_arm_found(self) -> bool:
+        """Whether the data showed the DVL to be elsewhere than the parameters say."""
+        return self.lever_arm != self.parameters.lever_arm
+
+    @property
+    def compensating(self) -> dict[str, Any]:
+        """The parameters that take out what was found: mounting, and lever arm and delay where they were found."""
+        rpy = rpy_from_rotation(self.rotation_body_from_dvl)
+        values: dict[str, Any] = {"mounting_rpy": _rounded(rpy)}
+        if self.lever_arm_found:
+            values["lever_arm"] = _rounded(self.lever_arm)
+        if self.dvl_time_offset != self.parameters.dvl_time_offset:
+            values["dvl_time_offset"] = _rounded([self.dvl_time_offset])[0]
+        return values
 
     @property
     def rotation_body_from_dvl_frame(self) -> Array:
@@ -105,9 +125,15 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     if not angle_between(rotation, saved) < 1e-6:
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     doubts += _unseen(model, state, parameters)
+    delay = scale_and_delay(model, state, parameters).time_offset
     return CalibratedMounting(
-        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, position
+        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, position, delay
     )
+
+
+def _rounded(values: Sequence[float] | Array) -> list[float]:
+    """Nine digits, so that what is written is the same when it is written again."""
+    return [float(f"{float(value):.9g}") + 0.0 for value in values]
 
 
 def _judged(
@@ -150,25 +176,69 @@ def angle_between(a: Array, b: Array) -> float:
 # ---------------------------------------------------------------------- URDF
 
 
-def calibrated_urdf(urdf: Urdf, mounting: Mounting, calibrated: CalibratedMounting, force: bool = False) -> bytes:
-    """The URDF with the calibrated mounting; its own bytes if it has it already.
+def calibrated_urdf(
+    urdf: Urdf, mounting: Mounting, calibrated: CalibratedMounting, force: bool = False, keep_position: bool = False
+) -> bytes:
+    """The URDF with the calibrated mounting, and position where that was found; its own bytes if it has them already.
 
-    Raises InputError if its mounting is another than the one the calibration began with, unless force is set.
+    Raises InputError if its mounting or position is another than the one the calibration began with, unless force is
+    set. keep_position: leave the position as it is.
     """
     now, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
     begun_with = calibrated.parameters.rotation_dvl_from_body.T
     if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
         corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
-    if angle_between(now, corrected) < ALREADY:
+    position = np.array(calibrated.lever_arm) if calibrated.lever_arm_found and not keep_position else mounting.position
+    is_there = np.abs(mounting.position - position).max() < ALREADY
+    if angle_between(now, corrected) < ALREADY and is_there:
         return urdf.content
-    if angle_between(now, begun_with) > SAME_MOUNTING and not force:
+    if angle_between(now, begun_with) > SAME_MOUNTING and angle_between(now, corrected) > ALREADY and not force:
         raise InputError(
             f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(now))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
             f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
             "or write the calibrated one all the same with --force"
         )
-    return urdf.turned(mounting, corrected)
+    began_at = np.array(calibrated.parameters.lever_arm)
+    if not is_there and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
+        raise InputError(
+            f"{urdf.path}: has the DVL at {numbers(mounting.position)} in {calibrated.base_frame} (joint "
+            f"{mounting.joint.name}), but {calibrated.path} began with lever_arm {numbers(began_at)} and found "
+            f"{numbers(_rounded(position))} from the reference point; --keep-position turns the joint alone, --force "
+            f"moves it there, which is right if the reference velocity is that of {calibrated.base_frame}'s origin"
+        )
+    return urdf.moved(mounting, corrected, None if is_there else position)
+
+
+# ---------------------------------------------------------------------- parameters of the node
+
+
+def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: bool = False) -> bytes:
+    """A parameter file for the node with what compensates the calibration's findings; made if there is none.
+
+    Raises InputError if it sets mounting, lever arm or delay to another than the one the calibration began with,
+    unless force is set; or if it starts from a saved calibration, whose angles are relative to another mounting.
+    """
+    values = calibrated.compensating
+    if not path.exists():
+        own = calibrated.parameters.replace(result_file="", initial_calibration="")
+        return new_file(own, values, _origin(calibrated))
+    there, default = load_parameters(path), Parameters()
+    if there.initial_calibration:
+        raise InputError(
+            f"{path}: sets initial_calibration, whose angles are relative to the mounting before; take it out first"
+        )
+    for name, value in values.items():
+        now, begun_with = getattr(there, name), getattr(calibrated.parameters, name)
+        known = [np.array(each) for each in (getattr(default, name), begun_with, value)]
+        within = SAME_POSITION if name == "lever_arm" else SAME_MOUNTING
+        if not any(np.allclose(now, each, rtol=0.0, atol=within) for each in known) and not force:
+            raise InputError(
+                f"{path}: sets {name} to {as_yaml(there.as_dict()[name])}, but {calibrated.path} began with "
+                f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's, or write the calibrated "
+                "one all the same with --force"
+            )
+    return with_parameters(path, values)
 
 
 def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -> str:
@@ -178,16 +248,11 @@ def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -
     return f"""# Mounting of the DVL from {urdf.path.name!r}, joint {mounting.joint.name!r}.
 /**:
   ros__parameters:
-    base_frame: {_flow(base)}
-    mounting_rpy: {_flow([float(word) for word in numbers(rpy).split()])}
+    base_frame: {as_yaml(base)}
+    mounting_rpy: {as_yaml([float(word) for word in numbers(rpy).split()])}
     # if the reference velocity is that of {base}'s origin:
-    # lever_arm: {_flow([float(word) for word in numbers(mounting.position).split()])}
+    # lever_arm: {as_yaml([float(word) for word in numbers(mounting.position).split()])}
 """
-
-
-def _flow(value: Any) -> str:
-    """A value as YAML on one line; doubles keep a decimal point, without which ROS takes them for integers."""
-    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
 
 
 # ---------------------------------------------------------------------- TF
@@ -245,11 +310,11 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
             f"{FUSION_NODE}:",
             "  ros__parameters:",
             f"    twist0: /{NODE_NAME}/calibrated_twist",
-            f"    twist0_config: {_flow(used)}",
+            f"    twist0_config: {as_yaml(used)}",
             "    twist0_queue_size: 10",
             f"{NODE_NAME}:",
             "  ros__parameters:",
-            *(f"    {key}: {_flow(value)}" for key, value in own.items()),
+            *(f"    {key}: {as_yaml(value)}" for key, value in own.items()),
             *_comment(
                 f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, turned by TF (URDF or "
                 "static transform, calibrated), which has the lever arm, too. Our node does not run. Corrected in "

@@ -27,13 +27,17 @@ MISSPELT = 0.8
 
 
 def load_parameters(
-    path: Path | None, overrides: Sequence[str] = (), defaults: Mapping[str, Any] | None = None
+    path: Path | None,
+    overrides: Sequence[str] = (),
+    defaults: Mapping[str, Any] | None = None,
+    text: str | None = None,
 ) -> Parameters:
     """Parameters of a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
 
     defaults: values, other than the schema's own, of what neither sets. An override may give angles in degrees: 45deg.
+    text: what is to be read instead of what the file holds now.
     """
-    values = dict(defaults or {}) | ({} if path is None else _node_parameters(path))
+    values = dict(defaults or {}) | ({} if path is None else _node_parameters(path, text))
     try:
         Parameters.from_mapping(values)
     except ParameterError as error:
@@ -96,8 +100,8 @@ def _number_or_degrees(value: Any) -> Any:
         return value
 
 
-def _node_parameters(path: Path) -> dict[str, Any]:
-    sections = _own_sections(path, NODE_NAME, _is_for_node)
+def _node_parameters(path: Path, text: str | None = None) -> dict[str, Any]:
+    sections = _own_sections(path, NODE_NAME, section_is_ours, text)
     values: dict[str, Any] = {}
     for _, body in sections:
         values.update(body)
@@ -121,8 +125,10 @@ def names_of_others(path: Path, node: str) -> set[str]:
     return _of_others(_own_sections(path, node, lambda section: _matches(_tokens(section), _tokens(node))))
 
 
-def _own_sections(path: Path, node: str, is_own: Callable[[str], bool]) -> list[tuple[str, dict[str, Any]]]:
-    content = load_yaml(path, "ROS 2 parameter file")
+def _own_sections(
+    path: Path, node: str, is_own: Callable[[str], bool], text: str | None = None
+) -> list[tuple[str, dict[str, Any]]]:
+    content = load_yaml(path, "ROS 2 parameter file", text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
     sections = [found for key, section in content.items() for found in _sections(str(key), section)]
@@ -181,7 +187,7 @@ def _sections(prefix: str, section: Any) -> list[tuple[str, Any]]:
     return found
 
 
-def _is_for_node(node: str) -> bool:
+def section_is_ours(node: str) -> bool:
     """Whether a section's name (with wildcards * and **) can be this node's, in whatever namespace it runs."""
     return fnmatch.fnmatchcase(NODE_NAME, node.rsplit("/", 1)[-1])
 

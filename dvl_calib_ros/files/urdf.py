@@ -1,4 +1,4 @@
-"""Mountings in a URDF: read from its fixed joints, and one joint's rotation changed with every other byte kept."""
+"""Mountings in a URDF: read from its fixed joints, and one joint's origin changed with every other byte kept."""
 
 from __future__ import annotations
 
@@ -94,17 +94,23 @@ class Urdf:
     def _fixed(self) -> str:
         return "its fixed joints: " + (", ".join(each.name for each in self.joints if each.kind == "fixed") or "none")
 
-    def turned(self, mounting: Mounting, rotation_body_from_dvl: Array) -> bytes:
-        """The file with the DVL's own joint turned so that the mounting is this (3, 3); all other bytes as they are."""
-        rpy = rpy_from_rotation(mounting.rotation_body_from_parent.T @ rotation_body_from_dvl)
-        text = numbers(rpy).encode()
-        joint = mounting.joint
+    def moved(self, mounting: Mounting, rotation_body_from_dvl: Array, position: Array | None = None) -> bytes:
+        """The file with the DVL's own joint so that the mounting is this (3, 3); all other bytes as they are.
+
+        position: (3,) m in the body where the DVL is to be; None: its joint's xyz stays.
+        """
+        joint, to_parent = mounting.joint, mounting.rotation_body_from_parent.T
+        new = {"rpy": numbers(rpy_from_rotation(to_parent @ rotation_body_from_dvl)).encode()}
+        if position is not None:
+            new["xyz"] = numbers(joint.xyz + to_parent @ (position - mounting.position)).encode()
         if joint.origin is None:
             start = end = joint.tag[1]
-            tag = b'<origin xyz="0 0 0" rpy="' + text + b'"/>'
+            tag = b'<origin xyz="' + new.get("xyz", b"0 0 0") + b'" rpy="' + new["rpy"] + b'"/>'
         else:
             start, end = joint.origin
-            tag = _with_rpy(self.content[start:end], text)
+            tag = self.content[start:end]
+            for name, text in new.items():
+                tag = _with_attribute(tag, name, text)
         return self.content[:start] + tag + self.content[end:]
 
 
@@ -118,16 +124,13 @@ def _is_link(link: str, frame: str) -> bool:
     return link == frame or link == frame.rsplit("/", 1)[-1]
 
 
-_RPY = re.compile(rb"""(?<=\s)rpy\s*=\s*("[^"]*"|'[^']*')""")
-
-
-def _with_rpy(tag: bytes, rpy: bytes) -> bytes:
-    found = _RPY.search(tag)
+def _with_attribute(tag: bytes, name: str, text: bytes) -> bytes:
+    found = re.compile(rb"(?<=\s)" + name.encode() + rb"""\s*=\s*("[^"]*"|'[^']*')""").search(tag)
     if found is not None:
         first, last = found.span(1)
-        return tag[: first + 1] + rpy + tag[last - 1 :]
+        return tag[: first + 1] + text + tag[last - 1 :]
     end = len(tag) - (2 if tag.endswith(b"/>") else 1)
-    return tag[:end].rstrip() + b' rpy="' + rpy + b'"' + tag[end:]
+    return tag[:end].rstrip() + b" " + name.encode() + b'="' + text + b'"' + tag[end:]
 
 
 def read_urdf(path: Path) -> Urdf:

@@ -46,9 +46,19 @@ def parse_scalar(text: str) -> Any:
         return text
 
 
-def load_yaml(path: Path, what: str) -> Any:
-    """Content of a YAML file. Raises InputError naming the file, the line and what the file should have been."""
+def compose_yaml(text: str) -> Any:
+    """The nodes of YAML, which know where in the text they stand; of text that `load_yaml` takes."""
+    return yaml.compose(text, Loader=_Loader)  # a SafeLoader
+
+
+def load_yaml(path: Path, what: str, text: str | None = None) -> Any:
+    """Content of a YAML file. Raises InputError naming the file, the line and what the file should have been.
+
+    text: what is to be read instead of what the file holds now.
+    """
     try:
+        if text is not None:
+            return yaml.load(text, Loader=_Loader)  # a SafeLoader
         with path.open(encoding="utf-8") as file:
             return yaml.load(file, Loader=_Loader)  # a SafeLoader
     except FileNotFoundError:

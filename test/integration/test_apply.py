@@ -21,6 +21,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting, scale_advice
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration, result_document, result_text
+from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario
 from dvl_calib_ros.simulation.scenario import write_bag as write_scenario
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -405,3 +406,105 @@ def test_the_angle_between_rotations_is_exact_for_small_ones(angle):
     a = Rotation.from_euler("xyz", MOUNTING)
     b = a * Rotation.from_rotvec(angle * axis)
     assert angle_between(a.as_matrix(), b.as_matrix()) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+
+
+# ---------------------------------------------------------------- lever arm and delay
+
+
+@pytest.fixture(scope="module")
+def displaced(tmp_path_factory):
+    """A bag of a DVL that is turned, off the reference point and late, and what a calibration makes of it as it is."""
+    bag = tmp_path_factory.mktemp("displaced") / "bag"
+    scenario = Scenario(
+        "figure8", 160.0, imu_rate=20, errors=DvlErrors((0.0, 0.01, 0.03), beam_std=0.005), gnss_std=0.02,
+        effects=(injection("lever_arm:x_m=-1.2,y_m=0.3,z_m=-0.2"), injection("dvl_time_offset:seconds=0.6")),
+    )  # fmt: skip
+    write_scenario(scenario, bag, Storage.MCAP, Compression.NONE)
+    return bag, replayed(bag).result
+
+
+def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_path, displaced, capsys):
+    bag, found = displaced
+    saved, parameters = change(tmp_path / "result.yaml", found), tmp_path / "vehicle.yaml"
+    assert found.selected == "G2"
+    parameters.write_text("/**:\n  ros__parameters:\n    # by hand\n    mounting_rpy: [0.0, 0.0, 0.0]\n")
+    before = parameters.read_bytes()
+    assert apply(saved, "--params", parameters) == 0
+    assert "s late, today" in capsys.readouterr().out
+    written = load_parameters(parameters)
+    mounting = yaml.safe_load(saved.read_text())["mounting"]
+    assert written.dvl_time_offset == pytest.approx(mounting["dvl_time_offset"], abs=1e-8)
+    assert written.lever_arm == pytest.approx(mounting["lever_arm"], abs=1e-8)
+    assert "# by hand" in parameters.read_text()
+    again = replayed(bag, **{name: getattr(written, name) for name in ("mounting_rpy", "lever_arm", "dvl_time_offset")})
+    assert again.result.selected == "G1"
+    rest = again.result.estimates["G2"]
+    assert np.linalg.norm(found.estimate.state[6:8]) > 1.0 and abs(found.estimate.state[9]) > 0.5
+    assert np.all(np.abs(rest.state[6:]) < np.minimum(2.0 * rest.std[6:], [0.03, 0.03, 0.1, 0.03]))
+    assert np.linalg.norm(again.result.estimate.misalignment[1:]) < 0.003
+    # once more changes nothing, and the way back leads to what was there
+    assert apply(saved, "--params", parameters) == 0
+    assert "is so already" in capsys.readouterr().out
+    assert apply("--rollback", "--params", parameters) == 0
+    assert parameters.read_bytes() == before
+
+
+def test_a_parameter_file_is_made_where_there_is_none_and_refused_where_it_says_another_thing(
+    tmp_path, displaced, capsys
+):
+    saved, parameters = change(tmp_path / "result.yaml", displaced[1]), tmp_path / "vehicle.yaml"
+    assert apply(saved, "--params", parameters) == 0
+    assert load_parameters(parameters).lever_arm[0] == pytest.approx(-1.2, abs=0.05)
+    parameters.write_text("/**: {ros__parameters: {dvl_time_offset: 0.1}}\n")
+    capsys.readouterr()
+    assert "dvl_time_offset to 0.1" in refused(capsys, saved, "--params", parameters)
+    assert apply(saved, "--params", parameters, "--force") == 0
+    assert load_parameters(parameters).dvl_time_offset == pytest.approx(0.6, abs=0.05)
+    parameters.write_text(f"/**: {{ros__parameters: {{initial_calibration: {saved}}}}}\n")
+    capsys.readouterr()
+    assert "initial_calibration" in refused(capsys, saved, "--params", parameters, "--force")
+
+
+def place(path: Path) -> np.ndarray:
+    """Position of the DVL in the body by an oracle's reading of a URDF."""
+    joints = {each.get("name"): each.find("origin") for each in ElementTree.parse(path).getroot().findall("joint")}
+    at = {name: [float(word) for word in origin.get("xyz").split()] for name, origin in joints.items()}
+    turn = Rotation.from_euler("xyz", [float(word) for word in joints["frame_joint"].get("rpy").split()])
+    return np.array(at["frame_joint"]) + turn.apply(at["dvl_joint"])
+
+
+def test_the_joint_is_moved_to_the_lever_arm_that_was_found(tmp_path, displaced, capsys):
+    saved, urdf = change(tmp_path / "result.yaml", displaced[1]), robot(tmp_path / "robot.urdf", mounting=(0, 0, 0))
+    frame = Rotation.from_euler("xyz", CHAIN)
+    at_reference = words(frame.inv().apply([-0.5, 0.0, 0.1]))
+    before = urdf.read_bytes().replace(b"0 0.2 0.3", at_reference.encode())
+    urdf.write_bytes(before)
+    np.testing.assert_allclose(place(urdf), 0.0, atol=1e-9)
+    assert apply(saved, "--urdf", urdf) == 0
+    found = yaml.safe_load(saved.read_text())["mounting"]["lever_arm"]
+    np.testing.assert_allclose(place(urdf), found, atol=1e-8)
+    assert difference(mounted(urdf), corrected(saved)) < 1e-8
+    after = urdf.read_bytes()
+    assert apply(saved, "--urdf", urdf) == 0
+    assert urdf.read_bytes() == after
+    assert apply("--rollback", "--urdf", urdf) == 0
+    assert urdf.read_bytes() == before
+
+
+def test_a_urdf_with_another_position_is_moved_by_force_only_or_turned_alone(tmp_path, displaced, capsys):
+    saved, urdf = change(tmp_path / "result.yaml", displaced[1]), robot(tmp_path / "robot.urdf", mounting=(0, 0, 0))
+    there = place(urdf)
+    error = refused(capsys, saved, "--urdf", urdf)
+    assert "began with lever_arm 0 0 0" in error and "--keep-position" in error
+    assert apply(saved, "--urdf", urdf, "--keep-position") == 0
+    np.testing.assert_allclose(place(urdf), there, atol=1e-12)
+    assert difference(mounted(urdf), corrected(saved)) < 1e-8
+    assert apply(saved, "--urdf", urdf, "--force") == 0
+    np.testing.assert_allclose(place(urdf), yaml.safe_load(saved.read_text())["mounting"]["lever_arm"], atol=1e-8)
+
+
+def test_a_calibration_without_a_lever_arm_leaves_the_position_where_it_is(tmp_path, saved):
+    urdf = robot(tmp_path / "robot.urdf")
+    there = place(urdf)
+    assert apply(saved, "--urdf", urdf) == 0
+    np.testing.assert_array_equal(place(urdf), there)
