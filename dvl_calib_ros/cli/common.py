@@ -116,12 +116,16 @@ def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
 
 
 def check_outputs(
-    arguments: argparse.Namespace, *files: str, folders: Sequence[str] = (), also_read: Sequence[Path] = ()
+    arguments: argparse.Namespace,
+    *files: str,
+    folders: Sequence[str] = (),
+    also_read: Sequence[Path] = (),
+    also_written: Mapping[str, Path] | None = None,
 ) -> None:
     """Raise InputError if what options name could not be written, or is read by the same command, before work is done.
 
     files, folders: options that name what is written. Every other path in the arguments, and what the parameters name,
-    is read. also_read: what is read beside.
+    is read. also_read: what is read beside. also_written: files that are made beside, by how an error calls them.
     """
     from ..errors import InputError
     from ..files.atomic import check_writable
@@ -131,6 +135,8 @@ def check_outputs(
     for name in files:
         if name in given:
             check_writable(given[name])
+    for path in (also_written or {}).values():
+        check_writable(path)
     read = [*also_read, *(path for name, path in given.items() if name not in (*files, *folders))]
     read += [path for value in vars(arguments).values() if isinstance(value, list) for path in value
              if isinstance(path, Path)]  # fmt: skip
@@ -140,7 +146,7 @@ def check_outputs(
         if name in given and os.path.islink(given[name]) and not given[name].exists():
             raise InputError(f"{given[name]}: is a link that leads nowhere; give another name, or remove it first")
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
-    check_apart(as_options[0], read, as_options[1])
+    check_apart(as_options[0] | dict(also_written or {}), read, as_options[1])
 
 
 def console(stderr: bool = False) -> Console:

@@ -6,6 +6,7 @@ One sentence with the answer comes first. Several bags must be of one vehicle; w
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from . import common, trial
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from rich.table import Table
 
@@ -60,12 +61,23 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError("name a bag, or try --trial")
     from ..diagnosis.compensation import compensated, parameter_file
     from ..diagnosis.diagnose import diagnose
+    from ..diagnosis.recordings import recording_names
     from ..diagnosis.results import diagnosis_document
     from ..files.atomic import save_text
     from ..simulation.twin_bags import write_twins
 
     parameters = common.load(arguments)
-    common.check_outputs(arguments, "json", "apply", "report", folders=["twin"])
+    names = recording_names(arguments.bags)
+    of_each = _applied_to_each(arguments.apply, names)
+    common.check_outputs(
+        arguments,
+        "json",
+        "apply",
+        "report",
+        folders=["twin"],
+        also_written={f"--apply of {name}": path for name, path in of_each.items()},
+    )
+    _check_twins(arguments.twin, names)
     write_report = report_writer(arguments, "write_diagnosis_report")
     discovery = common.discovered(arguments, arguments.bags, parameters)
     parameters = discovery.parameters
@@ -84,8 +96,7 @@ def run(arguments: argparse.Namespace) -> None:
         save_text(arguments.apply, parameter_file(compensated(parameters, diagnosis)))
         if any(effect.by_recording for effect in diagnosis.effects):
             for index, (name, _) in enumerate(diagnosis.recordings):
-                own = arguments.apply.with_name(f"{arguments.apply.stem}.{Path(name).stem}{arguments.apply.suffix}")
-                save_text(own, parameter_file(compensated(parameters, diagnosis, index)))
+                save_text(of_each[name], parameter_file(compensated(parameters, diagnosis, index)))
     if arguments.twin is not None:
         for twin in diagnosis.twins:
             write_twins(arguments.twin, twin)
@@ -93,6 +104,30 @@ def run(arguments: argparse.Namespace) -> None:
         write_report(arguments.report, diagnosis)
     _print(diagnosis)
     common.print_found(discovery, arguments.bags)
+
+
+def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
+    """Parameter files of the day, by recording, of several; beside the one that is named. Raises InputError."""
+    from ..errors import InputError
+    from ..files.atomic import own_stream
+
+    if path is None or len(names) < 2:
+        return {}
+    if own_stream(path) is not None:
+        raise InputError(f"--apply {path}: of several bags a file for each is written beside it; name a file")
+    return {name: path.with_name(f"{path.stem}.{name}{path.suffix}") for name in names}
+
+
+def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
+    """Raise InputError if a twin is there already, before work is done."""
+    from ..errors import InputError
+    from ..simulation.twin_bags import twin_paths
+
+    if folder is None:
+        return
+    for path in (path for name in names for path in twin_paths(folder, name)):
+        if os.path.lexists(path):
+            raise InputError(f"{path}: exists already; give another folder, or remove it first")
 
 
 def _print(diagnosis: Diagnosis) -> None:

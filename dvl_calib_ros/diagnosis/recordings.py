@@ -33,6 +33,8 @@ from ..replay.replay import Topics, _check_topics, _of_types
 from .settings import SETTINGS
 
 SECOND_NS = 1_000_000_000
+# Of files that are recordings by themselves
+SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3")
 # Shorter stretches have too few frequencies to tell motion from noise, whose power is averaged over so many bands
 MIN_SPECTRUM, BANDS = 60, 40
 # Power of a band over that of noise up to which it is noise alone, and from which all of it is kept
@@ -318,19 +320,33 @@ def load_recordings(
         raise InputError(f"{', '.join(map(str, paths))}: a bag is named twice")
     recordings: list[Recording] = []
     notes: list[str] = []
-    for index, path in enumerate(paths):
+    for index, (name, path) in enumerate(zip(recording_names(paths), paths, strict=True)):
 
         def progress(share: float, index: int = index) -> None:
             on_progress((index + share) / len(paths))
 
-        recording, own = _load(path, parameters, topics, progress)
+        recording, own = _load(name, path, parameters, topics, progress)
         recordings.append(recording)
         notes += own if len(paths) == 1 else [f"{path}: {note}" for note in own]
     return Loaded(tuple(recordings), tuple(notes))
 
 
+def recording_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each bag that no other has: its own, with its folder's where two are called the same."""
+    full = [path.resolve() for path in paths]
+    names = [_without_suffix(path.name) for path in full]
+    shared = Counter(names)
+    names = [f"{p.parent.name}-{name}" if shared[name] > 1 else name for p, name in zip(full, names, strict=True)]
+    shared = Counter(names)
+    return [f"{name}-{i + 1}" if shared[name] > 1 else name for i, name in enumerate(names)]
+
+
+def _without_suffix(name: str) -> str:
+    return next((name.removesuffix(end) for end in SUFFIXES if name.endswith(end)), name)
+
+
 def _load(
-    path: Path, parameters: Parameters, topics: Topics, on_progress: Callable[[float], None]
+    name: str, path: Path, parameters: Parameters, topics: Topics, on_progress: Callable[[float], None]
 ) -> tuple[Recording, list[str]]:
     found: list[Finding] = []
     with BagReader([path], KNOWN_DEFINITIONS) as bag:
@@ -343,7 +359,7 @@ def _load(
         raise InputError(
             f"{path}: no reference velocity to compare the DVL with: no messages on {topics.gnss}; set --gnss-topic"
         )
-    return _recording(path.name, streams, parameters, notes), notes
+    return _recording(name, streams, parameters, notes), notes
 
 
 def _read(bag: BagReader, topics: Topics, decoder: MessageDecoder, on_progress: Callable[[float], None]) -> Streams:

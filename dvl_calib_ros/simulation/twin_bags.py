@@ -13,18 +13,19 @@ from ..diagnosis.twin import Twin
 from ..messages.encode import SampleWriter
 
 
-def write_twins(folder: Path, twin: Twin) -> list[Path]:
+def twin_paths(folder: Path, name: str) -> tuple[Path, Path]:
+    """Where the twins of a recording go, without and with what was found."""
+    return folder / f"{name}_without", folder / f"{name}_with"
+
+
+def write_twins(folder: Path, twin: Twin) -> None:
     """Write NAME_without and NAME_with: DVL simulated without noise, reference and IMU as recorded. Raises InputError.
 
     Stamps are the recording's, less what the parameters know of its clocks.
     """
-    paths = []
-    for kind, velocity in (("without", twin.without), ("with", twin.with_effects)):
-        path = folder / f"{Path(twin.recording.name).stem}_{kind}"
+    for path, velocity in zip(twin_paths(folder, twin.recording.name), (twin.without, twin.with_effects), strict=True):
         with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:
             SampleWriter(bag).recording(*_streams(twin, velocity))
-        paths.append(path)
-    return paths
 
 
 def _streams(twin: Twin, velocity: Array) -> tuple[list[ImuSample], list[ReferenceSample], list[DvlSample]]:

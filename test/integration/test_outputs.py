@@ -39,6 +39,7 @@ COMMAND = {
         "diagnose bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--apply", "--report"),
         ("--twin",),
     ),
+    "diagnose two": Command("diagnose bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), ("--json", "--apply")),
     "doctor": Command("doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json",)),
     "evaluate": Command(
         "evaluate runs --partial --params params.yaml", ("runs", "runs/T_dvl.npy", "params.yaml"),
@@ -240,6 +241,33 @@ def test_no_two_outputs_can_be_one_file_by_any_name(scratch, capsys, name):
                 error = refused(capsys, [*command.arguments.split(), one, "out", other, str(second)])
                 assert "names of their own" in error
                 assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize("how", ["the_same", "link", "hard_link"])
+@pytest.mark.parametrize("read_as", ["--params", "--json"])
+def test_what_apply_writes_for_each_of_several_recordings_is_no_other_file_of_the_command(
+    scratch, capsys, how, read_as
+):
+    folder = scratch()
+    (folder / "params.yaml").rename(folder / "kept.yaml")
+    own = ALIASES[how](folder, Path("kept.yaml"))
+    os.rename(own, folder / "found.run.yaml")  # what --apply found.yaml names after loose/run.db3
+    other = "found.run.yaml" if how == "the_same" else "kept.yaml"
+    before = snapshot(folder)
+    error = refused(capsys, ["diagnose", "bag", LOOSE, "--apply", "found.yaml", read_as, other])
+    assert "--apply of run" in error
+    assert snapshot(folder) == before
+
+
+def test_parameter_files_of_several_recordings_need_a_file_and_not_a_stream(scratch, capsys):
+    scratch()
+    assert "name a file" in refused(capsys, ["diagnose", "bag", LOOSE, "--apply", "/dev/stdout"])
+
+
+def test_twins_that_are_there_already_are_refused_before_any_work(scratch, capsys):
+    folder = scratch()
+    (folder / "twins" / "bag_with").mkdir(parents=True)
+    assert "exists already" in refused(capsys, ["diagnose", "bag", "--twin", "twins"])
 
 
 PATHS = st.sampled_from(
