@@ -11,12 +11,14 @@ from scipy.stats import norm
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
-from ..effects.base import Effect, Needs
+from ..effects.base import ClockEffect, Effect, Needs
 from ..effects.registry import EFFECTS
+from ..errors import InputError
 from ..replay.replay import Topics
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
+from .far_clocks import check_clocks
 from .fitting import prior_std
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
@@ -65,10 +67,12 @@ def diagnose_recordings(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> Diagnosis:
-    """`diagnose`, of recordings that are read already."""
+    """`diagnose`, of recordings that are read already. Raises InputError for clocks too far apart to be compared."""
     says_nothing = _says_nothing(recordings)
     if says_nothing:
         return _nothing_to_say(says_nothing, notes)
+    for recording in recordings:
+        check_clocks(recording, parameters.rotation_dvl_from_body)
     available = frozenset.intersection(*(recording.available for recording in recordings))
     untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
     testable = {name: effect for name, effect in effects.items() if name not in untestable}
@@ -76,6 +80,7 @@ def diagnose_recordings(
     if len(selection.fitter.problem.time) < SETTINGS.min_bins:
         why = f"{len(selection.fitter.problem.bin_of)} samples have DVL, reference and attitude together"
         return _nothing_to_say(f"{why}; record {SETTINGS.min_seconds:.0f} s at least, better 600 s", notes)
+    _check_bounds(selection)
     rest = unexplained(selection.fitter, selection.fit)
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
@@ -113,6 +118,19 @@ def diagnose_recordings(
         twins=twins(selection),
         dvl=dvl_seen(selection, parameters),
     )
+
+
+def _check_bounds(selection: Selection) -> None:
+    """Raise InputError for a clock that is as far off as can be: it is further, and nothing beside it is right."""
+    hypothesis = selection.fit.hypothesis
+    for each in hypothesis.parameters():
+        value, spec = hypothesis.value(each), each.spec
+        if isinstance(each.effect, ClockEffect) and abs(value) >= 0.999 * spec.high:
+            name = selection.fitter.problem.recordings[each.recording or 0].name
+            raise InputError(
+                f"{name}: {each.effect.name} comes out at {value:+.3g} {spec.unit}, the end of what can be diagnosed "
+                "and taken off: set that clock right, or correct the stamps in the bag"
+            )
 
 
 def _interval(value: float, std: float) -> Triple:

@@ -1,0 +1,63 @@
+"""Clocks further apart than a diagnosis can fit are refused in one line; what is nearer is left to the fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
+from dvl_calib_ros.diagnosis.far_clocks import check_clocks
+from dvl_calib_ros.diagnosis.recordings import Curve, Recording, make_recording
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.simulation.injection import injection
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+
+@pytest.fixture(scope="module", params=["free", "figure8"])
+def recording(request) -> Recording:
+    errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
+    run = simulate(Scenario(request.param, 300.0, 3, errors, gnss_std=0.05, effects=(injection("lever_arm:x_m=-1.9"),)))
+    first_ns = run.dvl[0].stamp_ns
+
+    def stream(samples, field):
+        time = np.array([1e-9 * (sample.stamp_ns - first_ns) for sample in samples])
+        return time, np.array([getattr(sample, field) for sample in samples])
+
+    return make_recording(
+        request.param, stream(run.dvl, "velocity"), stream(run.gnss, "velocity"),
+        attitude=stream(run.imu, "orientation"), rates=stream(run.imu, "angular_velocity"),
+    )  # fmt: skip
+
+
+def late(recording: Recording, stream: str, seconds: float) -> Recording:
+    curve = getattr(recording, stream)
+    return replace(recording, **{stream: Curve(curve.time + seconds, curve.values)}, _kept={})
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1.5, -4.0, 7.9])
+@pytest.mark.parametrize("stream", ["dvl", "reference", "attitude"])
+def test_a_clock_that_can_be_fitted_is_left_to_the_fit(recording, stream, seconds):
+    check_clocks(late(recording, stream, seconds), np.eye(3))
+
+
+@pytest.mark.parametrize(("stream", "whose"), [("dvl", "the DVL's"), ("attitude", "the IMU's")])
+@pytest.mark.parametrize("seconds", [13.0, 100.0, -100.0, 500.0, 1.7e9])
+def test_a_clock_that_is_too_far_off_is_refused_in_one_line_whatever_is_common_to_the_streams(
+    recording, stream, whose, seconds
+):
+    with pytest.raises(InputError) as caught:
+        check_clocks(late(recording, stream, seconds), np.eye(3))
+    assert whose in str(caught.value) and "\n" not in str(caught.value)
+    if recording.name == "free":  # a figure of eight agrees with itself a round later
+        assert ("later" if seconds > 0.0 else "earlier") in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [8.3, 10.0, 100.0])
+def test_a_diagnosis_of_such_clocks_ends_in_that_line_and_not_in_an_answer(recording, seconds):
+    with pytest.raises(InputError, match="set that clock right"):
+        diagnose_recordings([late(recording, "dvl", seconds)], Parameters())
