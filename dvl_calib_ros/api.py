@@ -219,6 +219,7 @@ def replay(
     imu_topic: str | None = None,
     params: StrPath | None = None,
     history: bool = True,
+    merge: bool = False,
     **parameters: Any,
 ) -> Calibration:
     """Calibrate with recorded bags, as ``dvl-calib replay`` does.
@@ -233,6 +234,8 @@ def replay(
         A ROS 2 parameter file.
     history
         Keep the run over time, for `Calibration.plot`, `to_pandas` and `report`.
+    merge
+        Take several bags together even if the mounting moved between them.
     **parameters
         Any of the node's parameters, in SI units, such as ``mounting_rpy=(0, 0, 0.785)``.
 
@@ -241,11 +244,11 @@ def replay(
     InputError, ParameterError
         For what is no bag, has no DVL, or cannot be a parameter.
     """
-    from .replay.replay import replay as run
+    from .replay.checked import checked_replay
 
     paths = _paths(bags)
     discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
-    replayed = run(paths, discovery.parameters, discovery.topics, with_history=history)
+    replayed = checked_replay(paths, discovery.parameters, discovery.topics, merge=merge, with_history=history)
     return Calibration(replayed, discovery, tuple(paths))
 
 

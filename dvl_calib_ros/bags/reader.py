@@ -91,6 +91,17 @@ class BagReader:
         """First and last log time."""
         return min(s.span_ns[0] for s in self._sources), max(s.span_ns[1] for s in self._sources)
 
+    @property
+    def recorded_spans_ns(self) -> list[tuple[int, int]]:
+        """First and last log time of each stretch that was recorded, in order; of those that overlap as one."""
+        spans: list[tuple[int, int]] = []
+        for start_ns, end_ns in sorted(source.span_ns for source in self._sources):
+            if spans and start_ns <= spans[-1][1]:
+                spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
+            else:
+                spans.append((start_ns, end_ns))
+        return spans
+
     def messages(
         self, topics: Iterable[str], wanted: Callable[[str, int], bool] = lambda *_: True
     ) -> Iterator[DecodedMessage]:

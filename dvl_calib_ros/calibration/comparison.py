@@ -273,7 +273,11 @@ def _same(comparison: Comparison) -> str:
 
 def _moved(change: Change) -> str:
     """The sentence on a mounting that moved."""
-    difference = change.difference
+    return f"The mounting has moved {moved_in_words(change.difference)} {_between(change)}."
+
+
+def moved_in_words(difference: Difference) -> str:
+    """By how much a mounting moved, such as ``by 0.70° ± 0.05° about z``."""
     turn, arm = difference.test(MOUNTING[TURN]), difference.test(MOUNTING[LEVER_ARM])
     parts = []
     if turn.freedom and (turn.p < CHANCE or not arm.p < CHANCE):
@@ -282,7 +286,7 @@ def _moved(change: Change) -> str:
         found = ((axis, difference.value[LEVER_ARM][i], difference.std[LEVER_ARM][i]) for i, axis in enumerate("xyz"))
         shown = (f"{axis} {value:+.2f} m ± {std:.2f} m" for axis, value, std in found if std == std)
         parts.append(f"in its place (lever arm {', '.join(shown)})")
-    return f"The mounting has moved {' and '.join(parts)} {_between(change)}."
+    return " and ".join(parts)
 
 
 def turn_in_words(difference: Difference) -> str:

@@ -360,6 +360,12 @@ _KINDS = (
         "prefer prior_source fixed",
     ),
     FindingKind(
+        "INITIAL_CONTRADICTED",
+        "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
+        "What is begun with would be blended with what these data show, into the mounting of neither.",
+        "inspect the mounting; if it is as it shall be, save these data's result and begin with that",
+    ),
+    FindingKind(
         "RESULT_NOT_SAVED",
         "the result was not saved: {reason}",
         "Full disk, a folder that is gone, or no permission. The file before is untouched.",

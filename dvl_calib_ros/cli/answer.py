@@ -69,7 +69,7 @@ def _headline(replayed: Replayed) -> str:
     parameters = Parameters.from_mapping(result.parameters)
     turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
-    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0))
+    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - replayed.pause_s
     return (
         f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} (model "
         f"{result.selected}, {result.estimate.used} samples used of {seconds:.0f} s):"
@@ -189,6 +189,8 @@ def next_commands(
     named = " ".join(shlex.quote(str(bag)) for bag in bags)
     given = "".join(f" {shlex.quote(option)}" for option in options)
     verdict = replayed.result.verifications[replayed.result.selected].verdict.value
+    if verdict == "reject" and replayed.recordings is not None and not replayed.recordings.same_mounting:
+        return [f"dvl-calib compare {named}{given}", f"dvl-calib doctor {named}"]
     if verdict == "reject":
         return [f"dvl-calib doctor {named}", f"dvl-calib diagnose {named}{given}"]
     if saved is None:

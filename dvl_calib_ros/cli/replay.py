@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
     parser.add_argument("--models", metavar="NAMES", help="show these models beside the answer, such as M3,M7 or all")
+    parser.add_argument("--merge", action="store_true", help="take bags together even if the mounting moved between")
     parser.add_argument("-v", "--verbose", action="store_true", help="show counts, selection and all models as well")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
@@ -39,9 +40,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Look into the bags, replay them, save, print."""
+    from ..calibration.comparison import comparison_document
     from ..calibration.models import MODELS
     from ..files.result_file import result_document, save_result
-    from ..replay.replay import replay, replay_document
+    from ..replay.checked import checked_replay
+    from ..replay.replay import replay_document
 
     asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
     models = list(MODELS) if arguments.verbose or not asked else asked
@@ -50,7 +53,14 @@ def run(arguments: argparse.Namespace) -> None:
     write_report = report_writer(arguments, "write_replay_report")
     discovery = common.discovered(arguments, arguments.bags, parameters)
     with common.progress("replaying") as on_progress:
-        replayed = replay(arguments.bags, discovery.parameters, discovery.topics, on_progress, with_history=True)
+        replayed = checked_replay(
+            arguments.bags,
+            discovery.parameters,
+            discovery.topics,
+            on_progress,
+            merge=arguments.merge,
+            with_history=True,
+        )
     result = replayed.result
     if arguments.json is not None:
         common.write_json(
@@ -59,6 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
             | {
                 "dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned},
                 "findings": [found.as_dict() for found in replayed.findings],
+                "recordings": None if replayed.recordings is None else comparison_document(replayed.recordings),
                 "discovery": discovery.document(),
             },
         )

@@ -6,8 +6,10 @@ yet the streams have samples at the same times, which can be compared.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
@@ -82,12 +84,13 @@ def survey(bag: BagReader) -> Survey:
     types, counts = bag.topics, bag.message_counts
     moving = {topic for topic, kind in types.items() if kind in MOVING_TYPES}
     static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
-    start_ns, end_ns = bag.span_ns if types else (0, 0)
-    seconds = max(1e-9 * (end_ns - start_ns), 1e-9)
+    start_ns = bag.span_ns[0] if types else 0
+    spans_ns = bag.recorded_spans_ns if types else [(0, 0)]
+    seconds = max(1e-9 * sum(end - start for start, end in spans_ns), 1e-9)
     taken: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in moving}
     transforms: list[Any] = []
     descriptions: list[str] = []
-    wanted = _Bursts(start_ns, end_ns, static)
+    wanted = _Bursts(spans_ns, static)
     for topic, log_ns, message, _ in bag.messages(moving | static, wanted):
         if message is None:
             continue
@@ -113,9 +116,12 @@ def _is_static(topic: str, kind: str) -> bool:
 class _Bursts:
     """Whether a message is one to look at."""
 
-    def __init__(self, start_ns: int, end_ns: int, static: set[str]) -> None:
-        self._start_ns = start_ns
-        self._period_ns = max((end_ns - start_ns) // BURSTS, BURST_NS)
+    def __init__(self, spans_ns: Sequence[tuple[int, int]], static: set[str]) -> None:
+        """spans_ns: from and to when was recorded, in order."""
+        self._starts_ns = [start_ns for start_ns, _ in spans_ns]
+        lengths_ns = [end_ns - start_ns for start_ns, end_ns in spans_ns]
+        self._recorded_before_ns = [0, *accumulate(lengths_ns)]
+        self._period_ns = max(self._recorded_before_ns[-1] // BURSTS, BURST_NS)
         self._static = dict.fromkeys(static, 0)
         self._next_ns: dict[str, int] = {}
 
@@ -123,7 +129,9 @@ class _Bursts:
         if topic in self._static:
             self._static[topic] += 1
             return self._static[topic] <= MOST_STATIC
-        if (log_ns - self._start_ns) % self._period_ns >= BURST_NS or log_ns < self._next_ns.get(topic, 0):
+        span = max(bisect_right(self._starts_ns, log_ns) - 1, 0)
+        recorded_ns = log_ns - self._starts_ns[span] + self._recorded_before_ns[span]
+        if recorded_ns % self._period_ns >= BURST_NS or log_ns < self._next_ns.get(topic, 0):
             return False
         self._next_ns[topic] = log_ns + BURST_EVERY_NS
         return True

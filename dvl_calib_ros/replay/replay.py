@@ -14,6 +14,7 @@ from .. import __version__
 from ..bags.reader import BagReader
 from ..calibration.advice import data_advice, gate_advice, message_advice
 from ..calibration.calibrator import Calibrator
+from ..calibration.comparison import Comparison
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.findings import Finding, finding
 from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
@@ -58,6 +59,8 @@ class Replayed:
     notes: all that the user should know in words, the findings among it. history: the run over time, if it was asked
     for. reference_frame: of the reference's messages, None without any.
     dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
+    recordings: what several recordings say, each for itself; None where they were not looked at so (`checked`).
+    pause_s: how much of the time from the first to the last sample is between two recordings.
     """
 
     result: Result
@@ -68,6 +71,8 @@ class Replayed:
     reference_frame: VelocityFrame | None = None
     dvl_type: str = TWIST_TYPE
     turned: bool = False
+    recordings: Comparison | None = None
+    pause_s: float = 0.0
 
     @property
     def dvl_data(self) -> str:

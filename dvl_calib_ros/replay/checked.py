@@ -1,0 +1,281 @@
+"""A replay that first makes sure that what it is about to average belongs together.
+
+Several recordings are calibrated each for itself, and compared: one mounting averaged of two is that of neither. So is
+what an `initial_calibration` says that the data contradict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from ..bags.reader import BagReader
+from ..calibration.alignment import DROPOUT_NS
+from ..calibration.comparison import Comparison, Difference, compare, moved_in_words, sentences
+from ..calibration.extrinsics import Extrinsics
+from ..calibration.findings import Finding, finding
+from ..calibration.models import MODELS
+from ..calibration.parameters import Parameters
+from ..calibration.verification import Verification, Word
+from ..errors import InputError
+from ..files.extrinsics import load_extrinsics
+from ..messages.drivers import KNOWN_DEFINITIONS
+from .replay import Replayed, Topics, extrinsics_of_replay, replay
+
+# Files of one recording may overlap by what was on its way when the next began.
+OVERLAP_NS = 10_000_000_000
+# The finding on dropouts, which pauses between recordings are not.
+DROPOUTS = "DVL_DROPOUTS"
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """What several recordings say, each for itself.
+
+    comparison: None where less than two could be calibrated for themselves. unchecked: names of those that could not.
+    overlapping: names of two that hold the DVL at the same time. pauses_ns: times without any, between two of them.
+    """
+
+    comparison: Comparison | None
+    unchecked: tuple[str, ...]
+    overlapping: tuple[str, str] | None
+    pauses_ns: tuple[int, ...]
+
+    def objections(self, model: str) -> list[tuple[Word, str]]:
+        """Why an estimate of all of them together by this model is not to be used as it is."""
+        found = []
+        if self.overlapping is not None:
+            first, second = self.overlapping
+            found.append(
+                (
+                    Word.REJECT,
+                    f"{first} and {second} hold the DVL at the same time, so of many samples only the first is used: "
+                    "replay each by itself, and compare them",
+                )
+            )
+        if self.comparison is None:
+            return found
+        said = sentences(self.comparison)
+        moved = said[: len(self.comparison.moved)]
+        found += [
+            (Word.REJECT, f"{_decapitalised(sentence)}: all together are averaged, which is the mounting of neither")
+            for sentence in moved
+        ]
+        if self.comparison.clock_changed and "time_offset" in MODELS[model].state_names:
+            found.append(
+                (
+                    Word.REJECT,
+                    "the DVL's stamps are late by another delay in each, and one is taken for all: calibrate each by "
+                    "itself, or use dvl-calib diagnose, which takes a delay for each",
+                )
+            )
+        n_moved = max(1, len(moved))  # without any there is one sentence that says so
+        scales = said[n_moved : n_moved + len(self.comparison.scale_changed)]
+        found += [(Word.MARGINAL, _decapitalised(sentence)) for sentence in scales]
+        return found
+
+
+def _decapitalised(sentence: str) -> str:
+    return sentence[:1].lower() + sentence[1:].removesuffix(".")
+
+
+def checked_replay(
+    paths: Sequence[Path],
+    parameters: Parameters,
+    topics: Topics | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
+    *,
+    merge: bool = False,
+    with_history: bool = False,
+) -> Replayed:
+    """`replay`, after several recordings, or an initial calibration, have been held against each other.
+
+    merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
+    What `initial_calibration` says is left out, and said to be, if the data contradict it. Raises InputError.
+    """
+    recordings = None
+    parts = max(1, len(paths)) if len(paths) > 1 else 0
+    total = parts + 1 + bool(parameters.initial_calibration)
+
+    def progress_of(index: int) -> Callable[[float], None]:
+        return lambda share: on_progress((index + share) / total)
+
+    if len(paths) > 1:
+        recordings = _each_by_itself(paths, parameters, topics or Topics(), progress_of)
+    replayed = _with_fitting_start(paths, parameters, topics, progress_of, parts, with_history)
+    return replayed if recordings is None else _judged(replayed, recordings, merge)
+
+
+# ------------------------------------------------------------------ several recordings
+
+
+class _Bag(NamedTuple):
+    path: Path
+    name: str
+    from_ns: int
+    to_ns: int
+    has_dvl: bool
+
+
+def _each_by_itself(
+    paths: Sequence[Path], parameters: Parameters, topics: Topics, progress_of: Callable[[int], Callable[[float], None]]
+) -> Recordings:
+    """Calibrate with each recording alone, without any initial calibration."""
+    bags = _bags(paths, topics)
+    alone = parameters.replace(initial_calibration="")
+    found: list[Extrinsics] = []
+    unchecked: list[str] = []
+    groups = _recordings(bags)
+    overlapping = next((pair for pair in map(_overlap, groups) if pair is not None), None)
+    # of bags that hold the DVL at the same time each is one
+    groups = [part for group in groups for part in ([[bag] for bag in group] if _overlap(group) else [group])]
+    for index, group in enumerate(groups):
+        name = " + ".join(bag.name for bag in group)
+        if len(groups) == 1 or not any(bag.has_dvl for bag in group):
+            continue
+        try:
+            replayed = replay([bag.path for bag in group], alone, topics, progress_of(index))
+        except InputError:  # too little of the DVL to be a calibration; all together will say what is wrong with it
+            unchecked.append(name)
+            continue
+        extrinsics = extrinsics_of_replay(replayed, name)
+        if extrinsics is None or not extrinsics.shown[:3].any():
+            unchecked.append(name)
+        else:
+            found.append(extrinsics)
+    aided = [each for each in found if MODELS[each.model].aided]
+    found = aided or found  # what a model without GNSS assumes of currents is no measure of one with
+    try:
+        comparison = compare(found) if len(found) > 1 else None
+    except InputError:
+        comparison = None
+    own = [bag for bag in bags if bag.has_dvl]
+    gaps_ns = (after.from_ns - before.to_ns for before, after in pairwise(own))
+    pauses_ns = tuple(gap_ns for gap_ns in gaps_ns if gap_ns > DROPOUT_NS)
+    return Recordings(comparison, tuple(unchecked), overlapping, pauses_ns)
+
+
+def _bags(paths: Sequence[Path], topics: Topics) -> list[_Bag]:
+    """In order of time; those without any message are left out."""
+    short = [path.name or str(path) for path in paths]
+    names = short if len(set(short)) == len(short) else list(map(str, paths))
+    bags = []
+    for path, name in zip(paths, names, strict=True):
+        with BagReader([path], KNOWN_DEFINITIONS) as bag:
+            if not bag.topics:
+                continue
+            has_dvl = bag.message_counts[topics.found_in(bag.topics).dvl] > 0
+            bags.append(_Bag(path, name, *bag.span_ns, has_dvl))
+    return sorted(bags, key=lambda bag: bag.from_ns)
+
+
+def _recordings(bags: Sequence[_Bag]) -> list[list[_Bag]]:
+    """Bags that overlap in time are parts of one recording."""
+    groups: list[list[_Bag]] = []
+    until_ns = 0
+    for bag in bags:
+        if groups and bag.from_ns <= until_ns:
+            groups[-1].append(bag)
+            until_ns = max(until_ns, bag.to_ns)
+        else:
+            groups.append([bag])
+            until_ns = bag.to_ns
+    return groups
+
+
+def _overlap(group: Sequence[_Bag]) -> tuple[str, str] | None:
+    """Names of two bags with the DVL at the same time, for longer than parts of one recording would."""
+    own = [bag for bag in group if bag.has_dvl]
+    for index, bag in enumerate(own):
+        for other in own[index + 1 :]:
+            if min(bag.to_ns, other.to_ns) - other.from_ns > OVERLAP_NS:
+                return bag.name, other.name
+    return None
+
+
+def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed:
+    """With the verdict and the notes that follow from holding recordings against each other."""
+    result = replayed.result
+    verifications = {}
+    notes: list[str] = []
+    for name, verification in result.verifications.items():
+        objections = recordings.objections(name)
+        if name == result.selected and merge:
+            notes += [f"merged as asked: {sentence}" for _, sentence in objections]
+        verifications[name] = verification if merge else _with_objections(verification, objections)
+    if recordings.unchecked:
+        names = ", ".join(recordings.unchecked)
+        notes.append(f"{names}: too little to be calibrated alone, so whether its mounting is the others' is not known")
+    found, counts = _without_pauses(replayed.findings, result.counts, len(recordings.pauses_ns))
+    left_out = {str(each) for each in replayed.findings} - {str(each) for each in found}
+    kept = [note for note in replayed.notes if note not in left_out]
+    kept += [str(each) for each in found if str(each) not in kept]
+    return replace(
+        replayed,
+        result=replace(result, verifications=verifications, counts=counts),
+        findings=found,
+        notes=(*notes, *kept),
+        recordings=recordings.comparison,
+        pause_s=1e-9 * sum(recordings.pauses_ns),
+    )
+
+
+def _with_objections(verification: Verification, objections: Sequence[tuple[Word, str]]) -> Verification:
+    if not objections:
+        return verification
+    order = (Word.REJECT, Word.MARGINAL, Word.ACCEPT)
+    worst = min((verification.verdict, *(word for word, _ in objections)), key=order.index)
+    said = tuple(sentence for _, sentence in objections)
+    return replace(verification, verdict=worst, reasons=(*said, *verification.reasons))
+
+
+def _without_pauses(
+    findings: tuple[Finding, ...], counts: Mapping[str, Mapping[str, int]], pauses: int
+) -> tuple[tuple[Finding, ...], Mapping[str, Mapping[str, int]]]:
+    """Dropouts without the times between recordings."""
+    dropouts = counts["dvl"]["dropouts"]
+    left = max(dropouts - pauses, 0)
+    if left == dropouts:
+        return findings, counts
+    kept = [each for each in findings if each.code != DROPOUTS]
+    if left:
+        kept.append(finding(DROPOUTS, count=left))
+    return tuple(kept), {**counts, "dvl": {**counts["dvl"], "dropouts": left}}
+
+
+# ------------------------------------------------------------------ initial calibration
+
+
+def _with_fitting_start(
+    paths: Sequence[Path],
+    parameters: Parameters,
+    topics: Topics | None,
+    progress_of: Callable[[int], Callable[[float], None]],
+    first: int,
+    with_history: bool,
+) -> Replayed:
+    """Replay from `initial_calibration`, unless the data alone contradict it; then from nothing, with a finding."""
+    saved = parameters.initial_calibration
+    replayed = replay(paths, parameters, topics, progress_of(first), with_history=with_history)
+    if not saved:
+        return replayed
+    alone = replay(
+        paths, parameters.replace(initial_calibration=""), topics, progress_of(first + 1), with_history=with_history
+    )
+    found = extrinsics_of_replay(alone, "these data")
+    contradiction = None if found is None else _contradiction(load_extrinsics(Path(saved), saved), found)
+    if contradiction is None:
+        return replayed
+    said = finding("INITIAL_CONTRADICTED", file=saved, difference=contradiction)
+    return replace(alone, findings=(*alone.findings, said), notes=(*alone.notes, str(said)))
+
+
+def _contradiction(initial: Extrinsics, found: Extrinsics) -> str | None:
+    """In what the mounting that data alone show differs from an initial one; None if it does not."""
+    if not (initial.shown[:6] & found.shown[:6]).any():
+        return None
+    comparison = compare([initial, found])
+    return None if comparison.same_mounting else moved_in_words(Difference.between(initial, found))
