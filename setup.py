@@ -15,8 +15,8 @@ ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 DOCS = ["mkdocs>=1.6"]
 PANDAS = ["pandas>=2.0"]
 NOTEBOOK = ["nbclient>=0.8", "nbformat>=5.7", "ipykernel>=6.20"]
-TEST = ["pytest>=8.0", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40", *DASK, *COMPLETION, *PANDAS]
-TEST += NOTEBOOK
+TEST = ["pytest>=8.0", "pytest-xdist>=3.5", "hypothesis>=6.100", "filterpy>=1.4.5", "playwright>=1.40"]
+TEST += [*DASK, *COMPLETION, *PANDAS, *NOTEBOOK]
 
 
 def shared(folder: str) -> list:

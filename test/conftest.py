@@ -11,10 +11,18 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-# a busy machine takes its time over an example
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# A busy machine takes its time over an example. Who waits for the suite sees fewer of them than CI:
+# --hypothesis-profile=ci
+settings.register_profile("patient", deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("ci", settings.get_profile("patient"), max_examples=200)
 settings.load_profile("patient")
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def searched(examples: int, *unchecked: HealthCheck) -> settings:
+    """Settings of a search that takes another number of examples than 100: so many, as the profile scales them."""
+    scaled = max(5, round(examples * settings.default.max_examples / 100))
+    return settings(max_examples=scaled, suppress_health_check=[HealthCheck.too_slow, *unchecked])
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import ROOT
-from hypothesis import given, settings
+from conftest import ROOT, searched
+from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import JAZZY
 
@@ -52,7 +52,7 @@ def messages(draw):
     return draw(st.sampled_from(["dvl", "reference"])), TYPES[TWIST_TYPE](header, inner)
 
 
-@settings(max_examples=25)
+@searched(25)
 @given(st.lists(messages(), max_size=30))
 def test_whatever_messages_come_every_one_is_counted_and_the_estimates_stay_finite(given_messages):
     calibrator = Calibrator(Parameters(gnss_frame="enu"))
@@ -66,7 +66,7 @@ def test_whatever_messages_come_every_one_is_counted_and_the_estimates_stay_fini
         assert np.isfinite(estimate.state).all() and np.isfinite(estimate.covariance).all()
 
 
-@settings(max_examples=100)
+@searched(100)
 @given(st.sampled_from(sorted(SCHEMA)), TEXTS)
 def test_whatever_a_parameter_is_set_to_it_is_taken_or_refused_with_its_name(name, text):
     try:
@@ -75,7 +75,7 @@ def test_whatever_a_parameter_is_set_to_it_is_taken_or_refused_with_its_name(nam
         assert name in str(error)
 
 
-@settings(max_examples=30)
+@searched(30)
 @given(
     st.sampled_from(["replay", "salvage", "parameters", "import", "evaluate"]),
     st.lists(ARGUMENTS, max_size=5),

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from conftest import searched
+from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import replayed, run, write_bag
 
@@ -276,7 +277,7 @@ PATHS = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=60)
+@searched(60)
 @given(outputs=st.lists(PATHS, min_size=1, max_size=3), target=PATHS)
 def test_whatever_outputs_are_named_every_input_stays_as_it_is_and_the_code_says_what_happened(
     original, tmp_path_factory, outputs, target

@@ -12,8 +12,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
-from hypothesis import given, settings
+from conftest import ROOT, searched
+from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import JAZZY, raw, rewrite, run, write_bag
 from mcap.writer import CompressionType, Writer
@@ -118,7 +118,7 @@ def test_a_hostile_definition_runs_nothing(tmp_path, monkeypatch, name):
     assert not list(tmp_path.iterdir())
 
 
-@settings(max_examples=60)
+@searched(60)
 @given(st.text(alphabet="'\"\\\n;=#[]() ab1_/<>:", max_size=60), st.sampled_from([MSG, IDL]))
 def test_no_text_gets_through_a_definition_into_code(text, kind):
     """Whatever is accepted, all that reaches the generated code are plain names and numbers."""

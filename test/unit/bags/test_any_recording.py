@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import searched
 from driver_fixtures import A50, Maker, forget_definitions, write_driver_bag
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from io_fixtures import JAZZY, TOPICS, estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
 from mcap.writer import CompressionType
@@ -73,7 +74,7 @@ def test_hostile_names_are_names_to_reading_salvage_and_writing(tmp_path, bags, 
     check_name(tmp_path, bags, kind, name)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@searched(40, HealthCheck.function_scoped_fixture)
 @given(name=names, kind=st.sampled_from(["mcap", "sqlite3"]))
 def test_any_name_is_a_name_to_reading_salvage_and_writing(tmp_path_factory, bags, kind, name):
     check_name(tmp_path_factory.mktemp("any"), bags, kind, name)

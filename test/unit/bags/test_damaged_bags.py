@@ -18,8 +18,9 @@ from pathlib import Path
 import damage
 import lz4.frame
 import pytest
+from conftest import searched
 from documentation import section
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from io_fixtures import estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
 from mcap.reader import make_reader
@@ -37,7 +38,7 @@ else:
 
 NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
 Message = tuple[str, int, bytes]
-SEARCH = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+SEARCH = searched(40, HealthCheck.function_scoped_fixture)
 
 
 @cache

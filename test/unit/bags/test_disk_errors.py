@@ -11,8 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from conftest import searched
 from damage import PAGE, chunk_spans
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from io_fixtures import mcap_bytes, raw, raw_and_notes, run, storage_file, write_bag
 from mcap.reader import make_reader
@@ -174,7 +175,7 @@ def test_a_read_that_fails_once_at_whichever_call_costs_nothing(tmp_path, messag
             assert raw_and_notes(file) == expected, number
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@searched(25, HealthCheck.function_scoped_fixture)
 @given(bad=st.sets(st.integers(0, 40), max_size=12), compression=st.sampled_from([NONE, LZ4, ZSTD]), data=st.data())
 def test_any_unreadable_sectors_never_give_a_message_that_was_not_recorded(tmp_path, messages, bad, compression, data):
     options = data.draw(st.sampled_from(list(KINDS.values())))

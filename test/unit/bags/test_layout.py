@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from conftest import searched
+from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import JAZZY
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
@@ -94,7 +95,7 @@ def leaves(message: Any, path: str = "") -> dict[str, Any]:
     return {path: message}
 
 
-@settings(max_examples=150)
+@searched(150)
 @given(definitions(), st.integers(0, 2**32 - 1), st.booleans(), st.integers(0, 9))
 def test_columns_hold_what_rosbags_reads_of_each_message(text, seed, is_little, length):
     store = typestore(Definition(MessageDefinitionFormat.MSG, text), "a/msg/T")
@@ -118,7 +119,7 @@ def test_columns_hold_what_rosbags_reads_of_each_message(text, seed, is_little, 
     assert len(whole) == len(whole.part(slice(0, 5))) == 5
 
 
-@settings(max_examples=60)
+@searched(60)
 @given(definitions(), st.integers(0, 2**32 - 1), st.integers(0, 9), st.integers(0, 9))
 def test_a_message_with_strings_of_other_lengths_is_never_taken_for_one_of_the_layout(text, seed, length, other):
     store = typestore(Definition(MessageDefinitionFormat.MSG, text), "a/msg/T")

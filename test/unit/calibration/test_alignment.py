@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import fields
 
 import numpy as np
-from hypothesis import example, given, settings
+from conftest import searched
+from hypothesis import example, given
 from hypothesis import strategies as st
 from runs import SECOND, START_NS, feed
 
@@ -150,7 +151,7 @@ OPTIONS = (
 )
 
 
-@settings(max_examples=30)
+@searched(30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     unruly=st.sampled_from([0.0, 0.01, 0.2]),

@@ -6,7 +6,8 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from conftest import searched
+from hypothesis import given
 from hypothesis import strategies as st
 from runs import SECOND, START_NS, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
@@ -146,7 +147,7 @@ def test_a_covariance_is_used_only_where_it_is_given_and_wanted():
 # ---------------------------------------------------------------- order, blocks, switching
 
 
-@settings(max_examples=12)
+@searched(12)
 @given(seed=st.integers(0, 2**32 - 1), frame=st.sampled_from(list(VelocityFrame)))
 def test_the_order_in_which_topics_arrive_does_not_matter(seed, frame):
     """Each topic in its own order, but lagging the others by up to 0.9 s: the same to the last bit."""
@@ -332,7 +333,7 @@ def test_an_outlier_is_gated_and_changes_nothing():
         assert np.abs(hit.state(name).x - clean.state(name).x).max() < 0.3 * clean.estimate(name).std.max()
 
 
-@settings(max_examples=20)
+@searched(20)
 @given(st.integers(0, 2**32 - 1))
 def test_whatever_comes_the_counts_add_up_and_the_state_stays_finite(seed):
     source = random.Random(seed)

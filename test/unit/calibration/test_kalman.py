@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import searched
 from filter_problems import random_problem
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dvl_calib_ros.calibration import kalman
@@ -45,7 +46,7 @@ def test_least_squares_over_growing_windows_equals_the_filter_after_each(rng, we
         np.testing.assert_allclose(after.p[index], expected.p, atol=1e-12)
 
 
-@settings(max_examples=30)
+@searched(30)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n_samples=st.integers(1, 80),

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from conftest import searched
+from hypothesis import given
 from hypothesis import strategies as st
 from runs import feed
 
@@ -64,7 +65,7 @@ def check(data: SensorData, parameters: Parameters):
     return variants
 
 
-@settings(max_examples=15)
+@searched(15)
 @given(
     options=st.fixed_dictionaries(
         {

@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from hypothesis import given, settings
+from conftest import searched
+from hypothesis import given
 from hypothesis import strategies as st
 from other_simulators import READERS, mt19937_doubles
 from scipy.spatial.transform import Rotation
@@ -117,7 +118,7 @@ def test_what_stays_of_scale_and_bias_is_what_the_simulator_measures_too_little(
         np.testing.assert_allclose(measured, VELOCITY, atol=1e-3)
 
 
-@settings(max_examples=40)
+@searched(40)
 @given(
     st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1)),
     st.tuples(*[st.floats(-5.0, 5.0)] * 3),

@@ -6,8 +6,9 @@ import random
 
 import numpy as np
 import pytest
+from conftest import searched
 from driver_fixtures import MARINE, ODOMETRY, TWIST, TWIST_STAMPED, TYPES, Maker, write_driver_bag
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import IMU_TYPE, JAZZY, TWIST_TYPE, mcap_bytes, raw, run, write_bag
 
@@ -136,7 +137,7 @@ def recordings(draw: st.DrawFn):
     return messages
 
 
-@settings(max_examples=120, deadline=None)
+@searched(120)
 @given(recordings(), st.sampled_from([1, 7, 4096]), st.sampled_from(["", "dvl_link", "base_link"]), st.booleans())
 def test_whatever_is_recorded_gives_the_same_in_columns(tmp_path_factory, messages, window, dvl_frame, is_turned):
     path = tmp_path_factory.mktemp("bag") / "bag.mcap"

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import searched
 from documentation import section
 from driver_fixtures import (
     A50,
@@ -23,7 +24,7 @@ from driver_fixtures import (
     forget_definitions,
     write_driver_bag,
 )
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import estimates, mcap_bytes, raw, replayed, run, steady_run, write_bag
 from rosbags.rosbag2 import StoragePlugin
@@ -334,7 +335,7 @@ def numbers(rng: st.DataObject, value):
 
 @pytest.mark.parametrize("kind", TYPES)
 @given(rng=st.data())
-@settings(max_examples=25)
+@searched(25)
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_no_garbage_in_the_fields_raises_and_every_message_is_counted(kind, rng):
     feed = Feed(kind, dvl_frame="dvl_link" if rng.draw(st.booleans()) else "")
@@ -348,7 +349,7 @@ def test_no_garbage_in_the_fields_raises_and_every_message_is_counted(kind, rng)
 
 @pytest.mark.parametrize("kind", [TWIST, TWIST_STAMPED, ODOMETRY])
 @given(rng=st.data())
-@settings(max_examples=15)
+@searched(15)
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
 def test_no_garbage_in_a_reference_raises_either(kind, rng):
     feed = Feed(TWIST, gnss_type=kind)
