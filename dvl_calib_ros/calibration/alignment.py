@@ -77,9 +77,10 @@ class Aligner:
     n_judged, n_oriented, n_paired: numbers of the first row whose verdict, attitude or reference is not decided yet;
     the verdict may wait for the angular velocity. reference, imu: their samples of late. lag_ns: by how much (in
     stamps) one stream may lag another, a wrong clock included. given: by need, how many rows there are so far for
-    models that have
-    it. tally: by stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the DVL's stamps
-    went back when all is to start anew; everything here has then been forgotten.
+    models that have it. tally: by stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the
+    DVL's stamps went back when all is to start anew; everything here has then been forgotten. before_clearing: called
+    before the past of a track is forgotten whose stamps went back, so that who needs it takes it then, whatever stretch
+    it came in.
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class Aligner:
         self.parameters = parameters
         self._prior_sway_heave = prior_sway_heave
         self._on_restart = on_restart
+        self.before_clearing: Callable[[], None] = lambda: None
         self._clocks = Clocks.of(parameters)
         east, north = parameters.reference_velocity_offset
         offsets = {VelocityFrame.ENU: (east, north, 0.0), VelocityFrame.NED: (north, east, 0.0)}
@@ -282,6 +284,7 @@ class Aligner:
         order, admitted = self.orders[stream].admit(sample)
         self._count_order(self.tally[stream.value], order)
         if order is Order.CONFIRMED_RESTART:
+            self.before_clearing()
             track.clear()
             self._before_restart.discard(stream)
         if stream in self._before_restart and admitted:

@@ -120,6 +120,7 @@ class DelayFilter:
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
         for track in (aligner.reference, aligner.imu):
             track.needed_from_ns = LONG_AGO_NS  # until the first block is known
+        aligner.before_clearing = self.advance
 
     @property
     def counts(self) -> ModelCounts:

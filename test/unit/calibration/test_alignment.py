@@ -22,7 +22,8 @@ from dvl_calib_ros.calibration.samples import (
     sample_block,
 )
 
-STATES_EQUAL = 1e-12
+# Absolutely, and of σ: where most of what comes is rejected, rounding may grow to 1e-10 of σ.
+STATES_EQUAL, OF_SIGMA = 1e-12, 1e-9
 
 
 # ---------------------------------------------------------------- hostile data
@@ -138,8 +139,9 @@ def check_same(one: Calibrator, one_rows: Kept, other: Calibrator, other_rows: K
     for name in MODELS:
         a, b = one.estimate(name), other.estimate(name)
         assert (a.used, a.gated) == (b.used, b.gated), name
-        np.testing.assert_allclose(a.state, b.state, rtol=0, atol=STATES_EQUAL, err_msg=name)
-        np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=STATES_EQUAL, err_msg=name)
+        std = np.sqrt(np.diag(b.covariance))
+        assert (np.abs(a.state - b.state) <= STATES_EQUAL + OF_SIGMA * std).all(), (name, a.state - b.state)
+        np.testing.assert_allclose(a.covariance, b.covariance, rtol=OF_SIGMA, atol=STATES_EQUAL, err_msg=name)
 
 
 OPTIONS = (
@@ -162,6 +164,7 @@ OPTIONS = (
 @example(seed=3844923, unruly=0.0, lag_s=60.0, size=70, options={})  # an IMU that runs away from a DVL which lags
 @example(seed=3844923, unruly=0.01, lag_s=60.0, size=10_000, options={})  # stamps leap by years, G2 still needs before
 @example(seed=2416835433, unruly=0.01, lag_s=0.9, size=1, options=OPTIONS[4])
+@example(seed=33890, unruly=0.01, lag_s=0.9, size=512, options={})  # a reference's stamps go back
 def test_columns_cut_anywhere_give_what_one_by_one_gives(seed, unruly, lag_s, size, options):
     streams, parameters = hostile_streams(seed, unruly, lag_s), Parameters(gnss_hysteresis=1.0, **options)
     found = []
