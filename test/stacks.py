@@ -22,7 +22,7 @@ from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, 
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 START_NS = 1_760_000_000_000_000_000
-SECONDS = 240.0
+SECONDS = 150.0
 MISALIGNMENT = (0.012, -0.017, 0.026)  # rad: 0.7, -1.0, 1.5 degrees
 LEVER_ARM = (-0.6, 0.15, -0.3)
 DVL_STD, GNSS_STD = 0.01, 0.05

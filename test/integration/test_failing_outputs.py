@@ -120,7 +120,7 @@ def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_command_that_is_ended_half_way_leaves_no_half_of_a_bag(tmp_path, number):
-    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "simulate", str(tmp_path / "new"), "--duration", "3000"]
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "simulate", str(tmp_path / "new"), "--duration", "1000"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + PATIENCE_S
