@@ -8,7 +8,7 @@ NAME = "dvl_calib_ros"
 # The lowest versions that work: .ci/lowest.txt, with which CI runs the suite on Python 3.10.
 BAGS = ["rosbags>=0.11.7", "apsw>=3.46", "lz4>=4.3.2", 'backports.zstd>=1.0; python_version < "3.14"', "mcap>=1.2.1"]
 ROS_FREE = ["numpy>=1.26", "scipy>=1.11.1", "pyyaml>=6.0.1", "rich>=13.7", "joblib>=1.3", *BAGS]
-REPORT = ["matplotlib>=3.6.3", "jinja2>=3.1.2"]
+REPORT = ["matplotlib>=3.6.3", "jinja2>=3.1.2", "markupsafe>=2.1.0"]
 DASK = ["distributed>=2023.9"]
 COMPLETION = ["argcomplete>=3.1"]
 ROS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]

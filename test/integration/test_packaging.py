@@ -23,7 +23,8 @@ MODULES = sorted((ROOT / "dvl_calib_ros").rglob("*.py"))
 # how distributions call what we import, where it is not the module's own name
 DISTRIBUTIONS = {"yaml": "pyyaml", "backports": "backports.zstd"}
 # of ROS, of an extra, of Python 3.14, or replaced where it is missing
-NOT_REQUIRED = {"compression", "rclpy", "ament_index_python", "rosbag2_py", "argcomplete", "distributed", "pandas"}
+NOT_REQUIRED = {"compression", "rclpy", "ament_index_python", "rosbag2_py", "tf2_ros"}
+NOT_REQUIRED |= {"argcomplete", "distributed", "pandas"}
 
 
 def required() -> dict[str, str]:
