@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import rclpy
@@ -35,9 +36,9 @@ _MOST_STEPS = 40
 @cache
 def _node(folder: Path) -> CalibrationNode:
     """One for all inputs, heard by nobody."""
-    os.environ |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_LOG_DIR": str(folder)}
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=take_domain())
+    with patch.dict(os.environ, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_LOG_DIR": str(folder)}):
+        rclpy.init(context=context, domain_id=take_domain())
     result = Parameter("result_file", value=str(folder / "live.yaml"))
     node = CalibrationNode(context=context, parameter_overrides=[result])
     node.get_logger().set_level(LoggingSeverity.FATAL)

@@ -164,17 +164,24 @@ def run_parameters(data: bytes) -> None:
 
 
 def run_urdf(data: bytes) -> None:
-    """A mounting that is found is turned, and found again as it was turned."""
-    try:
-        urdf = read_urdf(_file("robot.urdf", data))
-        mounting = urdf.mounting("base_link", "dvl_link")
-        turned = rotation_from_rpy((0.1, -0.2, 0.3))
-        again = read_urdf(_file("robot.urdf", urdf.turned(mounting, turned))).mounting("base_link", "dvl_link")
-    except InputError as error:
-        assert len(str(error)) < 10_000
-        return
-    np.testing.assert_allclose(again.rotation_body_from_dvl, turned, rtol=0, atol=1e-6)
-    np.testing.assert_array_equal(again.position, mounting.position)
+    """A mounting that is found is turned and moved, and found again as it was turned and moved."""
+    turned = rotation_from_rpy((0.1, -0.2, 0.3))
+    for by in (None, np.array([0.5, -1.0, 2.0])):
+        try:
+            urdf = read_urdf(_file("robot.urdf", data))
+            mounting = urdf.mounting("base_link", "dvl_link")
+            position = mounting.position if by is None else mounting.position + by
+            moved = urdf.moved(mounting, turned, None if by is None else position)
+            again = read_urdf(_file("robot.urdf", moved)).mounting("base_link", "dvl_link")
+        except InputError as error:
+            assert len(str(error)) < 10_000
+            return
+        np.testing.assert_allclose(again.rotation_body_from_dvl, turned, rtol=0, atol=1e-6)
+        if by is None:
+            np.testing.assert_array_equal(again.position, position)
+        else:  # rounded to what is written, and to the largest that joints add up to nothing
+            scale = np.abs(mounting.joint.xyz).max() + np.abs(mounting.position).max()
+            np.testing.assert_allclose(again.position, position, rtol=0, atol=1e-5 + 1e-8 * scale)
 
 
 def run_trajectory(data: bytes) -> None:
