@@ -16,6 +16,7 @@ import numpy as np
 from .alignment import Aligner
 from .bank import ModelBank, ModelCounts, gate_of, nis_bounds, prior
 from .delay.filter import DelayFilter
+from .delay.hold_out import Recording, Terms
 from .folds import Moments, folds_of
 from .frames import Array, Vector
 from .history import Counts, Numbers, StateTrace
@@ -365,6 +366,23 @@ class Calibrator:
         counts = (estimate.used, estimate.gated)
         suggestion = self._delay.coarse.suggestion() if model.aided else None
         return verify(model, state, estimate.convergence, held_out, self.parameters, counts, suggestion)
+
+    def held_out_terms(self, name: str) -> list[Terms]:
+        """For every fold what one model corrects, had it not seen that fold; for one made with ``verified``.
+
+        Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
+        """
+        source = self._source(MODELS[name])
+        if source is None:
+            return [Terms.of_state(state.x) for state in self._delay.without_folds()]
+        terms = MODELS[source].error_terms_from_state
+        states = self._bank.states_without_folds(source)
+        return [Terms(terms @ state.x, np.zeros(3), 0.0) for state in states]
+
+    @property
+    def recording(self) -> tuple[Recording, int] | None:
+        """What was kept for verification of all streams, and the stamp (ns) of its time 0; None for nothing."""
+        return self._delay.recording
 
     def result(self) -> Result:
         """Everything, as of now."""

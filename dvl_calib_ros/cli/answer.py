@@ -24,10 +24,6 @@ VERDICTS = {
 }
 
 
-# Fewer samples with a reference say nothing of a mean.
-ENOUGH_PAIRS = 20
-
-
 def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Finding]:
     """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
     other = [f"{name}: " for name in replayed.result.estimates if name not in models]
@@ -54,7 +50,8 @@ def print_answer(out: Console, replayed: Replayed, discovery: Discovery) -> None
     out.print()
     out.print(escape(_headline(replayed)))
     out.print(_table(replayed))
-    for sentence in (*_drift(replayed), *_not_shown(replayed)):
+    _print_navigation(out, replayed)
+    for sentence in _not_shown(replayed):
         out.print(escape(sentence), soft_wrap=False)
     out.print(f"\nURDF  {escape(origin(replayed, discovery))}", soft_wrap=True)
 
@@ -131,32 +128,20 @@ def _table(replayed: Replayed) -> Table:
     return table
 
 
-def _drift(replayed: Replayed) -> list[str]:
-    """What the calibration is worth in dead reckoning: the mean velocity error, which adds up, before and after.
+def _print_navigation(out: Console, replayed: Replayed) -> None:
+    """What the calibration is worth in dead reckoning, and on a terminal a map of it."""
+    from rich.markup import escape
 
-    Noise that the reference leaves in the mean stays below its own figure, which is the least that is said.
-    """
-    import numpy as np
+    from ..replay.navigation import in_words
+    from .terminal_map import terminal_map
 
-    from ..calibration.error_model import correct
-    from ..calibration.models import MODELS
-    from ..calibration.parameters import Parameters
-
-    history, result = replayed.history, replayed.result
-    if history is None or len(history.paired_ns) < ENOUGH_PAIRS:
-        return []
-    rotation = Parameters.from_mapping(result.parameters).rotation_dvl_from_body
-    terms = MODELS[result.selected].error_terms_from_state @ result.estimate.state
-    speed = float(np.linalg.norm(history.reference_velocity, axis=1).mean())
-    per_km = []
-    for velocity in (
-        history.paired_velocity @ rotation, correct(history.paired_velocity, terms[:3], terms[3:], rotation)
-    ):  # fmt: skip
-        error = velocity - history.reference_velocity
-        noise = float(np.linalg.norm(error.std(axis=0))) / math.sqrt(len(error))
-        per_km.append(1000.0 * max(float(np.linalg.norm(error.mean(axis=0))), noise) / speed)
-    before, after = per_km
-    return [f"Dead reckoning, by this reference: {before:.0f} m of drift per km as mounted, {after:.1f} m corrected."]
+    navigation = replayed.navigation
+    if navigation is None:
+        return
+    for sentence in in_words(navigation):
+        out.print(escape(sentence), soft_wrap=False)
+    if out.is_terminal and navigation.on_a_map:
+        out.print(terminal_map(navigation, out.width))
 
 
 def _not_shown(replayed: Replayed) -> list[str]:

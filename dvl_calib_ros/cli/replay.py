@@ -44,6 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..calibration.models import MODELS
     from ..files.result_file import result_document, save_result
     from ..replay.checked import checked_replay
+    from ..replay.navigation import navigation_document
     from ..replay.replay import replay_document
 
     asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
@@ -71,6 +72,7 @@ def run(arguments: argparse.Namespace) -> None:
                 "findings": [found.as_dict() for found in replayed.findings],
                 "recordings": None if replayed.recordings is None else comparison_document(replayed.recordings),
                 "discovery": discovery.document(),
+                "navigation": navigation_document(replayed.navigation),
             },
         )
     if arguments.save is not None:

@@ -30,6 +30,7 @@ from ..files.result_file import estimate_document, load_initial_calibration
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder, Refusal
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
+from .navigation import Navigation, navigation_of
 from .recorder import Recorder, RunHistory
 
 BLOCK_SIZE = 512
@@ -61,6 +62,8 @@ class Replayed:
     dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
     recordings: what several recordings say, each for itself; None where they were not looked at so (`checked`).
     pause_s: how much of the time from the first to the last sample is between two recordings.
+    navigation: dead reckoning without and with the selected model's correction, on data that it had not seen; with a
+    history only, and None without a reference.
     """
 
     result: Result
@@ -73,6 +76,7 @@ class Replayed:
     turned: bool = False
     recordings: Comparison | None = None
     pause_s: float = 0.0
+    navigation: Navigation | None = None
 
     @property
     def dvl_data(self) -> str:
@@ -135,6 +139,7 @@ def replay(
         decoder.frame_of_reference,
         decoder.dvl_type.name,
         decoder.turns_dvl,
+        navigation=navigation_of(calibrator, result.selected, calibrator.parameters) if recorder else None,
     )
 
 

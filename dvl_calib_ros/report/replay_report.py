@@ -20,6 +20,7 @@ from ..files.result_file import result_document
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
 from . import replay_figures as figures
+from .navigation_figures import navigation_section
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture
 from .time_axis import TimeAxis, fitting_unit
@@ -78,6 +79,7 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
         "static_transform": document["mounting"]["static_transform_publisher"],
         "warnings": replayed.notes,
         "held_out": _held_out(result, shown),
+        "navigation": navigation_section(replayed.navigation),
         "estimates": _estimate_table(result, shown),
         "families": list(_families(result, history, time, shown)),
         "selected": result.selected,

@@ -15,7 +15,7 @@ import numpy as np
 from ..alignment import Aligner
 from ..bank import ModelCounts
 from ..coarse_mounting import CoarseFits
-from ..folds import folds_of
+from ..folds import FOLDS, folds_of
 from ..frames import ENU_FROM_NED, Array
 from ..kalman import GaussianState
 from ..observations import Assumptions, Observations
@@ -26,7 +26,7 @@ from ..streams import LONG_AGO_NS, LONGEST_NS, Track
 from ..tables import Table
 from ..verification import HeldOutError
 from .bank import DelayBank, Posterior
-from .hold_out import NOT_MEASURED, Kept, held_out_error, thinned
+from .hold_out import NOT_MEASURED, Kept, Recording, held_out_error, thinned
 from .rows import (
     BEYOND,
     DELAY,
@@ -349,6 +349,15 @@ class DelayFilter:
             noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
         stamps_ns = track.stamps_ns[at].copy()
         return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY, given), stamps_ns
+
+    @property
+    def recording(self) -> tuple[Recording, int] | None:
+        """All that was kept for verification, and the stamp (ns) of its time 0; None for nothing."""
+        return (Recording.of(self._kept), self._epoch_ns) if self._kept else None
+
+    def without_folds(self) -> list[GaussianState]:
+        """For every fold the state had it not seen that fold."""
+        return [self._bank.without_fold(fold) for fold in range(FOLDS)]
 
     def held_out_error(self) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""

@@ -11,7 +11,7 @@ from ..error_model import CORRECTION_JACOBIAN, correction_matrix
 from ..folds import FOLDS, folds_of
 from ..frames import Array, skew
 from ..parameters import Parameters
-from ..samples import Index, Stamps
+from ..samples import Index, Mask, Stamps
 from ..verification import HeldOutError, held_out_from_sums
 from .bank import DelayBank
 from .rows import DELAY, LEVER_ARM, DvlColumns, ImuColumns, ReferenceColumns, attitude_at
@@ -50,7 +50,7 @@ def held_out_error(kept: Sequence[Kept], bank: DelayBank, epoch_ns: int, p: Para
     As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
     less its delay, and the lever arm away from the reference point.
     """
-    recording = _Recording.of(kept)
+    recording = Recording.of(kept)
     folds = folds_of(np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns, p)
     nominal = np.zeros(len(bank.prior.x))
     sums = np.zeros(4)
@@ -82,8 +82,41 @@ class _Errors(NamedTuple):
     noise: Array
 
 
-class _Recording(NamedTuple):
-    """All that was kept."""
+class Terms(NamedTuple):
+    """What is to be corrected, beyond what the parameters say: errors (6,) φ rad and δk, lever_arm (3,) m, delay s."""
+
+    errors: Array
+    lever_arm: Array
+    time_offset: float
+
+    @staticmethod
+    def of_state(state: Array) -> Terms:
+        """Of G2's states (n,)."""
+        return Terms(np.array([*state[:5], 0.0]), state[LEVER_ARM], float(state[DELAY]))
+
+
+NO_TERMS = Terms(np.zeros(6), np.zeros(3), 0.0)
+
+
+class Compared(NamedTuple):
+    """N DVL samples beside the reference.
+
+    error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
+    does not measure. body (N, 3): the reference velocity. rotation_enu_from_body (N, 3, 3), oriented (N,): whether that
+    is known. variance (N, 3): of the reference. acceleration (N, 3): of the reference, body. rates (N, 3): rad/s.
+    """
+
+    error: Array
+    body: Array
+    rotation_enu_from_body: Array
+    oriented: Mask
+    variance: Array
+    acceleration: Array
+    rates: Array
+
+
+class Recording(NamedTuple):
+    """All that was kept, times in s since an epoch."""
 
     dvl: DvlColumns
     noise_dvl: Array
@@ -91,19 +124,33 @@ class _Recording(NamedTuple):
     imu: ImuColumns
 
     @staticmethod
-    def of(kept: Sequence[Kept]) -> _Recording:
+    def of(kept: Sequence[Kept]) -> Recording:
+        """Blocks one after the other."""
         dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
         noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
         reference = zip(*(each.reference for each in kept), strict=True)
         imu = zip(*(each.imu for each in kept), strict=True)
-        return _Recording(
+        return Recording(
             dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
         )
 
     def errors(self, at: Index, state: Array, p: Parameters) -> _Errors:
         """Errors of some DVL samples with a state (n,), interpolated as pairing does."""
-        n = len(at)
-        times, v = self.dvl.times[at] - state[DELAY], self.dvl.velocity[at]
+        n, v = len(at), self.dvl.velocity[at]
+        seen = self.compared(at, Terms.of_state(state), p)
+        t = p.rotation_dvl_from_body
+        measured = seen.variance < MEASURED_BELOW
+        jacobian = np.zeros((n, 3, len(state)))
+        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
+        jacobian[:, :, LEVER_ARM] = skew(seen.rates)
+        jacobian[:, :, DELAY] = -seen.acceleration
+        jacobian[~measured] = 0.0
+        noise = np.where(measured, seen.variance + self.noise_dvl[at, None] / 3.0, 0.0).sum(axis=1)
+        return _Errors(seen.error, jacobian, noise)
+
+    def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
+        """Some DVL samples beside the reference, corrected, interpolated as pairing does."""
+        times, v = self.dvl.times[at] - terms.time_offset, self.dvl.velocity[at]
         stamps = self.reference.times
         after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
         gap = stamps[after] - stamps[after - 1]
@@ -113,11 +160,12 @@ class _Recording(NamedTuple):
         rotation, oriented = attitude_at(self.imu, times, p.imu_timeout)
         body_from_reference = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
         body = np.matmul(body_from_reference, (g0 + (g1 - g0) * part)[..., None])[..., 0]
-        rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
-        lever = np.array(p.lever_arm) + state[LEVER_ARM]
-        t = p.rotation_dvl_from_body
-        errors = np.array([*state[:3], *state[3:5], 0.0])
-        error = body + np.cross(rates, lever) - v @ correction_matrix(errors[:3], errors[3:], t).T
+        rates = np.zeros_like(v)
+        if len(self.imu.times):
+            rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
+        lever = np.array(p.lever_arm) + terms.lever_arm
+        matrix = correction_matrix(terms.errors[:3], terms.errors[3:], p.rotation_dvl_from_body)
+        error = body + (np.cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
         found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
         found &= (v**2).sum(axis=1) >= p.min_speed**2
         body_noise = body_from_reference @ self.reference.noise[after] @ body_from_reference.swapaxes(1, 2)
@@ -125,13 +173,8 @@ class _Recording(NamedTuple):
         measured = variance < MEASURED_BELOW
         error[~measured] = 0.0
         error[~found] = np.nan
-        jacobian = np.zeros((n, 3, len(state)))
-        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
-        jacobian[:, :, LEVER_ARM] = skew(rates)
-        jacobian[:, :, DELAY] = -np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
-        jacobian[~measured] = 0.0
-        noise = np.where(measured, variance + self.noise_dvl[at, None] / 3.0, 0.0).sum(axis=1)
-        return _Errors(error, jacobian, noise)
+        acceleration = np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
+        return Compared(error, body, rotation, oriented, variance, acceleration, rates)
 
 
 def thinned(stamps_ns: Stamps) -> Index:

@@ -1,0 +1,229 @@
+"""What a calibration is worth to navigation: the track that dead reckoning gives with and without it.
+
+Velocity errors add up to an error of position. Each sample is corrected by an estimate that has not seen its stretch,
+with the lever arm and delay that it holds, so the drift is that of data to come; the reference's own noise is in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..calibration.calibrator import Calibrator
+from ..calibration.delay.hold_out import NO_TERMS, Compared, Recording, Terms
+from ..calibration.folds import folds_of
+from ..calibration.frames import Array
+from ..calibration.parameters import Parameters
+from ..calibration.samples import Index
+
+# Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
+STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
+ENOUGH = 3
+# What is shorter is no track.
+SHORTEST_M = 20.0
+# Where samples are further apart than this many of their usual intervals, and than this, s, nothing is known between.
+GAP_INTERVALS, GAP_S = 5.0, 2.0
+# Points of a track that are kept for a map.
+POINTS = 1500
+# Median of chi-square with one degree of freedom.
+MEDIAN_SQUARE = 0.4549
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far dead reckoning goes astray.
+
+    per_km: m per km, rms over stretches. end: m, at the end of the whole track.
+    """
+
+    per_km: float
+    end: float
+
+    @property
+    def percent(self) -> float:
+        """Of the distance."""
+        return 0.1 * self.per_km
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """Dead reckoning beside the reference.
+
+    Parameters
+    ----------
+    distance_m, seconds
+        Of the track, without gaps.
+    stretch_m
+        Length of the stretches that drift is told over; the whole distance if it is too short for several.
+    stretches
+        How many there are.
+    before, after
+        Drift as the DVL was mounted, and corrected by estimates that had not seen the data.
+    noise_per_km
+        Part of the drift that noise of reference and DVL, as the data show it, may be, m per km.
+    on_a_map
+        Whether headings are known, so that a track can be drawn: then east and north, else ahead and to port.
+    distances
+        (P,) m along the track, of the points kept.
+    reference, track_before, track_after
+        (P, 2) m from the start.
+    """
+
+    distance_m: float
+    seconds: float
+    stretch_m: float
+    stretches: int
+    before: Drift
+    after: Drift
+    noise_per_km: float
+    on_a_map: bool
+    distances: Array
+    reference: Array
+    track_before: Array
+    track_after: Array
+
+
+def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) -> Navigation | None:
+    """Of a finished calibration that was made ``verified``; None without reference, or with hardly any motion."""
+    kept = calibrator.recording
+    if kept is None:
+        return None
+    recording, epoch_ns = kept
+    try:
+        terms = calibrator.held_out_terms(model)
+    except np.linalg.LinAlgError:
+        return None
+    stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
+    return dead_reckoned(recording, folds_of(stamps_ns, parameters), terms, parameters)
+
+
+def dead_reckoned(
+    recording: Recording, folds: NDArray[np.int64], terms: Sequence[Terms], parameters: Parameters
+) -> Navigation | None:
+    """The track by the DVL as mounted, and corrected.
+
+    folds: (N,) of each DVL sample, which of `terms` corrects it. None without reference, or with hardly any motion.
+    """
+    if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
+        return None
+    every = np.arange(len(recording.dvl.times))
+    before = recording.compared(every, NO_TERMS, parameters)
+    after = _joined([recording.compared(np.flatnonzero(folds == k), each, parameters) for k, each in enumerate(terms)],
+                    np.argsort(folds, kind="stable"))  # fmt: skip
+    known = np.isfinite(before.error[:, 0]) & np.isfinite(after.error[:, 0])
+    on_a_map = bool(known.any() and (before.oriented & after.oriented)[known].all())
+    use = np.flatnonzero(known)
+    step_s = _steps(recording.dvl.times[use])
+    velocity = _level(before.body[use], before, use, on_a_map)
+    along = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
+    if not len(along) or along[-1] < SHORTEST_M:
+        return None
+    errors = [_level(each.error[use], each, use, on_a_map) for each in (before, after)]
+    astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
+    ends = _stretches(along)
+    kept = np.unique(np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp))
+    reference = np.cumsum(velocity * step_s[:, None], axis=0)
+    return Navigation(
+        distance_m=float(along[-1]),
+        seconds=float(step_s.sum()),
+        stretch_m=float(along[-1] if len(ends) == 2 else along[ends[1]] - along[ends[0]]),
+        stretches=len(ends) - 1,
+        before=_drift(astray[0], along, ends),
+        after=_drift(astray[1], along, ends),
+        noise_per_km=_noise(errors[1], step_s, along, ends),
+        on_a_map=on_a_map,
+        distances=along[kept],
+        reference=reference[kept],
+        track_before=(reference - astray[0])[kept],
+        track_after=(reference - astray[1])[kept],
+    )
+
+
+def _joined(parts: Sequence[Compared], order: Index) -> Compared:
+    """Parts as one, in the order of the samples. order: (N,) numbers of the samples in the order of the parts."""
+    back = np.argsort(order)
+    return Compared(*(np.concatenate(columns)[back] for columns in zip(*parts, strict=True)))
+
+
+def _steps(times: Array) -> Array:
+    """Time (N,) s that each sample stands for: since the one before, 0 after a gap."""
+    interval = np.diff(times, prepend=times[:1])
+    if len(interval) < 2:
+        return np.zeros(len(times))
+    usual = float(np.median(interval[1:]))
+    return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
+
+
+def _level(vectors: Array, seen: Compared, use: Index, on_a_map: bool) -> Array:
+    """(K, 2): east and north of body vectors (K, 3), or ahead and to port where no heading is known."""
+    if not on_a_map:
+        return vectors[:, :2]
+    return np.asarray(np.matmul(seen.rotation_enu_from_body[use], vectors[..., None])[:, :2, 0])
+
+
+def _stretches(along: Array) -> Index:
+    """Where stretches end (S + 1,), beginning with 0: of the longest length that there are enough of."""
+    for length in STRETCHES_M:
+        n = int(along[-1] // length)
+        if n >= ENOUGH:
+            return np.asarray(np.searchsorted(along, length * np.arange(n + 1)).clip(0, len(along) - 1))
+    return np.array([0, len(along) - 1])
+
+
+def _drift(astray: Array, along: Array, ends: Index) -> Drift:
+    off = np.linalg.norm(np.diff(astray[ends], axis=0), axis=1)
+    share = off / np.maximum(np.diff(along[ends]), 1e-9)
+    return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(astray[-1])))
+
+
+def _noise(errors: Array, step_s: Array, along: Array, ends: Index) -> float:
+    """What white noise of these errors (K, 2) makes of drift, m per km, rms over stretches.
+
+    Its size is that of differences of neighbours, which nothing slow is in.
+    """
+    if len(errors) < 3:
+        return 0.0
+    variance = np.median(np.diff(errors, axis=0) ** 2, axis=0).sum() / (2.0 * MEDIAN_SQUARE)
+    squares = np.concatenate([[0.0], np.cumsum(step_s[1:] ** 2)])
+    share = variance * np.diff(squares[ends]) / np.maximum(np.diff(along[ends]), 1e-9) ** 2
+    return 1000.0 * math.sqrt(float(np.mean(share)))
+
+
+def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
+    """Figures for `--json`."""
+    if navigation is None:
+        return None
+    return {
+        "distance_m": navigation.distance_m,
+        "seconds": navigation.seconds,
+        "stretch_m": navigation.stretch_m,
+        "stretches": navigation.stretches,
+        "drift_m_per_km": {"before": navigation.before.per_km, "after": navigation.after.per_km},
+        "end_error_m": {"before": navigation.before.end, "after": navigation.after.end},
+        "noise_m_per_km": navigation.noise_per_km,
+    }
+
+
+def in_words(navigation: Navigation) -> list[str]:
+    """What there is to say of it, a sentence each."""
+    n, before, after = navigation, navigation.before, navigation.after
+    over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
+    said = [
+        f"Dead reckoning on data held out, {over}: {_figure(before.per_km)} m of drift per km as mounted "
+        f"({before.percent:.2g} % of distance), {_figure(after.per_km)} m corrected ({after.percent:.2g} %); of that "
+        f"noise of reference and DVL may be {_figure(n.noise_per_km)} m."
+    ]
+    said.append(
+        f"After {n.distance_m:.0f} m it is {_figure(before.end)} m off as mounted, {_figure(after.end)} m corrected"
+        + ("." if n.on_a_map else "; without headings, as on one course.")
+    )
+    return said
+
+
+def _figure(value: float) -> str:
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.1f}"

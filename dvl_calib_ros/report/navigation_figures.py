@@ -1,0 +1,82 @@
+"""Figures of dead reckoning: the track on a map, and how far it is astray along it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..calibration.frames import Array
+from ..replay.navigation import Navigation, in_words
+from .replay_figures import AFTER, BAD
+from .style import INK, WIDTH, Picture, legend_above, new_figure, picture
+
+# A map is as high as it is wide at most, and never a strip, inches
+HIGHEST, LOWEST = WIDTH, 2.2
+_OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
+
+
+def navigation_section(navigation: Navigation | None) -> dict[str, Any] | None:
+    """What a page shows of it; None without."""
+    if navigation is None:
+        return None
+    return {"sentences": in_words(navigation), "pictures": navigation_pictures(navigation, {"": navigation})}
+
+
+def navigation_pictures(one: Navigation, corrected: Mapping[str, Navigation], where: str = "") -> Sequence[Picture]:
+    """Map, if headings are known, and error along the track.
+
+    one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone.
+    """
+    told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
+    alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
+    figures = []
+    if one.on_a_map:
+        figures.append(
+            picture(f"Track{where}", f"Map of the track {alt}", track_map, one, corrected,
+                    caption="From the same start; the corrected track by estimates that had not seen the data.")
+        )  # fmt: skip
+    figures.append(picture(f"Error of position{where}", f"Error of dead reckoning {alt}", error_along, one, corrected))
+    return figures
+
+
+def track_map(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
+    """East and north, m, the same scale along both."""
+    drawn = [one.reference, one.track_before, *(each.track_after for each in corrected.values())]
+    every = np.concatenate(drawn)
+    east, north = np.ptp(every, axis=0)
+    height = float(np.clip(0.85 * WIDTH * north / max(east, 1e-9) + 0.9, LOWEST, HIGHEST))
+    figure, axes = new_figure(height=height)
+    axes.plot(*one.reference.T, color=INK, linewidth=2.6, alpha=0.35, label="reference")
+    axes.plot(*one.track_before.T, color=BAD, linewidth=1.2, label="as mounted")
+    for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
+        axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
+    axes.plot(*one.reference[0], "o", color=INK, markersize=4.0)
+    for track, colour in zip(drawn[1:], (BAD, *_OTHERS), strict=False):
+        axes.plot(*track[-1], "s", color=colour, markersize=3.5)
+    axes.plot(*one.reference[-1], "s", color=INK, markersize=3.5)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("east, m (● start, ■ end)")
+    axes.set_ylabel("north, m")
+    legend_above(axes)
+    return figure
+
+
+def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
+    """Distance of the dead-reckoned position from the reference's, m, along the track."""
+
+    def off(each: Navigation, track: Array) -> Array:
+        return np.asarray(np.linalg.norm(track - each.reference, axis=1))
+
+    figure, axes = new_figure()
+    axes.plot(one.distances, off(one, one.track_before), color=BAD, label="as mounted")
+    for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
+        axes.plot(each.distances, off(each, each.track_after), color=colour, label=name or "corrected")
+    axes.set_xlim(0.0, one.distance_m)
+    axes.set_ylim(0.0, None)
+    axes.set_xlabel("distance along the track, m")
+    axes.set_ylabel("off the reference's track, m")
+    legend_above(axes)
+    return figure
