@@ -117,6 +117,7 @@ def diagnose_recordings(
         recordings=tuple((recording.name, recording.first_ns) for recording in recordings),
         twins=twins(selection),
         dvl=dvl_seen(selection, parameters),
+        selection=selection,
     )
 
 

@@ -127,9 +127,20 @@ class Fitter:
         white = self._white(noise, residual)
         return float(white @ white + np.sum((hypothesis.vector() / prior_std(hypothesis)) ** 2))
 
-    def fit(self, start: Hypothesis, noise: Noise, max_steps: int = MAX_STEPS, only_of_the_day: bool = False) -> Fit:
-        """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept."""
+    def fit(
+        self,
+        start: Hypothesis,
+        noise: Noise,
+        max_steps: int = MAX_STEPS,
+        only_of_the_day: bool = False,
+        fixed: frozenset[str] = frozenset(),
+    ) -> Fit:
+        """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept.
+
+        fixed: names of effects whose values are kept.
+        """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
+        kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
         seen, residual = self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)

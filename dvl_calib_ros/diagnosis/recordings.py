@@ -39,6 +39,8 @@ SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3")
 MIN_SPECTRUM, BANDS = 60, 40
 # Power of a band over that of noise up to which it is noise alone, and from which all of it is kept
 NOISE_ALONE, SOME_MOTION = 1.4, 2.5
+# A reference that moves faster than this shows that a DVL's zero is none, m/s
+MOVING_MPS = 0.1
 # Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out
 SPIKE, SPIKE_PASSES = 12.0, 3
 # Streams slower than this show turns and waves barely; they have no frequencies to spare
@@ -386,6 +388,7 @@ def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[
         raise InputError(f"{name}: no valid reference velocity of {len(streams.reference)}; see gnss_frame, max_speed")
     code = int(reference.frames[0])
     reference = reference.part(np.flatnonzero(reference.frames == code))
+    dvl = _without_zeros(dvl, reference, notes)
     velocity, std, frame = reference.values, _std(reference.covariances), FRAMES[code]
     if frame is VelocityFrame.NED:
         velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[[1, 0, 2]], VelocityFrame.ENU
@@ -430,6 +433,23 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
         negative = np.array([bool((np.diag(c) < 0.0).any()) for c in block.covariances.distinct] + [False])
         valid &= ~negative[block.covariances.index]
     return block.part(valid)
+
+
+def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.bool_]:
+    """(N,) DVL rows of exactly zero on all axes while the reference, nearest in time, moves: dropouts, not velocities."""
+    zero = (dvl.values == 0.0).all(axis=1)
+    if not zero.any() or not len(reference):
+        return zero & False
+    nearest = np.clip(np.searchsorted(reference.stamps_ns, dvl.stamps_ns), 0, len(reference) - 1)
+    return np.asarray(zero & (np.linalg.norm(reference.values[nearest], axis=1) > MOVING_MPS))
+
+
+def _without_zeros(dvl: SampleBlock, reference: SampleBlock, notes: list[str]) -> SampleBlock:
+    lost = zeros_while_moving(dvl, reference)
+    if not lost.any() or lost.all():
+        return dvl
+    notes.append(f"dvl: {np.count_nonzero(lost)} samples are exactly zero while the vehicle moves: taken for dropouts")
+    return dvl.part(~lost)
 
 
 def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> SampleBlock:

@@ -10,6 +10,7 @@ from typing import Any
 from .closure import Gap
 from .dvl import DvlSeen
 from .noise_findings import NoiseFinding
+from .selection import Selection
 from .series import DiagnosisSeries
 from .twin import Twin
 from .where import Place
@@ -45,6 +46,7 @@ class Diagnosis:
     """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any.
     calibration: value, low, high of φ (rad) and δk, three of each, beside the effects. compared_axes: in words.
     recordings: names and first stamps (ns). twins: of the recordings. dvl: as another simulator has to be told of it.
+    selection: the fits behind it, None where nothing could be fitted.
     """
 
     verdict: Verdict
@@ -63,6 +65,7 @@ class Diagnosis:
     recordings: tuple[tuple[str, int], ...] = ()
     twins: tuple[Twin, ...] = ()
     dvl: DvlSeen | None = None
+    selection: Selection | None = field(default=None, repr=False, compare=False)
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -1,0 +1,294 @@
+"""The comparison: from both sides' recordings to an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from ..diagnosis.diagnose import VISIBLE_TIMES_TYPICAL
+from ..diagnosis.holm import holm
+from ..diagnosis.results import Diagnosis
+from ..diagnosis.results import Verdict as Explained
+from ..diagnosis.selection import Selection
+from ..effects.base import Effect
+from ..effects.registry import EFFECTS
+from . import noise as noises
+from .logs import Log, Source, read_log
+from .results import ComparedEffect, ComparedNoise, Comparison, Rung, Status, Verdict
+from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
+from .sizes import (
+    Size,
+    common_names,
+    fitted,
+    is_testable,
+    is_there,
+    lies,
+    p_alike,
+    sizes,
+    smallest_difference,
+    trace_of,
+    union,
+)
+
+# Family-wise, of all that is claimed to differ
+LEVEL = 0.01
+ORDER = (Status.MISSING, Status.OTHER_SIZE, Status.ONLY_SIMULATOR, Status.ALIKE, Status.CANNOT_TELL)
+
+
+def compare(
+    vehicle: Source,
+    simulator: Source,
+    on_progress: Callable[[float], None] = lambda _: None,
+    effects: Mapping[str, Effect] = EFFECTS,
+    with_series: bool = False,
+) -> Comparison:
+    """Compare bags of a vehicle with bags of a simulator, from any motions.
+
+    Raises InputError for what cannot be compared at all.
+    """
+    real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
+    made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
+    comparison = compare_logs(real, made, effects)
+    on_progress(1.0)
+    return comparison
+
+
+def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> Comparison:
+    """`compare`, of sides that are read and explained already."""
+    if vehicle.selection is None or simulator.selection is None:
+        return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
+    candidates = noises.compare_noise(vehicle, simulator)
+    names = common_names(vehicle, simulator)
+    compared = _Compared.of(vehicle, simulator, names, union(*names), effects)
+    p = holm([*compared.p.values(), *(each.p for each in candidates)])
+    found = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
+    found += [compared.untested(name) for name in compared.names if name not in compared.p]
+    found.sort(key=lambda each: (ORDER.index(each.status), -each.adds_mps))
+    noise = [_noise(each, float(adjusted)) for each, adjusted in zip(candidates, p[len(compared.p) :], strict=True)]
+    noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
+    status = {each.name: each.status for each in found}
+    both = {name: (*compared.sizes[name], status[name]) for name in compared.p}
+    own = [effects[name] for name in names[0].values() if name in compared.sizes]
+    shrunk = shrink(vehicle, simulator, models(both, own))
+    levels = [noises.levels_by_regime(log) for log in (vehicle, simulator)]
+    verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
+    return Comparison(
+        verdict=verdict,
+        sentence=_sentence(verdict, found, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
+        effects=tuple(found),
+        noise=tuple(noise),
+        levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
+        rungs=shrunk.rungs,
+        floor_mps=shrunk.floor,
+        not_shown={
+            side: _not_shown(log.diagnosis, effects)
+            for side, log in (("vehicle", vehicle), ("simulator", simulator))
+        },
+        vehicle=vehicle.diagnosis,
+        simulator=simulator.diagnosis,
+        notes=tuple(
+            f"{side}: {note}"
+            for side, log in (("vehicle", vehicle), ("simulator", simulator))
+            for note in log.diagnosis.notes
+        ),
+        series=_series(shrunk, vehicle, simulator),
+    )
+
+
+def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
+    """What pictures show."""
+    return {
+        "shrunk": shrunk,
+        "residuals": {"vehicle": vehicle.residuals, "simulator": simulator.residuals},
+        "intervals": {
+            side: [each.dvl.interval for each in log.recordings]
+            for side, log in (("vehicle", vehicle), ("simulator", simulator))
+        },
+    }
+
+
+# ------------------------------------------------------------------ effects
+
+
+class _Compared:
+    """The union of effects, fitted to both sides."""
+
+    def __init__(
+        self,
+        vehicle: Log,
+        simulator: Log,
+        renamed: tuple[Mapping[str, str], Mapping[str, str]],
+        names: Sequence[str],
+        selections: tuple[Selection, Selection],
+        effects: Mapping[str, Effect],
+    ) -> None:
+        self.names, self._effects = names, effects
+        self._selections, self._logs, self._renamed = selections, (vehicle, simulator), renamed
+        self._fits = tuple(fitted(selection, names, effects) for selection in selections)
+        per_side = [
+            sizes(selection, fit, list(own.values()))
+            for selection, fit, own in zip(selections, self._fits, renamed, strict=True)
+        ]
+        self._per_side = per_side
+        self.sizes: dict[str, tuple[Size, Size]] = {
+            name: (per_side[0][name], per_side[1][name]) for name in names if all(name in side for side in per_side)
+        }
+        self.p = {name: p_alike(*both) for name, both in self.sizes.items()}
+
+    @classmethod
+    def of(
+        cls,
+        vehicle: Log,
+        simulator: Log,
+        renamed: tuple[Mapping[str, str], Mapping[str, str]],
+        names: Sequence[str],
+        effects: Mapping[str, Effect],
+    ) -> _Compared:
+        assert_both = (vehicle.selection, simulator.selection)
+        if assert_both[0] is None or assert_both[1] is None:
+            raise ValueError("nothing was fitted")
+        return cls(vehicle, simulator, renamed, names, (assert_both[0], assert_both[1]), effects)
+
+    def effect(self, name: str, p: float) -> ComparedEffect:
+        """One that both sides were tested for. p: adjusted."""
+        vehicle, simulator = self.sizes[name]
+        there = is_there(vehicle, simulator), is_there(simulator, vehicle)
+        status = _status(there, p < LEVEL)
+        needs = ""
+        if status is Status.CANNOT_TELL:
+            blind = "simulator" if there[0] else "vehicle"
+            least = smallest_difference(vehicle, simulator, len(self.p))
+            smallest = ", ".join(f"{key} {value:.2g}" for key, value in least.items())
+            needs = (
+                f"the two logs together would show a difference of {smallest}; with the {blind}: "
+                f"{self._effects[name].manoeuvre}"
+            )
+        side = 1 if status is Status.ONLY_SIMULATOR or not there[0] else 0
+        trace = trace_of(self._selections[side], self._fits[side], self._effects[name])
+        adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
+        where = lies(self._selections[side], self._fits[side], trace)
+        return ComparedEffect(
+            name, status, self._equivalent(name), vehicle.intervals(), simulator.intervals(), p, adds, where, needs
+        )
+
+    def untested(self, name: str) -> ComparedEffect:
+        """One that the recordings of one side cannot be tested for."""
+        shown = [side[name].intervals() if name in side else {} for side in self._per_side]
+        lacking = next(
+            side
+            for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True)
+            if not is_testable(self._effects[name], selection)
+        )
+        effect = self._effects[name]
+        what = "a second recording" if effect.relative_to_first else ", ".join(sorted(n.value for n in effect.needs))
+        return ComparedEffect(
+            name, Status.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"),
+            needs=f"the {lacking}'s log lacks {what}",
+        )  # fmt: skip
+
+    def _equivalent(self, name: str) -> tuple[str, ...]:
+        others: list[str] = []
+        for log, renamed in zip(self._logs, self._renamed, strict=True):
+            for each in log.diagnosis.effects:
+                if renamed[each.name] == name:
+                    others += [n for n in (each.name, *each.equivalent_to) if n != name]
+        return tuple(dict.fromkeys(others))
+
+
+def _status(there: tuple[bool, bool], differ: bool) -> Status:
+    if there[0] and there[1]:
+        return Status.OTHER_SIZE if differ else Status.ALIKE
+    if not differ:
+        return Status.CANNOT_TELL
+    return Status.MISSING if there[0] else Status.ONLY_SIMULATOR
+
+
+def _noise(candidate: noises.Candidate, p: float) -> ComparedNoise:
+    differ = p < LEVEL and candidate.matters
+    status = _status(candidate.there, differ) if any(candidate.there) else Status.ALIKE
+    if status is Status.CANNOT_TELL:
+        status = Status.ALIKE
+    return ComparedNoise(
+        candidate.name, status, candidate.unit, candidate.vehicle, candidate.simulator, p, candidate.note
+    )
+
+
+# ------------------------------------------------------------------ words
+
+
+def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
+    """Effects that a side could not have shown at sizes that matter -> what it could have, or what it lacks."""
+    found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
+    named = {each.name for each in diagnosis.effects}
+    for name, least in diagnosis.minimum_detectable.items():
+        typical = {spec.name: spec.typical for spec in effects[name].parameters}
+        if name not in named and not any(size <= VISIBLE_TIMES_TYPICAL * typical[key] for key, size in least.items()):
+            found[name] = "from " + ", ".join(f"{key} {size:.2g}" for key, size in least.items())
+    return found
+
+
+def _verdict(
+    effects: Sequence[ComparedEffect], noise: Sequence[ComparedNoise], vehicle: Diagnosis, simulator: Diagnosis
+) -> Verdict:
+    if any(each.status.is_claim for each in effects):
+        return Verdict.DIFFERENT
+    if any(each.status.is_claim for each in noise):
+        return Verdict.ONLY_NOISE
+    unsure = Explained.INSUFFICIENT_EXCITATION in (vehicle.verdict, simulator.verdict)
+    if unsure or any(each.status is Status.CANNOT_TELL for each in effects):
+        return Verdict.CANNOT_TELL
+    return Verdict.NO_DIFFERENCE
+
+
+def _sentence(
+    verdict: Verdict,
+    effects: Sequence[ComparedEffect],
+    noise: Sequence[ComparedNoise],
+    rungs: Sequence[Rung],
+    vehicle: Diagnosis,
+    simulator: Diagnosis,
+) -> str:
+    by_name = {rung.name: rung for rung in rungs}
+    before, after = by_name[AS_IT_IS], by_name[NOISE]
+    parts = []
+    for status, verb in (
+        (Status.MISSING, "The simulator lacks {}"),
+        (Status.OTHER_SIZE, "has {} of another size"),
+        (Status.ONLY_SIMULATOR, "has {} which the vehicle has not"),
+    ):
+        named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]
+        if named:
+            parts.append(verb.format(" and ".join(named)))
+    if parts:
+        text = ", ".join(parts)
+        text = text if text.startswith("The") else f"The simulator {text}"
+        text += (
+            f": with that the error on the vehicle's own motion falls from {1e3 * before.error_mps:.1f} to "
+            f"{1e3 * after.error_mps:.1f} mm/s, held out"
+        )
+    elif verdict is Verdict.CANNOT_TELL:
+        text = "These recordings show no difference in effects, and could not have shown some that matter"
+    else:
+        text = "The simulator lacks no effect that these recordings show"
+    differing = [each.name for each in noise if each.status.is_claim]
+    if differing:
+        text += f"; the noise differs in {', '.join(differing)}"
+    unknown = [side for side, d in (("vehicle", vehicle), ("simulator", simulator)) if d.verdict is Explained.UNKNOWN]
+    if unknown:
+        text += f"; something in the log of the {' and of the '.join(unknown)} follows no effect of the library"
+    return f"{text}."
+
+
+def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> Comparison:
+    said = [
+        f"{side}: {diagnosis.sentence}"
+        for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))
+        if diagnosis.selection is None
+    ]
+    return Comparison(
+        Verdict.CANNOT_TELL, f"Nothing can be compared. {' '.join(said)}", (), (), {}, (), float("nan"),
+        {"vehicle": {}, "simulator": {}}, vehicle, simulator,
+    )  # fmt: skip
+
+

@@ -1,0 +1,107 @@
+"""Both sides of a comparison: recordings of a vehicle or of a simulator, explained by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.parameters import Parameters
+from ..diagnosis.composed import Problem
+from ..diagnosis.diagnose import diagnose_recordings
+from ..diagnosis.recordings import Curve, Recording, load_recordings
+from ..diagnosis.results import Diagnosis
+from ..diagnosis.selection import Selection
+from ..diagnosis.twin import simulated
+from ..effects.base import Effect
+from ..effects.registry import EFFECTS
+from ..replay.replay import Topics
+from .stream import StreamFacts, stream_facts
+
+# No DVL is so quiet (m/s): its resolution is 1 mm/s. One that is, is the simulator's truth
+NOISE_FREE_MPS = 2e-4
+# Noise that is laid over such a DVL, so that what interpolation leaves is not taken for an effect: a DVL's resolution
+DITHER_MPS = 1e-3
+# A DVL that follows its reference with less than this share of its own noise has the same noise: it is no second sensor
+COPIED = 0.3
+
+
+@dataclass(frozen=True)
+class Source:
+    """Bags of one side, and how to read them."""
+
+    paths: tuple[Path, ...]
+    parameters: Parameters
+    topics: Topics
+
+
+@dataclass(frozen=True)
+class Log:
+    """One side, explained by itself.
+
+    residuals: (N, 3) m/s per recording, recorded DVL velocity less that of the model that explains it, DVL frame, at
+    the DVL's stamps. exact: the DVL has no noise of its own. copied: it has the noise of its reference.
+    """
+
+    diagnosis: Diagnosis
+    recordings: tuple[Recording, ...]
+    facts: tuple[StreamFacts, ...]
+    residuals: tuple[Array, ...]
+    exact: bool
+    copied: bool
+
+    @property
+    def selection(self) -> Selection | None:
+        """The fits behind the diagnosis; None where it could not make any."""
+        return self.diagnosis.selection
+
+
+def read_log(
+    source: Source,
+    on_progress: Callable[[float], None] = lambda _: None,
+    effects: Mapping[str, Effect] = EFFECTS,
+    with_series: bool = False,
+) -> Log:
+    """Read and diagnose one side. Raises InputError for what cannot be compared at all."""
+    loaded = load_recordings(source.paths, source.parameters, source.topics, lambda share: on_progress(0.4 * share))
+    facts = tuple(stream_facts(path, source.parameters, source.topics) for path in source.paths)
+    on_progress(0.5)
+    exact = all(float(np.linalg.norm(one.dvl.roughness)) < NOISE_FREE_MPS for one in loaded.recordings)
+    recordings = tuple(dithered(one) for one in loaded.recordings) if exact else loaded.recordings
+    diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, effects, with_series)
+    on_progress(1.0)
+    residuals = () if diagnosis.selection is None else dvl_residuals(diagnosis.selection)
+    return Log(diagnosis, recordings, facts, residuals, exact, not exact and _is_copied(recordings, residuals))
+
+
+def dithered(recording: Recording) -> Recording:
+    """The recording with white noise over its DVL, the same at every call."""
+    dvl = recording.dvl
+    noise = DITHER_MPS * np.random.default_rng(0).standard_normal(dvl.values.shape)
+    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed), _kept={})
+
+
+def dvl_residuals(selection: Selection) -> tuple[Array, ...]:
+    """(N, 3) m/s per recording: recorded less simulated by the fit, DVL frame, on a reference without its noise."""
+    problem = with_quiet_reference(selection.fitter.problem)
+    return tuple(
+        recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
+        for index, recording in enumerate(problem.recordings)
+    )
+
+
+def with_quiet_reference(problem: Problem) -> Problem:
+    """The problem with the noise of every reference taken off where there is no motion in it."""
+    quiet = tuple(replace(one, reference=one.reference.quiet, _kept={}) for one in problem.recordings)
+    return replace(problem, recordings=quiet, _kept={})
+
+
+def _is_copied(recordings: Sequence[Recording], residuals: Sequence[Array]) -> bool:
+    if not residuals:
+        return False
+    left = [float(np.linalg.norm(Curve(one.dvl.time, r).roughness)) for one, r in zip(recordings, residuals, strict=True)]
+    own = [float(np.linalg.norm(one.dvl.roughness)) for one in recordings]
+    return all(one < COPIED * other for one, other in zip(left, own, strict=True))

@@ -1,0 +1,195 @@
+"""What a comparison says, as data, and as the JSON of `diagnose --simulator --json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from ..diagnosis.results import Diagnosis, diagnosis_document
+
+Triple = tuple[float, float, float]
+"""A value and its 95 per cent interval."""
+
+
+class Status(str, Enum):
+    """How an effect, or a property of the noise, compares."""
+
+    MISSING = "missing_in_simulator"
+    OTHER_SIZE = "other_size"
+    ONLY_SIMULATOR = "only_in_simulator"
+    ALIKE = "alike"
+    CANNOT_TELL = "cannot_tell"
+
+    @property
+    def is_claim(self) -> bool:
+        """Whether it says that the two differ."""
+        return self in (Status.MISSING, Status.OTHER_SIZE, Status.ONLY_SIMULATOR)
+
+
+class Verdict(str, Enum):
+    """The answer in a word."""
+
+    DIFFERENT = "different"
+    ONLY_NOISE = "only_noise"
+    NO_DIFFERENCE = "no_difference"
+    CANNOT_TELL = "cannot_tell"
+
+
+@dataclass(frozen=True)
+class Lies:
+    """Where most of an effect is: axis, regime of motion, band of frequency; each with its share of the energy."""
+
+    axis: str
+    axis_share: float
+    regime: str
+    regime_share: float
+    band_hz: tuple[float, float]
+    band_share: float
+
+
+@dataclass(frozen=True)
+class ComparedEffect:
+    """One effect on both sides. equivalent_to: others that the data cannot tell from it, on the side that has it.
+
+    vehicle, simulator: parameters; empty where that side's recordings cannot show it. p: that both are alike, adjusted
+    (Holm) over all claims; nan where not tested. adds_mps: rms of what it adds to the vehicle's DVL (or, if only in the
+    simulator, to that), beyond what misalignment and scale take in. needs: what would show what could not be told.
+    """
+
+    name: str
+    status: Status
+    equivalent_to: tuple[str, ...]
+    vehicle: Mapping[str, Triple]
+    simulator: Mapping[str, Triple]
+    p: float
+    adds_mps: float = 0.0
+    lies: Lies | None = None
+    needs: str = ""
+
+
+@dataclass(frozen=True)
+class ComparedNoise:
+    """One property of the noise or of the stream. vehicle, simulator: value and interval in unit; p: adjusted."""
+
+    name: str
+    status: Status
+    unit: str
+    vehicle: Triple
+    simulator: Triple
+    p: float
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One model of the vehicle's DVL. name: the simulator as it is, or with what added. error_mps: rms of recorded less
+    simulated without noise, on held-out stretches. distance: energy distance of windows of both, with noise, in units
+    of their spread; null95: what it stays below 19 times in 20 if both are alike; p.
+    """
+
+    name: str
+    error_mps: float
+    distance: float
+    null95: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The whole answer. effects and noise: claims first, the strongest first. levels: per regime, m/s rms over the
+    axes: vehicle and simulator. floor_mps: noise that no simulator can take off, of `rungs`. not_shown: for each side
+    the effects that its motions could not have shown at sizes that matter, with the smallest size that they would.
+    """
+
+    verdict: Verdict
+    sentence: str
+    effects: tuple[ComparedEffect, ...]
+    noise: tuple[ComparedNoise, ...]
+    levels: Mapping[str, tuple[float, float]]
+    rungs: tuple[Rung, ...]
+    floor_mps: float
+    not_shown: Mapping[str, Mapping[str, str]]
+    vehicle: Diagnosis
+    simulator: Diagnosis
+    notes: tuple[str, ...] = ()
+    series: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def missing(self) -> tuple[ComparedEffect, ...]:
+        """Effects that the vehicle has and the simulator has not, the strongest first."""
+        return tuple(each for each in self.effects if each.status is Status.MISSING)
+
+
+def comparison_document(comparison: Comparison) -> dict[str, Any]:
+    """The JSON; with the diagnosis of each side as `diagnose --json` has it."""
+    return {
+        "verdict": comparison.verdict.value,
+        "sentence": comparison.sentence,
+        "effects": [
+            {
+                "name": each.name,
+                "status": each.status.value,
+                "equivalent_to": list(each.equivalent_to),
+                "vehicle": _parameters(each.vehicle),
+                "simulator": _parameters(each.simulator),
+                "p_adjusted": each.p,
+                "adds_mps": each.adds_mps,
+                "where": None if each.lies is None else _lies(each.lies),
+                "needs": each.needs,
+            }
+            for each in comparison.effects
+        ],
+        "noise": [
+            {
+                "name": each.name,
+                "status": each.status.value,
+                "unit": each.unit,
+                "vehicle": _value(each.vehicle),
+                "simulator": _value(each.simulator),
+                "p_adjusted": each.p,
+                "note": each.note,
+            }
+            for each in comparison.noise
+        ],
+        "noise_level_mps": {
+            regime: {"vehicle": vehicle, "simulator": simulator}
+            for regime, (vehicle, simulator) in comparison.levels.items()
+        },
+        "shrinks": [
+            {
+                "model": rung.name,
+                "error_mps": rung.error_mps,
+                "energy_distance": rung.distance,
+                "null95": rung.null95,
+                "p": rung.p,
+            }
+            for rung in comparison.rungs
+        ],
+        "noise_floor_mps": comparison.floor_mps,
+        "not_shown": {side: dict(names) for side, names in comparison.not_shown.items()},
+        "notes": list(comparison.notes),
+        "vehicle": diagnosis_document(comparison.vehicle),
+        "simulator": diagnosis_document(comparison.simulator),
+    }
+
+
+def _lies(lies: Lies) -> dict[str, Any]:
+    return {
+        "axis": lies.axis,
+        "axis_share": lies.axis_share,
+        "regime": lies.regime,
+        "regime_share": lies.regime_share,
+        "band_hz": list(lies.band_hz),
+        "band_share": lies.band_share,
+    }
+
+
+def _parameters(parameters: Mapping[str, Triple]) -> dict[str, Any]:
+    return {name: _value(each) for name, each in parameters.items()}
+
+
+def _value(each: Triple) -> dict[str, Any]:
+    value, low, high = each
+    return {"value": value, "ci95": [low, high]}

@@ -1,0 +1,221 @@
+"""How far the gap shrinks: the vehicle's motion through the simulator's model as it is, and with what it lacks added.
+
+Everything is judged on stretches of the vehicle's recordings that were held out: misalignment and scale (which take in
+a part of every effect) and the effects that are added are fitted to the rest. Two figures: the rms of what recorded and
+simulated DVL velocity differ by, and an energy distance between windows of both, each less what an ideal DVL would have
+measured, the simulated one with noise. If both were drawn alike, each pair of windows of the same time could be
+exchanged, which gives the distance's distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import median_abs_deviation
+
+from ..calibration.frames import Array
+from ..diagnosis.closure import FOLD_STEPS
+from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
+from ..diagnosis.selection import Selection
+from ..diagnosis.settings import SETTINGS
+from ..diagnosis.twin import simulated
+from ..effects.base import Effect
+from .logs import Log
+from .results import Rung, Status
+from .sizes import Size
+
+# Windows of the two-sample test: long enough that neighbours are nearly independent
+WINDOW_S, PERMUTATIONS = 10.0, 500
+# Noise is drawn from stretches of so many residuals, so that its colour is in it
+STRETCH = 8
+AS_IT_IS, ALL, NOISE = "as it is", "all effects", "all effects, and the vehicle's noise"
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is simulated. added: effects fitted to the vehicle; kept: those of the simulator, with their values."""
+
+    name: str
+    added: tuple[Effect, ...]
+    kept: Mapping[str, tuple[Effect, Values]]
+    vehicle_noise: bool = False
+
+
+def models(sizes: Mapping[str, tuple[Size, Size, Status]], vehicle: Sequence[Effect]) -> list[Model]:
+    """The ladder. sizes: of both sides by name, and how they compare. vehicle: effects that the vehicle has."""
+    kept = {
+        name: (simulator.effect, _values(simulator))
+        for name, (_, simulator, status) in sizes.items()
+        if status is not Status.MISSING and simulator.found and _always(simulator.effect)
+    }
+    lacking = [
+        sizes[name][0].effect
+        for name in sizes
+        if sizes[name][2] in (Status.MISSING, Status.OTHER_SIZE) and sizes[name][0].effect in vehicle
+    ]
+    ladder = [Model(AS_IT_IS, (), kept)]
+    for effect in lacking:
+        rest = {name: each for name, each in kept.items() if name != effect.name}
+        ladder.append(Model(f"with {effect.name}", (effect,), rest))
+    if len(lacking) != 1 or set(vehicle) != set(lacking) or kept:
+        ladder.append(Model(ALL, tuple(vehicle), {}))
+    return [*ladder, Model(NOISE, tuple(vehicle), {}, vehicle_noise=True)]
+
+
+def _always(effect: Effect) -> bool:
+    """Whether what a simulator has of it, it has on every run."""
+    return not effect.relative_to_first and not any(is_time_of_run(spec) for spec in effect.parameters)
+
+
+def _values(size: Size) -> Values:
+    mean = size.mean[0].tolist()
+    return size.effect.defaults | {s.name: v for s, v in zip(amplitudes(size.effect), mean, strict=True)}
+
+
+@dataclass(frozen=True)
+class Shrunk:
+    """rungs: of the ladder. errors: (F, 3) m/s held out, by name of the model, DVL frame. time: (F,) s; recording_of."""
+
+    rungs: tuple[Rung, ...]
+    floor: float
+    errors: Mapping[str, Array]
+    time: Array
+    recording_of: Array
+
+
+def shrink(vehicle: Log, simulator: Log, ladder: Sequence[Model], seed: int = 0) -> Shrunk:
+    """Climb the ladder on the vehicle's recordings."""
+    selection = vehicle.selection
+    if selection is None:
+        raise ValueError("nothing was fitted to the vehicle's recordings")
+    rng = np.random.default_rng(seed)
+    problem = selection.fitter.problem
+    ideal = _held_out(selection, Model("", (), {}))
+    truth = [each.dvl.values for each in problem.recordings]
+    shaken = _reference_noise(problem, selection.base.hypothesis, rng)
+    own = [_drawn([each], each, _fold_of(problem, index), rng) for index, each in enumerate(vehicle.residuals)]
+    # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
+    drawn = [
+        _drawn(simulator.residuals, each, None, rng) + noise for each, noise in zip(vehicle.residuals, shaken, strict=True)
+    ]
+    time = np.concatenate([each.dvl.time for each in problem.recordings])
+    recording_of = np.repeat(np.arange(len(truth)), [len(each) for each in truth])
+    windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
+    rungs, errors = [], {}
+    for model in ladder:
+        predicted = _held_out(selection, model)
+        off = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
+        errors[model.name] = off
+        noise = own if model.vehicle_noise else drawn
+        recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
+        made = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
+        known = np.isfinite(off).all(axis=1)
+        distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
+        rungs.append(Rung(model.name, _rms(off[known]), distance, null95, p))
+    return Shrunk(tuple(rungs), _floor(vehicle), errors, time, recording_of)
+
+
+def _rms(values: Array) -> float:
+    """Of the vectors' lengths, outliers drawn in to five standard deviations of the rest."""
+    scale = 5.0 * np.maximum(median_abs_deviation(values, axis=0, scale="normal"), 1e-9)
+    return float(np.sqrt((np.clip(values, -scale, scale) ** 2).sum(axis=1).mean()))
+
+
+def _floor(vehicle: Log) -> float:
+    return vehicle.diagnosis.gap.noise_floor
+
+
+def _held_out(selection: Selection, model: Model) -> list[Array]:
+    """(N, 3) m/s per recording: what a model, fitted without the fold that a sample is in, says the DVL measures.
+
+    Of several recordings stretches are held out as well: the model's days must have been seen for their own delays.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    problem = fitter.problem
+    n = len(problem.recordings)
+    kept = {name: (values,) * n for name, (_, values) in model.kept.items()}
+    effects = [*model.added, *(effect for effect, _ in model.kept.values())]
+    start = fit.hypothesis.with_effects(effects, n, kept)
+    fixed = frozenset(kept)
+    bins = np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds
+    sample_folds = [_fold_of(problem, index) for index in range(n)]
+    predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
+    for fold in np.unique(bins):
+        fitted = fitter.without(bins == fold).fit(start, fit.noise, FOLD_STEPS, fixed=fixed).hypothesis
+        for index in range(n):
+            at = sample_folds[index] == fold
+            predicted[index][at] = simulated(problem, fitted, index)[at]
+    return predicted
+
+
+def _fold_of(problem: Problem, index: int) -> Array:
+    """(N,) fold of every DVL sample of a recording: stretches of time in turn; -1 outside of what was fitted."""
+    time = problem.recordings[index].dvl.time - problem.grids[index].late
+    of = problem.grids[index].bin_time
+    fold = np.floor(time / SETTINGS.block).astype(int) % SETTINGS.folds
+    inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
+    return np.where(inside, fold, -1)
+
+
+def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Generator) -> list[Array]:
+    """(N, 3) m/s per recording: what made-up noise of the reference makes in the DVL's frame."""
+    noisy = replace(
+        problem,
+        recordings=tuple(replace(one, reference=one.reference.shaken(rng), _kept={}) for one in problem.recordings),
+        _kept={},
+    )
+    return [
+        simulated(noisy, hypothesis, index) - simulated(problem, hypothesis, index)
+        for index in range(len(problem.recordings))
+    ]
+
+
+def _drawn(pool: Sequence[Array], like: Array, folds: Array | None, rng: np.random.Generator) -> Array:
+    """(N, 3) m/s: noise put together of stretches of residuals; with folds, of another fold than a sample's own."""
+    joined = np.concatenate(list(pool))
+    joined = joined - np.median(joined, axis=0)
+    n = len(like)
+    starts = rng.integers(0, max(len(joined) - STRETCH, 1), -(-n // STRETCH))
+    at = (starts[:, None] + np.arange(STRETCH)).ravel()[:n] % len(joined)
+    if folds is not None and len(joined) == n:
+        same = folds[at] == folds
+        at[same] = (at[same] + n // 2 + 1) % n
+    return np.asarray(joined[at])
+
+
+# ------------------------------------------------------------------ two samples
+
+
+def features(values: Array, windows: Array) -> Array:
+    """(W, 6) of each window: mean and logarithm of the scatter on every axis."""
+    _, index = np.unique(windows, return_inverse=True)
+    count = np.bincount(index).astype(float)
+    mean = np.stack([np.bincount(index, column) for column in values.T], axis=1) / count[:, None]
+    left = values - mean[index]
+    variance = np.stack([np.bincount(index, column**2) for column in left.T], axis=1) / count[:, None]
+    full = count >= max(4.0, 0.5 * float(np.median(count)))
+    return np.column_stack([mean, 0.5 * np.log(np.maximum(variance, 1e-12))])[full]
+
+
+def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Energy distance of the windows of two series (N, 3), its 95 per cent quantile if both are alike, and p."""
+    a, b = features(one, windows), features(other, windows)
+    scale = np.maximum(median_abs_deviation(np.concatenate([a, b]), axis=0, scale="normal"), 1e-9)
+    both = np.concatenate([a, b]) / scale
+    apart = np.linalg.norm(both[:, None] - both[None], axis=2)
+    w = len(a)
+    if w < 4:
+        return np.nan, np.nan, np.nan
+    sign = np.concatenate([np.ones(w), -np.ones(w)])
+
+    def energy(signs: Array) -> Array:
+        """-s'Ds / w² is 2 E|X-Y| - E|X-X'| - E|Y-Y'|."""
+        return -np.einsum("...i,ij,...j->...", signs, apart, signs) / w**2
+
+    swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, w))
+    null = energy(np.concatenate([swap, -swap], axis=1))
+    value = float(energy(sign))
+    p = (1.0 + np.count_nonzero(null >= value)) / (1.0 + PERMUTATIONS)
+    return float(np.sqrt(max(value, 0.0))), float(np.sqrt(max(np.quantile(null, 0.95), 0.0))), float(p)

@@ -1,0 +1,208 @@
+"""Effect by effect: the size on both sides, whether they differ, and where the difference lies.
+
+All effects that either side was found to have are fitted to both, together: so the other side gives an interval for an
+effect that it was not found to have, which is wide where its motions do not show it. Sizes are compared by Wald's test
+with the covariance that the scatter of blocks of time shows on each side.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import f as f_distribution
+from scipy.stats import norm
+
+from ..calibration.frames import Array
+from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
+from ..diagnosis.fitting import Fit
+from ..diagnosis.selection import CLOCKS, Selection, blocks_of
+from ..diagnosis.where import BANDS_HZ, regimes
+from ..effects.base import Effect
+from ..effects.registry import EFFECTS
+from .logs import Log
+from .results import Lies, Triple
+
+# An effect that a side was not found to have is there nevertheless if it is sure at this level ...
+THERE = 1e-3
+# ... and at least this share of the other side's: less is what interpolation and noise in the regressors leave
+WORTH_IT = 0.1
+
+
+@dataclass(frozen=True)
+class Size:
+    """An effect on one side. values: (p,) its parameters with a derivative, of the day's the mean of the days'.
+
+    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p). dof: of that.
+    found: the side's own diagnosis named it.
+    """
+
+    effect: Effect
+    stacked: Array
+    covariance: Array
+    dof: int
+    found: bool
+
+    @property
+    def mean(self) -> tuple[Array, Array]:
+        """(p,) weighted mean over recordings and its covariance (p, p)."""
+        r, p = self.stacked.shape
+        design = np.tile(np.eye(p), (r, 1))
+        weight = np.linalg.inv(self.covariance)
+        covariance = np.linalg.inv(design.T @ weight @ design)
+        return covariance @ design.T @ weight @ self.stacked.ravel(), np.asarray(covariance)
+
+    def intervals(self) -> dict[str, Triple]:
+        """95 per cent, by name."""
+        values, covariance = self.mean
+        reach = norm.ppf(0.975) * np.sqrt(np.diag(covariance))
+        return {
+            spec.name: (float(v), float(v - w), float(v + w))
+            for spec, v, w in zip(amplitudes(self.effect), values, reach, strict=True)
+        }
+
+    def p_absent(self) -> float:
+        """p of there being none of it."""
+        defaults = np.array([spec.default for spec in amplitudes(self.effect)])
+        return _wald(self.stacked.ravel() - np.tile(defaults, len(self.stacked)), self.covariance, self.dof)
+
+
+def p_alike(vehicle: Size, simulator: Size) -> float:
+    """p of an effect having one size on both sides; of the day's, of every day having the simulator's."""
+    mean, covariance = simulator.mean
+    n = len(vehicle.stacked)
+    design = np.tile(np.eye(len(mean)), (n, 1))
+    apart = vehicle.stacked.ravel() - design @ mean
+    return _wald(apart, vehicle.covariance + design @ covariance @ design.T, min(vehicle.dof, simulator.dof))
+
+
+def _wald(values: Array, covariance: Array, dof: int) -> float:
+    p = len(values)
+    statistic = float(values @ np.linalg.solve(covariance, values)) / p
+    return float(f_distribution.sf(statistic, p, max(dof - p, 2)))
+
+
+def is_there(own: Size, other: Size) -> bool:
+    """Whether a side has an effect: it was named there, or is sure and not small against the other side's."""
+    if own.found:
+        return True
+    value, against = own.mean[0], other.mean[0]
+    worth_it = float(np.linalg.norm(value)) > WORTH_IT * float(np.linalg.norm(against))
+    return worth_it and own.p_absent() < THERE
+
+
+def smallest_difference(vehicle: Size, simulator: Size, n_claims: int) -> dict[str, float]:
+    """Difference of each parameter that would be found four times in five, at the level of so many claims."""
+    std = np.sqrt(np.diag(vehicle.mean[1]) + np.diag(simulator.mean[1]))
+    factor = float(norm.isf(0.005 / max(n_claims, 1)) + norm.ppf(0.8))
+    return {spec.name: factor * float(s) for spec, s in zip(amplitudes(vehicle.effect), std, strict=True)}
+
+
+# ------------------------------------------------------------------ the same names on both sides
+
+
+def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str, str]]:
+    """Per side, names found -> the name under which they are compared.
+
+    An effect that one side cannot tell from the one that the other side has is taken for that.
+    """
+    own = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
+    names: list[dict[str, str]] = [{name: name for name in side} for side in own]
+    for here, there in ((0, 1), (1, 0)):
+        for name, equivalent in own[here].items():
+            if name in own[there] or names[here][name] != name:
+                continue
+            shared = [other for other in equivalent if other in own[there] and other not in own[here]]
+            if shared:
+                names[here][name] = shared[0]
+    return names[0], names[1]
+
+
+def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]:
+    """Names to compare. Of three clocks only two differences matter, so the third is left out."""
+    both = {*vehicle.values(), *simulator.values()}
+    if set(CLOCKS) <= both:
+        both.discard(CLOCKS[2])
+    return [name for name in EFFECTS if name in both] + sorted(both - set(EFFECTS))
+
+
+def fitted(selection: Selection, names: Sequence[str], effects: Mapping[str, Effect]) -> Fit:
+    """All effects of these names that the recordings can be tested for, fitted together."""
+    fitter, fit = selection.fitter, selection.fit
+    problem = fitter.problem
+    n = len(problem.recordings)
+    chosen = [effects[name] for name in names if is_testable(effects[name], selection)]
+    start: dict[str, tuple[Values, ...]] = {}
+    for effect in chosen:
+        if effect not in fit.effects:
+            start[effect.name] = tuple(_some_time(effect, recording.seconds) for recording in problem.recordings)
+    return fitter.fit(fit.hypothesis.with_effects(chosen, n, start), fit.noise)
+
+
+def is_testable(effect: Effect, selection: Selection) -> bool:
+    """Whether recordings hold what an effect needs."""
+    problem = selection.fitter.problem
+    return effect.needs <= problem.available and not (effect.relative_to_first and len(problem.recordings) < 2)
+
+
+def _some_time(effect: Effect, seconds: float) -> Values:
+    """Defaults; what begins in the midst of a run is tried in its middle."""
+    times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
+    return effect.defaults | ({times[0]: 0.5 * seconds} if len(times) == 1 else {})
+
+
+def sizes(selection: Selection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
+    """Every effect of a fit by name. found: names (as compared) that the side's own diagnosis has."""
+    block = blocks_of(selection.fitter.problem)
+    covariance = fit.covariance(block)
+    dof = int(block.max()) + 1
+    vector = fit.hypothesis.vector()
+    n = len(fit.seen)
+    result, at = {}, 6
+    for effect in fit.effects:
+        p, r = len(amplitudes(effect)), len(whose_parameters(effect, n))
+        part = slice(at, at + p * r)
+        at += p * r
+        stacked = vector[part].reshape(r, p)
+        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found)
+    return result
+
+
+# ------------------------------------------------------------------ where it lies
+
+
+def trace_of(selection: Selection, fit: Fit, effect: Effect) -> Array:
+    """(M, A) m/s that an effect adds, without what misalignment, scale and the other effects would take in of it."""
+    others = [other for other in fit.effects if other is not effect]
+    without = selection.fitter.fit(fit.hypothesis.with_effects(others, len(fit.seen), {}), fit.noise, 4)
+    return without.residual - fit.residual
+
+
+def lies(selection: Selection, fit: Fit, trace: Array) -> Lies:
+    """Axis, regime and band that hold most of a trace (M, A); of the regimes the one where it is densest."""
+    problem = selection.fitter.problem
+    energy = trace**2
+    total = max(float(energy.sum()), 1e-300)
+    names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
+    axis = int(np.argmax(energy.sum(axis=0)))
+    regime, share, dense = "all", 1.0, 1.0
+    for name, mask in regimes(problem, fit.seen).items():
+        within = float(energy[mask].sum()) / total
+        if within > 0.4 and within / float(mask.mean()) > 1.2 * dense:
+            regime, share, dense = name, within, within / float(mask.mean())
+    nyquist = 0.5 / problem.interval
+    power = (np.abs(np.fft.rfft(trace, axis=0)) ** 2).sum(axis=1)
+    frequency = np.linspace(0.0, nyquist, len(power))
+    bands = [
+        (low, min(high, nyquist), float(power[(frequency >= low) & (frequency < high)].sum() / max(power.sum(), 1e-300)))
+        for low, high in itertools.pairwise(BANDS_HZ)
+        if low < nyquist
+    ]
+    low, high, band_share = max(bands, key=lambda band: band[2])
+    return Lies(
+        names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(high)), band_share
+    )
+
+
