@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from . import common, trial
+from . import common, trial, unpaired
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_report_option(parser)
     common.add_parameter_options(parser)
     common.add_discovery_options(parser)
+    unpaired.add_arguments(parser)
     parser.add_argument("--trial", action="store_true", help="try the diagnosis itself, blindly, on simulated bags")
     trial.add_arguments(parser)
 
@@ -59,6 +60,9 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if not arguments.bags:
         raise InputError("name a bag, or try --trial")
+    if arguments.simulator:
+        unpaired.run(arguments, DEFAULTS)
+        return
     from ..diagnosis.compensation import compensated, parameter_file
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.recordings import recording_names

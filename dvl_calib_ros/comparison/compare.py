@@ -82,8 +82,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
         rungs=shrunk.rungs,
         floor_mps=shrunk.floor,
         not_shown={
-            side: _not_shown(log.diagnosis, effects)
-            for side, log in (("vehicle", vehicle), ("simulator", simulator))
+            side: _not_shown(log.diagnosis, effects) for side, log in (("vehicle", vehicle), ("simulator", simulator))
         },
         vehicle=vehicle.diagnosis,
         simulator=simulator.diagnosis,
@@ -290,5 +289,3 @@ def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> Comparison:
         Verdict.CANNOT_TELL, f"Nothing can be compared. {' '.join(said)}", (), (), {}, (), float("nan"),
         {"vehicle": {}, "simulator": {}}, vehicle, simulator,
     )  # fmt: skip
-
-

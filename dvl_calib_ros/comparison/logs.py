@@ -102,6 +102,8 @@ def with_quiet_reference(problem: Problem) -> Problem:
 def _is_copied(recordings: Sequence[Recording], residuals: Sequence[Array]) -> bool:
     if not residuals:
         return False
-    left = [float(np.linalg.norm(Curve(one.dvl.time, r).roughness)) for one, r in zip(recordings, residuals, strict=True)]
+    left = [
+        float(np.linalg.norm(Curve(one.dvl.time, r).roughness)) for one, r in zip(recordings, residuals, strict=True)
+    ]
     own = [float(np.linalg.norm(one.dvl.roughness)) for one in recordings]
     return all(one < COPIED * other for one, other in zip(left, own, strict=True))

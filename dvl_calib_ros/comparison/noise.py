@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 from scipy.stats import fisher_exact, median_abs_deviation, norm, t
 
@@ -34,6 +35,8 @@ RATE_SHARE, JITTER_S, LATENCY_S = 0.03, 0.002, 0.01
 ASTERN_SHARE, ASTERN_MPS = 0.05, 0.1
 # Growth of the noise is of the logarithm: these are compared where one side shows them at this level
 GROWS = 1e-4
+# Standard deviations of speed, m/s, turn rate, rad/s, and speed astern, m/s, over which a growth can be seen
+SPREAD = {"speed": 0.1, "turn_rate": 0.01, "astern": 0.05}
 
 
 @dataclass(frozen=True)
@@ -106,12 +109,12 @@ def scatter(log: Log) -> list[Scatter]:
 
 def _differences(
     time: Array, values: Array, interval: float, weights: Sequence[float]
-) -> tuple[Array, Array, float]:
+) -> tuple[Array, NDArray[np.intp], float]:
     """Differences (K, 3) of neighbours without a gap, the middle sample of each, and their norm for white noise."""
     w, reach = np.array(weights), len(weights) // 2
     n = len(time) - 2 * reach
     if n < 1:
-        return np.zeros((0, values.shape[1])), np.zeros(0, dtype=int), 1.0
+        return np.zeros((0, values.shape[1])), np.zeros(0, dtype=np.intp), 1.0
     inner = np.arange(reach, reach + n)
     sums = np.sum([each * values[k : k + n] for k, each in enumerate(w)], axis=0)
     near = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
@@ -139,14 +142,14 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
         value, low, high = np.exp(_mean(levels))
         intervals.append((float(value), float(np.sqrt(max(low**2 - reference**2, 0.0))), float(high)))
     larger = 0 if intervals[0][0] >= intervals[1][0] else 1
-    levels = [np.asarray(b) for b in blocks]
+    own_levels = [np.asarray(each) for each in blocks]
     if of_reference[larger] > 0.0:
-        own = np.exp(2.0 * levels[larger]) - of_reference[larger] ** 2
-        levels[larger] = 0.5 * np.log(np.maximum(own, 1e-12))
-    ratio = float(np.exp(levels[larger].mean() - levels[1 - larger].mean()))
+        own = np.exp(2.0 * own_levels[larger]) - of_reference[larger] ** 2
+        own_levels[larger] = 0.5 * np.log(np.maximum(own, 1e-12))
+    ratio = float(np.exp(own_levels[larger].mean() - own_levels[1 - larger].mean()))
     note = "DVL and reference together" if max(of_reference) > 0.0 else ""
     return Candidate(
-        f"level_{'xyz'[axis]}", "m/s", intervals[0], intervals[1], _welch(levels[0], levels[1]),
+        f"level_{'xyz'[axis]}", "m/s", intervals[0], intervals[1], _welch(own_levels[0], own_levels[1]),
         matters=ratio > WORTH_TELLING, note=note,
     )  # fmt: skip
 
@@ -206,9 +209,14 @@ def _growth(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> list[Ca
         p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
         found.append(
             Candidate(
-                f"growth_with_{name}", unit, _around(a, std_a), _around(b, std_b), p,
-                (there[0], there[1]), matters=any(there),
-            )  # fmt: skip
+                f"growth_with_{name}",
+                unit,
+                _around(a, std_a),
+                _around(b, std_b),
+                p,
+                (there[0], there[1]),
+                matters=any(there),
+            )
         )
     return found
 
@@ -230,9 +238,7 @@ def _slopes(scattered: Sequence[Scatter]) -> dict[str, tuple[float, float]]:
         columns["turn_rate"] = np.concatenate([np.abs(each.motion.turn_rate[:, 2]) for each in scattered])
     if np.mean(ahead < -ASTERN_MPS) > ASTERN_SHARE:
         columns["astern"] = np.maximum(-ahead, 0.0)
-    columns = {name: column for name, column in columns.items() if np.std(column) > 0.02 * max(np.ptp(column), 1e-9)}
-    spread = {"speed": 0.1, "turn_rate": 0.01, "astern": 0.05}
-    columns = {name: column for name, column in columns.items() if np.std(column) > spread[name]}
+    columns = {name: column for name, column in columns.items() if np.std(column) > SPREAD[name]}
     if not columns:
         return {}
     values = np.concatenate([each.values for each in scattered])
@@ -319,10 +325,11 @@ def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
     if min(len(each) for each in slow) < 3 * FEWEST_BLOCKS:
         return None
     ratio = float(np.mean(slow[0] ** 2) / np.mean(slow[1] ** 2))
-    p = 2.0 * min(f_distribution.sf(ratio, len(slow[0]), len(slow[1])), f_distribution.cdf(ratio, len(slow[0]), len(slow[1])))
+    above = float(f_distribution.sf(ratio, len(slow[0]), len(slow[1])))
+    p = 2.0 * min(above, 1.0 - above)
     values = [f.parameters["time_constant_s"] if f is not None else (0.0, 0.0, 0.0) for f in findings]
     return Candidate(
-        "colour", "s", values[0], values[1], float(min(p, 1.0)),
+        "colour", "s", values[0], values[1], p,
         (findings[0] is not None, findings[1] is not None), note="of DVL or reference",
     )  # fmt: skip
 
@@ -359,7 +366,8 @@ def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
 
 def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
     counts = [
-        (sum(f.missing + f.refused for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)
+        (sum(f.missing + f.refused for f in log.facts), sum(f.received for f in log.facts))
+        for log in (vehicle, simulator)
     ]
     return _shares("dropouts", counts[0], counts[1])
 
@@ -420,5 +428,3 @@ def _times(name: str, vehicle: Array, simulator: Array, worth: float) -> Candida
     return Candidate(
         name, "s", shown[0], shown[1], _welch(vehicle, simulator), (there[0], there[1]), matters=apart > worth
     )
-
-

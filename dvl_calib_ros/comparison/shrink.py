@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import median_abs_deviation
 
 from ..calibration.frames import Array
@@ -76,13 +77,15 @@ def _values(size: Size) -> Values:
 
 @dataclass(frozen=True)
 class Shrunk:
-    """rungs: of the ladder. errors: (F, 3) m/s held out, by name of the model, DVL frame. time: (F,) s; recording_of."""
+    """rungs: of the ladder. floor: m/s. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan where nothing
+    is known. time: (F,) s since the start of the recording (F,).
+    """
 
     rungs: tuple[Rung, ...]
     floor: float
     errors: Mapping[str, Array]
     time: Array
-    recording_of: Array
+    recording_of: NDArray[np.intp]
 
 
 def shrink(vehicle: Log, simulator: Log, ladder: Sequence[Model], seed: int = 0) -> Shrunk:
@@ -92,27 +95,30 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[Model], seed: int = 0)
         raise ValueError("nothing was fitted to the vehicle's recordings")
     rng = np.random.default_rng(seed)
     problem = selection.fitter.problem
-    ideal = _held_out(selection, Model("", (), {}))
     truth = [each.dvl.values for each in problem.recordings]
-    shaken = _reference_noise(problem, selection.base.hypothesis, rng)
-    own = [_drawn([each], each, _fold_of(problem, index), rng) for index, each in enumerate(vehicle.residuals)]
-    # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
-    drawn = [
-        _drawn(simulator.residuals, each, None, rng) + noise for each, noise in zip(vehicle.residuals, shaken, strict=True)
-    ]
     time = np.concatenate([each.dvl.time for each in problem.recordings])
-    recording_of = np.repeat(np.arange(len(truth)), [len(each) for each in truth])
+    recording_of = np.repeat(np.arange(len(truth), dtype=np.intp), [len(each) for each in truth])
     windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
+    ideal = _held_out(selection, Model("", (), {}))
+    everything = _held_out(selection, ladder[-1])
+    own = [
+        _drawn([a - b], a, _fold_of(problem, index), rng)
+        for index, (a, b) in enumerate(zip(truth, everything, strict=True))
+    ]
+    # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
+    of_reference = _reference_noise(problem, selection.base.hypothesis, rng)
+    drawn = [_drawn(simulator.residuals, a, None, rng) + b for a, b in zip(truth, of_reference, strict=True)]
+    recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
     rungs, errors = [], {}
     for model in ladder:
-        predicted = _held_out(selection, model)
+        is_everything = set(model.added) == set(ladder[-1].added) and not model.kept
+        predicted = everything if is_everything else _held_out(selection, model)
         off = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
-        errors[model.name] = off
         noise = own if model.vehicle_noise else drawn
-        recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
         made = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
         known = np.isfinite(off).all(axis=1)
         distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
+        errors[model.name] = off
         rungs.append(Rung(model.name, _rms(off[known]), distance, null95, p))
     return Shrunk(tuple(rungs), _floor(vehicle), errors, time, recording_of)
 
@@ -175,14 +181,14 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
 def _drawn(pool: Sequence[Array], like: Array, folds: Array | None, rng: np.random.Generator) -> Array:
     """(N, 3) m/s: noise put together of stretches of residuals; with folds, of another fold than a sample's own."""
     joined = np.concatenate(list(pool))
-    joined = joined - np.median(joined, axis=0)
+    joined = joined - np.nanmedian(joined, axis=0)
     n = len(like)
     starts = rng.integers(0, max(len(joined) - STRETCH, 1), -(-n // STRETCH))
     at = (starts[:, None] + np.arange(STRETCH)).ravel()[:n] % len(joined)
     if folds is not None and len(joined) == n:
         same = folds[at] == folds
         at[same] = (at[same] + n // 2 + 1) % n
-    return np.asarray(joined[at])
+    return np.asarray(np.nan_to_num(joined[at]))
 
 
 # ------------------------------------------------------------------ two samples
@@ -195,7 +201,7 @@ def features(values: Array, windows: Array) -> Array:
     mean = np.stack([np.bincount(index, column) for column in values.T], axis=1) / count[:, None]
     left = values - mean[index]
     variance = np.stack([np.bincount(index, column**2) for column in left.T], axis=1) / count[:, None]
-    full = count >= max(4.0, 0.5 * float(np.median(count)))
+    full = count >= np.maximum(4.0, 0.5 * np.median(count))
     return np.column_stack([mean, 0.5 * np.log(np.maximum(variance, 1e-12))])[full]
 
 
@@ -218,4 +224,5 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
     null = energy(np.concatenate([swap, -swap], axis=1))
     value = float(energy(sign))
     p = (1.0 + np.count_nonzero(null >= value)) / (1.0 + PERMUTATIONS)
-    return float(np.sqrt(max(value, 0.0))), float(np.sqrt(max(np.quantile(null, 0.95), 0.0))), float(p)
+    null95 = float(np.quantile(null, 0.95))
+    return float(np.sqrt(max(value, 0.0))), float(np.sqrt(max(null95, 0.0))), float(p)

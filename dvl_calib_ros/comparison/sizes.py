@@ -196,13 +196,13 @@ def lies(selection: Selection, fit: Fit, trace: Array) -> Lies:
     power = (np.abs(np.fft.rfft(trace, axis=0)) ** 2).sum(axis=1)
     frequency = np.linspace(0.0, nyquist, len(power))
     bands = [
-        (low, min(high, nyquist), float(power[(frequency >= low) & (frequency < high)].sum() / max(power.sum(), 1e-300)))
+        (
+            low,
+            min(high, nyquist),
+            float(power[(frequency >= low) & (frequency < high)].sum() / max(power.sum(), 1e-300)),
+        )
         for low, high in itertools.pairwise(BANDS_HZ)
         if low < nyquist
     ]
     low, high, band_share = max(bands, key=lambda band: band[2])
-    return Lies(
-        names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(high)), band_share
-    )
-
-
+    return Lies(names[axis], float(energy[:, axis].sum()) / total, regime, share, (float(low), float(high)), band_share)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bags.columns import windows
 from ..bags.reader import BagReader
@@ -101,6 +101,6 @@ def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Array) -> StreamF
     )
 
 
-def _runs(mask: Sequence[bool] | Array) -> int:
+def _runs(mask: NDArray[np.bool_]) -> int:
     """Number of stretches that are true."""
-    return int(np.count_nonzero(np.diff(np.asarray(mask, dtype=int), prepend=0) > 0))
+    return int(np.count_nonzero(np.diff(mask.astype(int), prepend=0) > 0))

@@ -436,7 +436,7 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
 
 
 def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.bool_]:
-    """(N,) DVL rows of exactly zero on all axes while the reference, nearest in time, moves: dropouts, not velocities."""
+    """(N,) DVL rows of exactly zero while the reference, nearest in time, moves: dropouts, not velocities."""
     zero = (dvl.values == 0.0).all(axis=1)
     if not zero.any() or not len(reference):
         return zero & False

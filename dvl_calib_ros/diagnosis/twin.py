@@ -14,7 +14,7 @@ from .composed import Hypothesis, Problem
 from .recordings import Recording
 from .selection import Selection
 
-# Passes in which the true time of a late stamp is found
+# Passes in which the true time of a late stamp is found, and the motion of which a reference makes what it says
 _PASSES = 3
 
 
@@ -57,7 +57,8 @@ def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     rates = recording.angular_velocity(oriented) if has_rates else None
     nominal = problem.rotation_dvl_from_body
     motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0)
-    motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
+    for _ in range(_PASSES):  # the trace is that of the true motion, which is what is looked for
+        motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
     moved = at_dvl(injections, motion)
     if rates is not None:
         moved = replace(moved, velocity_body=moved.velocity_body + np.cross(rates, problem.lever_arm))

@@ -302,9 +302,7 @@ def _of_simulator(row: str, scenes: _Scenes, faults: Faults, rng: np.random.Gene
     return [dvl, _truth(scene, faults, start_ns), _true_attitude(scene, faults, start_ns)]
 
 
-def _row_noise(
-    kind: Row, scenes: _Scenes, vehicle: Vehicle, velocity: Floats, rng: np.random.Generator
-) -> Floats:
+def _row_noise(kind: Row, scenes: _Scenes, vehicle: Vehicle, velocity: Floats, rng: np.random.Generator) -> Floats:
     n = len(velocity)
     if not kind.on_beams:
         return scenes.row_std * rng.normal(size=(n, 3))
@@ -338,4 +336,3 @@ def _true_attitude(scene: Scene, faults: Faults, start_ns: int) -> list[Sample]:
             times.tolist(), quaternions.tolist(), state.rates.tolist(), strict=True
         )
     ]
-

@@ -39,11 +39,11 @@ def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[flo
     from ..comparison.logs import Source
     from ..comparison.results import comparison_document
 
-    sides = (
-        Source((path,), Parameters(min_speed=0.0, mounting_rpy=tuple(mounting[side])), Topics())
-        for side, path in (("vehicle", vehicle), ("simulator", simulator))
-    )
-    return comparison_document(compare(*sides))
+    def source(side: str, path: Path) -> Source:
+        roll, pitch, yaw = mounting[side]
+        return Source((path,), Parameters(min_speed=0.0, mounting_rpy=(roll, pitch, yaw)), Topics())
+
+    return comparison_document(compare(source("vehicle", vehicle), source("simulator", simulator)))
 
 
 def run_pairs(
@@ -224,8 +224,11 @@ def misses(found: Sequence[tuple[Document, Document]]) -> list[str]:
             claims = [(e["name"], e["status"]) for e in answer["document"]["effects"] if e["status"] in CLAIMS]
             said = ", ".join(f"{name} ({status})" for name, status in claims) or answer["document"]["verdict"]
             noise = f"; noise, wrongly: {', '.join(score.noise_wrong)}" if score.noise_wrong else ""
-            there = f"vehicle {', '.join(truth['vehicle']) or 'nothing'}, simulator {', '.join(truth['simulator']) or 'nothing'}"
-            lines.append(f"{truth['id']} {truth['what']} of {truth['row']} ({there}): said {said}{noise}")
+            there = [", ".join(truth[side]) or "nothing" for side in ("vehicle", "simulator")]
+            lines.append(
+                f"{truth['id']} {truth['what']} of {truth['row']} (vehicle {there[0]}, simulator {there[1]}): "
+                f"said {said}{noise}"
+            )
     return lines
 
 

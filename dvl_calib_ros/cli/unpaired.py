@@ -1,0 +1,166 @@
+"""`dvl-calib diagnose REAL --simulator SIM`: options and output."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import common
+from .reporting import report_writer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rich.table import Table
+
+    from ..comparison.logs import Source
+    from ..comparison.results import ComparedEffect, Comparison
+    from ..discovery.discover import Discovery
+
+COLOURS = {"different": "yellow", "only_noise": "yellow", "no_difference": "green", "cannot_tell": "yellow"}
+WORDS = {
+    "missing_in_simulator": "the simulator lacks it",
+    "other_size": "another size",
+    "only_in_simulator": "only in the simulator",
+    "alike": "alike",
+    "cannot_tell": "cannot tell",
+}
+NOT_WITH = ("apply", "twin")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """--simulator and what belongs to it."""
+    parser.add_argument(
+        "--simulator", nargs="+", type=Path, metavar="SIM",
+        help="bags of a simulator, from any motion, with its true velocity: what does its DVL lack?",
+    )  # fmt: skip
+    parser.add_argument(
+        "--simulator-params", type=Path, metavar="FILE", help="parameter file of the simulator, where it needs another"
+    )
+
+
+def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
+    """Compare, print, save."""
+    from ..comparison.compare import compare
+    from ..comparison.results import comparison_document
+    from ..errors import InputError
+
+    for option in NOT_WITH:
+        if getattr(arguments, option) is not None:
+            raise InputError(f"--{option} is of a diagnosis of one vehicle; run it without --simulator")
+    common.check_outputs(arguments, "json", "report", also_read=arguments.simulator)
+    write_report = report_writer(arguments, "write_comparison_report")
+    real = _source(arguments, arguments.bags, arguments.params, defaults)
+    made = _source(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
+    with common.progress("comparing") as on_progress:
+        comparison = compare(real[0], made[0], on_progress, with_series=write_report is not None)
+    if arguments.json is not None:
+        common.write_json(arguments.json, comparison_document(comparison))
+    if write_report is not None:
+        write_report(arguments.report, comparison)
+    _print(comparison)
+    common.print_found(real[1], arguments.bags)
+    common.print_found(made[1], arguments.simulator)
+
+
+def _source(
+    arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
+) -> tuple[Source, Discovery]:
+    """One side's bags and what they say of themselves."""
+    from ..comparison.logs import Source
+
+    own = argparse.Namespace(**{**vars(arguments), "params": params})
+    discovery = common.discovered(own, bags, common.load(own))
+    common.print_warnings(discovery.doubts)
+    parameters = common.load(own, defaults).replace(**discovery.values)
+    return Source(tuple(bags), parameters, discovery.topics), discovery
+
+
+def _print(comparison: Comparison) -> None:
+    from rich.markup import escape
+
+    common.print_warnings(comparison.notes)
+    out = common.console()
+    word = comparison.verdict.value
+    out.print(f"[bold {COLOURS[word]}]{word}[/]: {escape(comparison.sentence)}", soft_wrap=True)
+    if comparison.effects:
+        out.print(_effects(comparison))
+    if comparison.rungs:
+        out.print(_rungs(comparison))
+    if comparison.noise:
+        out.print(_noise(comparison))
+    if comparison.levels:
+        out.print(_levels(comparison))
+    for side, names in comparison.not_shown.items():
+        for name, why in names.items():
+            out.print(f"not shown by the {side}'s motion: {name}, {why}")
+    for effect in comparison.effects:
+        if effect.needs:
+            out.print(f"to tell {effect.name}: {escape(effect.needs)}", soft_wrap=True)
+
+
+def _table(title: str, *columns: str) -> Table:
+    from rich.table import Table as RichTable
+
+    table = RichTable(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column)
+    return table
+
+
+def _effects(comparison: Comparison) -> Table:
+    table = _table("effects", "effect", "", "vehicle (95 %)", "simulator (95 %)", "adds mm/s", "mostly", "p")
+    for each in comparison.effects:
+        names = " or ".join((each.name, *each.equivalent_to))
+        table.add_row(
+            names, WORDS[each.status.value], _values(each.vehicle), _values(each.simulator),
+            f"{1e3 * each.adds_mps:.1f}", where_text(each), "-" if math.isnan(each.p) else f"{each.p:.1g}",
+        )  # fmt: skip
+    return table
+
+
+def where_text(effect: ComparedEffect) -> str:
+    """Axis, regime and band that hold most of an effect."""
+    lies = effect.lies
+    if lies is None:
+        return "-"
+    regime = "" if lies.regime == "all" else f", {lies.regime}"
+    return f"{lies.axis}{regime}, {lies.band_hz[0]:.2g} .. {lies.band_hz[1]:.2g} Hz"
+
+
+def _rungs(comparison: Comparison) -> Table:
+    title = f"the simulator on the vehicle's own motion, held out; noise {1e3 * comparison.floor_mps:.1f} mm/s"
+    table = _table(title, "simulator", "error mm/s", "energy distance", "alike: below", "p")
+    for rung in comparison.rungs:
+        table.add_row(
+            rung.name, f"{1e3 * rung.error_mps:.1f}", f"{rung.distance:.2f}", f"{rung.null95:.2f}", f"{rung.p:.2g}"
+        )
+    return table
+
+
+def _noise(comparison: Comparison) -> Table:
+    table = _table("noise and stream", "property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p", "")
+    for each in comparison.noise:
+        table.add_row(
+            each.name, WORDS[each.status.value], _value(each.vehicle), _value(each.simulator), each.unit,
+            f"{each.p:.1g}", each.note,
+        )  # fmt: skip
+    return table
+
+
+def _levels(comparison: Comparison) -> Table:
+    table = _table("noise of the DVL by regime, mm/s over the axes", "when", "vehicle", "simulator")
+    for name, (vehicle, simulator) in comparison.levels.items():
+        table.add_row(name, f"{1e3 * vehicle:.1f}", f"{1e3 * simulator:.1f}")
+    return table
+
+
+def _values(parameters: Mapping[str, tuple[float, float, float]]) -> str:
+    return ", ".join(f"{name} {_value(each)}" for name, each in parameters.items()) or "-"
+
+
+def _value(each: tuple[float, float, float]) -> str:
+    value, low, high = each
+    return f"{value:.3g} ({low:.3g} .. {high:.3g})"
