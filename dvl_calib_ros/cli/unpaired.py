@@ -15,18 +15,11 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from ..comparison.logs import Source
-    from ..comparison.results import ComparedEffect, Comparison
+    from ..unpaired.logs import Source
+    from ..unpaired.results import UnpairedComparison
     from ..discovery.discover import Discovery
 
 COLOURS = {"different": "yellow", "only_noise": "yellow", "no_difference": "green", "cannot_tell": "yellow"}
-WORDS = {
-    "missing_in_simulator": "the simulator lacks it",
-    "other_size": "another size",
-    "only_in_simulator": "only in the simulator",
-    "alike": "alike",
-    "cannot_tell": "cannot tell",
-}
 NOT_WITH = ("apply", "twin")
 
 
@@ -43,21 +36,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
     """Compare, print, save."""
-    from ..comparison.compare import compare
-    from ..comparison.results import comparison_document
+    from ..unpaired.compare import compare
+    from ..unpaired.results import unpaired_document
     from ..errors import InputError
 
     for option in NOT_WITH:
         if getattr(arguments, option) is not None:
             raise InputError(f"--{option} is of a diagnosis of one vehicle; run it without --simulator")
     common.check_outputs(arguments, "json", "report", also_read=arguments.simulator)
-    write_report = report_writer(arguments, "write_comparison_report")
+    write_report = report_writer(arguments, "write_unpaired_report")
     real = _source(arguments, arguments.bags, arguments.params, defaults)
     made = _source(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
         comparison = compare(real[0], made[0], on_progress, with_series=write_report is not None)
     if arguments.json is not None:
-        common.write_json(arguments.json, comparison_document(comparison))
+        common.write_json(arguments.json, unpaired_document(comparison))
     if write_report is not None:
         write_report(arguments.report, comparison)
     _print(comparison)
@@ -69,7 +62,7 @@ def _source(
     arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
 ) -> tuple[Source, Discovery]:
     """One side's bags and what they say of themselves."""
-    from ..comparison.logs import Source
+    from ..unpaired.logs import Source
 
     own = argparse.Namespace(**{**vars(arguments), "params": params})
     discovery = common.discovered(own, bags, common.load(own))
@@ -78,7 +71,7 @@ def _source(
     return Source(tuple(bags), parameters, discovery.topics), discovery
 
 
-def _print(comparison: Comparison) -> None:
+def _print(comparison: UnpairedComparison) -> None:
     from rich.markup import escape
 
     common.print_warnings(comparison.notes)
@@ -110,27 +103,18 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _effects(comparison: Comparison) -> Table:
+def _effects(comparison: UnpairedComparison) -> Table:
     table = _table("effects", "effect", "", "vehicle (95 %)", "simulator (95 %)", "adds mm/s", "mostly", "p")
     for each in comparison.effects:
         names = " or ".join((each.name, *each.equivalent_to))
         table.add_row(
-            names, WORDS[each.status.value], _values(each.vehicle), _values(each.simulator),
-            f"{1e3 * each.adds_mps:.1f}", where_text(each), "-" if math.isnan(each.p) else f"{each.p:.1g}",
+            names, each.status.words, _values(each.vehicle), _values(each.simulator),
+            f"{1e3 * each.adds_mps:.1f}", str(each.lies or "-"), "-" if math.isnan(each.p) else f"{each.p:.1g}",
         )  # fmt: skip
     return table
 
 
-def where_text(effect: ComparedEffect) -> str:
-    """Axis, regime and band that hold most of an effect."""
-    lies = effect.lies
-    if lies is None:
-        return "-"
-    regime = "" if lies.regime == "all" else f", {lies.regime}"
-    return f"{lies.axis}{regime}, {lies.band_hz[0]:.2g} .. {lies.band_hz[1]:.2g} Hz"
-
-
-def _rungs(comparison: Comparison) -> Table:
+def _rungs(comparison: UnpairedComparison) -> Table:
     title = f"the simulator on the vehicle's own motion, held out; noise {1e3 * comparison.floor_mps:.1f} mm/s"
     table = _table(title, "simulator", "error mm/s", "energy distance", "alike: below", "p")
     for rung in comparison.rungs:
@@ -140,17 +124,17 @@ def _rungs(comparison: Comparison) -> Table:
     return table
 
 
-def _noise(comparison: Comparison) -> Table:
+def _noise(comparison: UnpairedComparison) -> Table:
     table = _table("noise and stream", "property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p", "")
     for each in comparison.noise:
         table.add_row(
-            each.name, WORDS[each.status.value], _value(each.vehicle), _value(each.simulator), each.unit,
+            each.name, each.status.words, _value(each.vehicle), _value(each.simulator), each.unit,
             f"{each.p:.1g}", each.note,
         )  # fmt: skip
     return table
 
 
-def _levels(comparison: Comparison) -> Table:
+def _levels(comparison: UnpairedComparison) -> Table:
     table = _table("noise of the DVL by regime, mm/s over the axes", "when", "vehicle", "simulator")
     for name, (vehicle, simulator) in comparison.levels.items():
         table.add_row(name, f"{1e3 * vehicle:.1f}", f"{1e3 * simulator:.1f}")

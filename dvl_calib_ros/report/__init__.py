@@ -7,10 +7,12 @@ from .comparison_report import write_comparison_report
 from .diagnosis_report import write_diagnosis_report
 from .evaluation_report import write_evaluation_report
 from .replay_report import write_replay_report
+from .unpaired_report import write_unpaired_report
 
 __all__ = [
     "write_comparison_report",
     "write_diagnosis_report",
     "write_evaluation_report",
     "write_replay_report",
+    "write_unpaired_report",
 ]

@@ -35,15 +35,15 @@ SAME_LEVEL = 1.02
 
 def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[float]]) -> Document:
     """What `dvl-calib diagnose VEHICLE --simulator SIMULATOR` says, as in its JSON."""
-    from ..comparison.compare import compare
-    from ..comparison.logs import Source
-    from ..comparison.results import comparison_document
+    from ..unpaired.compare import compare
+    from ..unpaired.logs import Source
+    from ..unpaired.results import unpaired_document
 
     def source(side: str, path: Path) -> Source:
         roll, pitch, yaw = mounting[side]
         return Source((path,), Parameters(min_speed=0.0, mounting_rpy=(roll, pitch, yaw)), Topics())
 
-    return comparison_document(compare(source("vehicle", vehicle), source("simulator", simulator)))
+    return unpaired_document(compare(source("vehicle", vehicle), source("simulator", simulator)))
 
 
 def run_pairs(

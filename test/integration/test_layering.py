@@ -21,7 +21,8 @@ MAY_IMPORT = {
     "files": {"bags", "messages", "calibration", "errors"},
     "diagnosis": {"bags", "messages", "replay", "effects", "calibration", "errors"},
     "export": {"files", "effects", "calibration", "errors"},
-    "report": {"diagnosis", "evaluation", "replay", "files", "effects", "calibration", "errors"},
+    "unpaired": {"diagnosis", "bags", "messages", "replay", "effects", "calibration", "errors"},
+    "report": {"unpaired", "diagnosis", "evaluation", "replay", "files", "effects", "calibration", "errors"},
 }
 WIRING = {"cli", "node", "demo"}
 

@@ -27,6 +27,17 @@ class Status(str, Enum):
         """Whether it says that the two differ."""
         return self in (Status.MISSING, Status.OTHER_SIZE, Status.ONLY_SIMULATOR)
 
+    @property
+    def words(self) -> str:
+        """As people read it."""
+        return {
+            Status.MISSING: "the simulator lacks it",
+            Status.OTHER_SIZE: "another size",
+            Status.ONLY_SIMULATOR: "only in the simulator",
+            Status.ALIKE: "alike",
+            Status.CANNOT_TELL: "cannot tell",
+        }[self]
+
 
 class Verdict(str, Enum):
     """The answer in a word."""
@@ -47,6 +58,10 @@ class Lies:
     regime_share: float
     band_hz: tuple[float, float]
     band_share: float
+
+    def __str__(self) -> str:
+        regime = "" if self.regime == "all" else f", {self.regime}"
+        return f"{self.axis}{regime}, {self.band_hz[0]:.2g} .. {self.band_hz[1]:.2g} Hz"
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,7 @@ class Rung:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class UnpairedComparison:
     """The whole answer. effects and noise: claims first, the strongest first. levels: per regime, m/s rms over the
     axes: vehicle and simulator. floor_mps: noise that no simulator can take off, of `rungs`. not_shown: for each side
     the effects that its motions could not have shown at sizes that matter, with the smallest size that they would.
@@ -122,7 +137,7 @@ class Comparison:
         return tuple(each for each in self.effects if each.status is Status.MISSING)
 
 
-def comparison_document(comparison: Comparison) -> dict[str, Any]:
+def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
     """The JSON; with the diagnosis of each side as `diagnose --json` has it."""
     return {
         "verdict": comparison.verdict.value,

@@ -15,7 +15,7 @@ from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from . import noise as noises
 from .logs import Log, Source, read_log
-from .results import ComparedEffect, ComparedNoise, Comparison, Rung, Status, Verdict
+from .results import ComparedEffect, ComparedNoise, UnpairedComparison, Rung, Status, Verdict
 from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .sizes import (
     Size,
@@ -42,7 +42,7 @@ def compare(
     on_progress: Callable[[float], None] = lambda _: None,
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
-) -> Comparison:
+) -> UnpairedComparison:
     """Compare bags of a vehicle with bags of a simulator, from any motions.
 
     Raises InputError for what cannot be compared at all.
@@ -54,7 +54,7 @@ def compare(
     return comparison
 
 
-def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> Comparison:
+def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
     """`compare`, of sides that are read and explained already."""
     if vehicle.selection is None or simulator.selection is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
@@ -73,7 +73,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     shrunk = shrink(vehicle, simulator, models(both, own))
     levels = [noises.levels_by_regime(log) for log in (vehicle, simulator)]
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
-    return Comparison(
+    return UnpairedComparison(
         verdict=verdict,
         sentence=_sentence(verdict, found, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
         effects=tuple(found),
@@ -279,13 +279,13 @@ def _sentence(
     return f"{text}."
 
 
-def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> Comparison:
+def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
     said = [
         f"{side}: {diagnosis.sentence}"
         for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))
         if diagnosis.selection is None
     ]
-    return Comparison(
+    return UnpairedComparison(
         Verdict.CANNOT_TELL, f"Nothing can be compared. {' '.join(said)}", (), (), {}, (), float("nan"),
         {"vehicle": {}, "simulator": {}}, vehicle, simulator,
     )  # fmt: skip

@@ -29,6 +29,8 @@ from .results import Lies, Triple
 THERE = 1e-3
 # ... and at least this share of the other side's: less is what interpolation and noise in the regressors leave
 WORTH_IT = 0.1
+# A regime is named if it holds this share of an effect, and so many times as much as its share of the time
+MOST, DENSER = 0.4, 1.2
 
 
 @dataclass(frozen=True)
@@ -187,11 +189,12 @@ def lies(selection: Selection, fit: Fit, trace: Array) -> Lies:
     total = max(float(energy.sum()), 1e-300)
     names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
     axis = int(np.argmax(energy.sum(axis=0)))
-    regime, share, dense = "all", 1.0, 1.0
+    regime, share, densest = "all", 1.0, DENSER
     for name, mask in regimes(problem, fit.seen).items():
         within = float(energy[mask].sum()) / total
-        if within > 0.4 and within / float(mask.mean()) > 1.2 * dense:
-            regime, share, dense = name, within, within / float(mask.mean())
+        density = within / float(mask.mean())
+        if within > MOST and density > densest:
+            regime, share, densest = name, within, density
     nyquist = 0.5 / problem.interval
     power = (np.abs(np.fft.rfft(trace, axis=0)) ** 2).sum(axis=1)
     frequency = np.linspace(0.0, nyquist, len(power))

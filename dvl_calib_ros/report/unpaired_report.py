@@ -1,0 +1,251 @@
+"""The report of a comparison with a simulator: `dvl-calib diagnose REAL --simulator SIM --report out.html`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.signal import welch
+
+from ..calibration.frames import Array
+from ..unpaired.results import ComparedEffect, ComparedNoise, UnpairedComparison, Status, Verdict
+from ..unpaired.shrink import ALL, AS_IT_IS, NOISE, Shrunk
+from .page import Cell, Table, write_page
+from .replay_figures import AFTER, BAD
+from .series import running_mean
+from .style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
+
+KINDS = {
+    Verdict.NO_DIFFERENCE: "accept",
+    Verdict.ONLY_NOISE: "marginal",
+    Verdict.CANNOT_TELL: "marginal",
+    Verdict.DIFFERENT: "reject",
+}
+CELLS = {Status.MISSING: "bad", Status.OTHER_SIZE: "off", Status.ONLY_SIMULATOR: "off"}
+DVL_AXES = ("x", "y", "z")
+# Lines over time are means over this share of the run
+WINDOW_SHARE = 1.0 / 50.0
+MM = 1e3
+
+
+def write_unpaired_report(path: Path, comparison: UnpairedComparison) -> None:
+    """Write the report of a comparison. Raises InputError if that cannot be."""
+    write_page(path, "unpaired.html", _context(comparison))
+
+
+def _context(c: UnpairedComparison) -> dict[str, Any]:
+    names = {side: ", ".join(name for name, _ in d.recordings) for side, d in _sides(c).items()}
+    return {
+        "title": "The DVL of a simulator against that of the vehicle",
+        "subtitle": f"vehicle: {names['vehicle']}; simulator: {names['simulator']}",
+        "written": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"),
+        "verdict": {"word": c.verdict.value.replace("_", " "), "kind": KINDS[c.verdict], "sentence": c.sentence},
+        "notes": c.notes,
+        "effects": _effects(c.effects) if c.effects else None,
+        "needs": [f"{each.name}: {each.needs}" for each in c.effects if each.needs],
+        "rungs": _rungs(c) if c.rungs else None,
+        "shrinks": list(_shrink_pictures(c)) if c.rungs else [],
+        "noise": _noise(c.noise) if c.noise else None,
+        "noise_pictures": list(_noise_pictures(c)),
+        "not_shown": _not_shown(c),
+        "sides": [{"name": side, "verdict": d.verdict.value, "sentence": d.sentence} for side, d in _sides(c).items()],
+    }
+
+
+def _sides(c: UnpairedComparison) -> dict[str, Any]:
+    return {"vehicle": c.vehicle, "simulator": c.simulator}
+
+
+# ------------------------------------------------------------------ tables
+
+
+def _effects(effects: Sequence[ComparedEffect]) -> Table:
+    rows = [
+        (
+            " or ".join((each.name, *each.equivalent_to)), Cell(each.status.words, CELLS.get(each.status, "")),
+            Cell(_values(each.vehicle), "text"), Cell(_values(each.simulator), "text"), f"{MM * each.adds_mps:.1f}",
+            str(each.lies or "–"), _p(each.p),
+        )
+        for each in effects
+    ]  # fmt: skip
+    head = ("effect", "", "vehicle (95 %)", "simulator (95 %)", "adds, mm/s", "mostly on", "p, adjusted")
+    notes = [
+        "Each effect is fitted to both logs, whichever was found to have it. p: that both have the same size, adjusted "
+        "for all claims of this page. Adds: beyond what misalignment and scale take in."
+    ]
+    return Table(head, rows, notes=notes)
+
+
+def _rungs(c: UnpairedComparison) -> Table:
+    rows = [
+        (r.name, f"{MM * r.error_mps:.1f}", f"{r.distance:.2f}", f"{r.null95:.2f}", _p(r.p)) for r in c.rungs
+    ]  # fmt: skip
+    head = ("simulator", "error, mm/s", "energy distance", "alike: below", "p")
+    notes = [
+        f"On stretches of the vehicle's own motion that were held out; noise of {MM * c.floor_mps:.1f} mm/s stays in "
+        "the error. Energy distance: between windows of recorded and simulated velocity, each less that of an ideal "
+        "DVL, by their means and scatter on the axes."
+    ]
+    return Table(head, rows, notes=notes)
+
+
+def _noise(noise: Sequence[ComparedNoise]) -> Table:
+    rows = [
+        (
+            each.name, Cell(each.status.words, CELLS.get(each.status, "")), _value(each.vehicle),
+            _value(each.simulator), each.unit, _p(each.p), each.note,
+        )
+        for each in noise
+    ]  # fmt: skip
+    return Table(("property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p, adjusted", ""), rows)
+
+
+def _not_shown(c: UnpairedComparison) -> Table | None:
+    names = sorted({name for side in c.not_shown.values() for name in side})
+    if not names:
+        return None
+    rows = [(name, *(c.not_shown[side].get(name, "would have shown") for side in c.not_shown)) for name in names]
+    return Table(("effect", *c.not_shown), rows)
+
+
+def _values(parameters: Mapping[str, tuple[float, float, float]]) -> str:
+    return "; ".join(f"{name} {_value(each)}" for name, each in parameters.items()) or "–"
+
+
+def _value(each: tuple[float, float, float]) -> str:
+    value, low, high = (f"{x:.3g}".replace("-", "−") for x in each)
+    return f"{value} ({low} to {high})"
+
+
+def _p(p: float) -> str:
+    return "–" if math.isnan(p) else f"{p:.2g}"
+
+
+# ------------------------------------------------------------------ pictures
+
+
+def _shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+    names = [rung.name for rung in c.rungs if rung.name != NOISE]
+    errors = [MM * rung.error_mps for rung in c.rungs if rung.name != NOISE]
+    alt = "; ".join(f"{name}: {error:.1f} mm/s" for name, error in zip(names, errors, strict=True))
+    yield picture("Error of the simulated DVL", alt, error_bars, names, errors, MM * c.floor_mps)
+    yield picture(
+        "Energy distance of recorded and simulated",
+        "; ".join(f"{rung.name}: {rung.distance:.2f}, alike below {rung.null95:.2f}" for rung in c.rungs),
+        distance_bars, [r.name for r in c.rungs], [r.distance for r in c.rungs], [r.null95 for r in c.rungs],
+        caption="Line: what it stays below 19 times in 20 if recorded and simulated are alike.",
+    )  # fmt: skip
+    shrunk = c.series.get("shrunk")
+    if isinstance(shrunk, Shrunk):
+        last = ALL if ALL in shrunk.errors else NOISE
+        for axis, name in enumerate(DVL_AXES):
+            yield picture(
+                f"Recorded less simulated over time, {name} of the DVL",
+                f"Running means over time of axis {name}: the simulator as it is, and with all effects",
+                over_time, shrunk, axis, (AS_IT_IS, last),
+            )  # fmt: skip
+
+
+def error_bars(names: Sequence[str], errors: Sequence[float], floor: float) -> Figure:
+    """Error of each model, mm/s, and the noise."""
+    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    colours = [BAD] + [FAINT] * (len(names) - 2) + [AFTER] if len(names) > 1 else [BAD]
+    axes.barh(range(len(names)), errors, color=colours, height=0.6)
+    axes.axvline(floor, color=INK, linewidth=0.9, linestyle=":", label="noise")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlabel("recorded less simulated, held out, mm/s rms")
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequence[float]) -> Figure:
+    """Energy distance of each model, and what it stays below if both are alike."""
+    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    rows = np.arange(len(names))
+    alike = [d <= n for d, n in zip(distances, null95, strict=True)]
+    axes.barh(rows, distances, color=[AFTER if each else BAD for each in alike], height=0.6)
+    axes.vlines(null95, rows - 0.38, rows + 0.38, color=INK, linewidth=1.6)
+    axes.set_yticks(rows, names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set_xlabel("energy distance, in spreads of the windows")
+    axes.grid(False, axis="y")
+    return figure
+
+
+def over_time(shrunk: Shrunk, axis: int, models: Sequence[str]) -> Figure:
+    """What is left on one axis of the DVL with each model, of the recording where most is left."""
+    first = shrunk.errors[models[0]]
+    squares = np.bincount(shrunk.recording_of, np.nansum(first**2, axis=1))
+    at = shrunk.recording_of == int(np.argmax(squares))
+    time = shrunk.time[at]
+    points = max(3, round(WINDOW_SHARE * len(time)))
+    figure, axes = new_figure()
+    for model, colour in zip(models, (BAD, AFTER), strict=True):
+        where, mean = running_mean(time, MM * shrunk.errors[model][at, axis], points)
+        axes.plot(where, mean, color=colour, label=AS_IT_IS if model == AS_IT_IS else "with all effects")
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    axes.set_xlabel("time from the start, s")
+    axes.set_ylabel(f"recorded less simulated, {DVL_AXES[axis]}, mm/s")
+    legend_above(axes)
+    return figure
+
+
+def _noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+    if c.levels:
+        alt = "; ".join(f"{name}: {MM * v:.1f} and {MM * s:.1f} mm/s" for name, (v, s) in c.levels.items())
+        yield picture("Noise of the DVL by regime", f"Vehicle and simulator: {alt}", level_bars, c.levels)
+    residuals: Any = c.series.get("residuals")
+    intervals: Any = c.series.get("intervals")
+    if residuals and all(residuals.values()):
+        for axis, name in enumerate(DVL_AXES):
+            lines = {
+                side: spectrum(max(residuals[side], key=len)[:, axis], float(np.median(intervals[side])))
+                for side in residuals
+            }
+            yield picture(
+                f"Residual by frequency, {name} of the DVL",
+                f"Amplitude spectral density of what each side's own explanation leaves on {name}", spectra, lines,
+            )  # fmt: skip
+
+
+def level_bars(levels: Mapping[str, tuple[float, float]]) -> Figure:
+    """Noise of both sides in each regime, m/s."""
+    figure, axes = new_figure(height=1.2 + 0.36 * len(levels))
+    rows = np.arange(len(levels))
+    for i, (side, colour) in enumerate((("vehicle", INK), ("simulator", AFTER))):
+        values = [MM * each[i] for each in levels.values()]
+        axes.barh(rows + (i - 0.5) * 0.38, values, height=0.34, color=colour, label=side)
+    axes.set_yticks(rows, list(levels))
+    axes.set_ylim(len(levels) - 0.4, -0.6)
+    axes.set_xlabel("noise over the axes, mm/s")
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def spectrum(values: Array, interval: float) -> tuple[Array, Array]:
+    """Frequency (F,) Hz and amplitude spectral density (F,) of values (N,)."""
+    frequency, power = welch(values, 1.0 / interval, nperseg=min(len(values), max(16, len(values) // 6)))
+    return frequency[1:], np.sqrt(power[1:])
+
+
+def spectra(lines: Mapping[str, tuple[Array, Array]]) -> Figure:
+    """Amplitude spectral densities of both sides, m/s/√Hz."""
+    figure, axes = new_figure()
+    for (side, (frequency, density)), colour in zip(lines.items(), (INK, AFTER), strict=True):
+        axes.plot(frequency, MM * np.maximum(density, 1e-7), color=colour, label=side)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    plain_log_ticks(axes.xaxis)
+    plain_log_ticks(axes.yaxis)
+    axes.set_xlabel("frequency, Hz")
+    axes.set_ylabel("mm/s/√Hz")
+    legend_above(axes)
+    return figure
