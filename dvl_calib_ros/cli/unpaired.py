@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
+    from ..discovery.discover import Discovery
     from ..unpaired.logs import Source
     from ..unpaired.results import UnpairedComparison
-    from ..discovery.discover import Discovery
 
 COLOURS = {"different": "yellow", "only_noise": "yellow", "no_difference": "green", "cannot_tell": "yellow"}
 NOT_WITH = ("apply", "twin")
@@ -36,9 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
     """Compare, print, save."""
+    from ..errors import InputError
     from ..unpaired.compare import compare
     from ..unpaired.results import unpaired_document
-    from ..errors import InputError
 
     for option in NOT_WITH:
         if getattr(arguments, option) is not None:

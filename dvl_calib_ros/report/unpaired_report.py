@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from ..calibration.frames import Array
-from ..unpaired.results import ComparedEffect, ComparedNoise, UnpairedComparison, Status, Verdict
+from ..unpaired.results import ComparedEffect, ComparedNoise, Status, UnpairedComparison, Verdict
 from ..unpaired.shrink import ALL, AS_IT_IS, NOISE, Shrunk
 from .page import Cell, Table, write_page
 from .replay_figures import AFTER, BAD

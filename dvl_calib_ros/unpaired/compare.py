@@ -15,7 +15,7 @@ from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from . import noise as noises
 from .logs import Log, Source, read_log
-from .results import ComparedEffect, ComparedNoise, UnpairedComparison, Rung, Status, Verdict
+from .results import ComparedEffect, ComparedNoise, Rung, Status, UnpairedComparison, Verdict
 from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .sizes import (
     Size,
