@@ -1,0 +1,212 @@
+"""A vehicle's log against a simulator's, from other motions: what is claimed, and what is not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import fail, succeed
+from report_fixtures import Page
+
+from dvl_calib_ros.bags.writer import Compression, Storage
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import Stream, sample_block
+from dvl_calib_ros.effects.registry import EFFECTS
+from dvl_calib_ros.replay.replay import Topics
+from dvl_calib_ros.simulation.injection import injection
+from dvl_calib_ros.simulation.scenario import Scenario, write_bag
+from dvl_calib_ros.simulation.sensors import DvlErrors
+from dvl_calib_ros.unpaired.compare import compare
+from dvl_calib_ros.unpaired.logs import Source
+from dvl_calib_ros.unpaired.results import Status, Verdict, unpaired_document
+from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, two_samples
+from dvl_calib_ros.unpaired.sizes import Size, is_there, p_alike
+from dvl_calib_ros.unpaired.stream import facts_of
+
+SECOND_NS = 1_000_000_000
+
+
+def source(*paths: Path) -> Source:
+    return Source(paths, Parameters(min_speed=0.0), Topics())
+
+
+def bag(path: Path, effects: tuple[str, ...] = (), **fields) -> Path:
+    scenario = {"trajectory": "free", "seconds": 200.0, "gnss_rate": 5.0, "gnss_std": 0.02}
+    write_bag(
+        Scenario(**(scenario | fields), effects=tuple(map(injection, effects))), path, Storage.MCAP, Compression.NONE
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory) -> dict[str, Path]:
+    """A vehicle with a lever arm and misalignment, and a simulator without, its reference being the truth."""
+    folder = tmp_path_factory.mktemp("unpaired")
+    tilted = DvlErrors((0.01, -0.01, 0.03), (0.005,) * 3, (0.0,) * 4, 0.005)
+    return {
+        "vehicle": bag(folder / "sea", ("lever_arm:x_m=0.8,y_m=-0.3",), errors=tilted, seed=1),
+        "simulator": bag(
+            folder / "sim", trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0, seed=2,
+            errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.01),
+        ),
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def compared(bags):
+    return compare(source(bags["vehicle"]), source(bags["simulator"]))
+
+
+# ------------------------------------------------------------------ the whole way
+
+
+def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_sides(compared):
+    assert compared.verdict is Verdict.DIFFERENT
+    assert [each.name for each in compared.missing] == ["lever_arm"]
+    arm = compared.missing[0]
+    value, low, high = arm.vehicle["x_m"]
+    assert low < value < high and value == pytest.approx(0.8, abs=0.1)
+    assert arm.simulator["x_m"][1] < 0.0 < arm.simulator["x_m"][2]
+    assert arm.p < 0.01 and arm.lies is not None and "lever_arm" in compared.sentence
+
+
+def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_in(compared):
+    assert [each.name for each in compared.effects if each.status.is_claim] == ["lever_arm"]
+
+
+def test_adding_the_missing_effect_shrinks_error_and_distance_on_held_out_stretches(compared):
+    rungs = {rung.name: rung for rung in compared.rungs}
+    assert list(rungs) == [AS_IT_IS, "with lever_arm", NOISE]
+    assert rungs[NOISE].error_mps < 0.85 * rungs[AS_IT_IS].error_mps
+    assert rungs[NOISE].error_mps == pytest.approx(compared.floor_mps, rel=0.2)
+    assert rungs[AS_IT_IS].distance > rungs[AS_IT_IS].null95
+    assert rungs[NOISE].p > 0.01 and rungs[NOISE].distance < rungs[AS_IT_IS].distance
+
+
+def test_a_noisier_dvl_is_told_axis_by_axis_and_nothing_else_of_the_stream(compared):
+    told = {each.name for each in compared.noise if each.status.is_claim}
+    assert told == {"level_x", "level_y", "level_z"}
+    level = next(each for each in compared.noise if each.name == "level_x")
+    assert level.simulator[0] == pytest.approx(2.0 * level.vehicle[0], rel=0.2)
+
+
+def test_the_json_holds_all_of_it_and_the_diagnosis_of_each_side(compared):
+    document = json.loads(json.dumps(unpaired_document(compared), default=float))
+    assert document["effects"][0]["status"] == "missing_in_simulator"
+    assert document["vehicle"]["verdict"] == "known"
+    assert [each["model"] for each in document["shrinks"]] == [rung.name for rung in compared.rungs]
+    assert set(document["not_shown"]) == {"vehicle", "simulator"}
+
+
+@pytest.mark.slow
+def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys):
+    report, document = tmp_path / "page.html", tmp_path / "answer.json"
+    out, _ = succeed(
+        capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], "--report", report, "--json", document
+    )
+    assert "The simulator lacks lever_arm" in out
+    assert json.loads(document.read_text())["verdict"] == "different"
+    page = Page(report)
+    assert page.row("lever_arm")[1] == "the simulator lacks it"
+    assert page.row("as it is") and "How far the gap shrinks" in page.text
+
+
+@pytest.mark.slow
+def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_said_so(bags, tmp_path):
+    arm = "lever_arm:x_m=0.8,y_m=-0.3"
+    made = bag(
+        tmp_path / "sim", (arm, "velocity_bias:x_mps=0.05"), trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0,
+        seed=3,
+    )  # fmt: skip
+    found = {each.name: each.status for each in compare(source(bags["vehicle"]), source(made)).effects}
+    assert found["lever_arm"] is Status.ALIKE
+    assert found["velocity_bias"] is Status.ONLY_SIMULATOR
+
+
+@pytest.mark.slow
+def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(bags, tmp_path):
+    made = bag(
+        tmp_path / "sim", trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0,
+        errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.0),
+    )  # fmt: skip
+    found = compare(source(bags["vehicle"]), source(made))
+    leak = next(each for each in found.noise if each.name == "truth_leaks")
+    assert leak.status is Status.ONLY_SIMULATOR and "without any noise" in leak.note
+    assert [each.name for each in found.effects if each.status.is_claim] == ["lever_arm"]
+
+
+@pytest.mark.slow
+def test_a_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags, tmp_path):
+    made = bag(tmp_path / "sim", trajectory="straight", gnss_rate=10.0, gnss_std=0.0)
+    found = compare(source(bags["vehicle"]), source(made))
+    arm = next(each for each in found.effects if each.name == "lever_arm")
+    assert arm.status is Status.CANNOT_TELL and "with the simulator" in arm.needs
+
+
+@pytest.mark.parametrize("option", ["--apply", "--twin"])
+def test_what_is_of_one_vehicle_is_refused_beside_a_simulator(bags, tmp_path, capsys, option):
+    assert option in fail(
+        capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], option, tmp_path / "x"
+    )
+
+
+# ------------------------------------------------------------------ its parts
+
+
+def size(value: float, std: float, found: bool = True) -> Size:
+    effect = EFFECTS["sideslip"]
+    return Size(effect, np.array([[value]]), np.array([[std**2]]), 60, found)
+
+
+def test_sizes_differ_only_by_what_both_sides_are_unsure_of():
+    assert p_alike(size(1.0, 0.1), size(0.0, 0.1)) < 1e-6
+    assert p_alike(size(1.0, 0.1), size(0.0, 1.0)) > 0.1
+    assert p_alike(size(1.0, 0.1), size(1.05, 0.1)) > 0.5
+
+
+def test_p_of_alike_sizes_is_even():
+    rng = np.random.default_rng(0)
+    p = np.array([p_alike(size(rng.normal(0.3, 0.1), 0.1), size(rng.normal(0.3, 0.05), 0.05)) for _ in range(400)])
+    assert np.mean(p < 0.05) < 0.09 and np.mean(p < 0.5) == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_trace_of_an_effect_that_was_not_named_is_none_of_it():
+    assert not is_there(size(0.02, 0.001, found=False), size(1.0, 0.1))
+    assert is_there(size(0.9, 0.1, found=False), size(1.0, 0.1))
+
+
+def test_windows_of_one_kind_are_alike_and_shifted_ones_are_not():
+    rng = np.random.default_rng(1)
+    windows = np.repeat(np.arange(30), 40)
+    draw = rng.normal(0.0, 0.01, (60, 1200, 3))
+    p = np.array([two_samples(draw[2 * k], draw[2 * k + 1], windows, rng)[2] for k in range(30)])
+    assert np.mean(p < 0.05) < 0.2 and p.max() > 0.5
+    distance, null95, p_shifted = two_samples(draw[0], draw[1] + [0.01, 0.0, 0.0], windows, rng)
+    assert distance > null95 and p_shifted < 0.01
+
+
+def stream(n: int = 200, rate: float = 5.0):
+    """Messages of a DVL under way, and of its reference."""
+    stamps = (np.arange(n) / rate * SECOND_NS).astype(np.int64)
+    values = np.column_stack([1.0 + 0.01 * np.sin(np.arange(n)), np.zeros(n), np.zeros(n)])
+    return stamps, values, sample_block(Stream.REFERENCE, stamps, values)
+
+
+def test_the_stream_is_counted_in_events():
+    stamps, values, reference = stream()
+    values = values.copy()
+    values[50:53] = 0.0  # one dropout that is sent as zero
+    values[80] = values[79]
+    kept = np.r_[0:100, 104:150, 151:200]  # two gaps
+    facts = facts_of(sample_block(Stream.DVL, stamps[kept], values[kept]), reference, stamps[kept] + 30_000_000)
+    assert (facts.missing, facts.zero, facts.repeats, facts.refused) == (2, 1, 1, 0)
+    assert facts.lost == 5 + 3
+    assert facts.interval == pytest.approx(0.2) and np.median(facts.latency) == pytest.approx(0.03)
+
+
+def test_log_times_of_another_clock_say_no_latency():
+    stamps, values, reference = stream()
+    facts = facts_of(sample_block(Stream.DVL, stamps, values), reference, stamps + 10**18)
+    assert not len(facts.latency)
