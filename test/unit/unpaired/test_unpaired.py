@@ -147,9 +147,7 @@ def test_a_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags, tmp_
 
 @pytest.mark.parametrize("option", ["--apply", "--twin"])
 def test_what_is_of_one_vehicle_is_refused_beside_a_simulator(bags, tmp_path, capsys, option):
-    assert option in fail(
-        capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], option, tmp_path / "x"
-    )
+    assert option in fail(capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], option, tmp_path / "x")
 
 
 # ------------------------------------------------------------------ its parts
