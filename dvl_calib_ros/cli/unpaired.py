@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
     for option in NOT_WITH:
         if getattr(arguments, option) is not None:
             raise InputError(f"--{option} is of a diagnosis of one vehicle; run it without --simulator")
-    common.check_outputs(arguments, "json", "report", also_read=arguments.simulator)
+    common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments, "write_unpaired_report")
     real = _source(arguments, arguments.bags, arguments.params, defaults)
     made = _source(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)

@@ -41,6 +41,10 @@ COMMAND = {
         ("--twin",),
     ),
     "diagnose two": Command("diagnose bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), ("--json", "--apply")),
+    "diagnose against a simulator": Command(
+        f"diagnose bag --simulator {LOOSE} --simulator-params params.yaml",
+        ("bag", "bag/bag.mcap", LOOSE, "params.yaml"), ("--json", "--report"),
+    ),
     "doctor": Command("doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json",)),
     "evaluate": Command(
         "evaluate runs --partial --params params.yaml", ("runs", "runs/T_dvl.npy", "params.yaml"),
@@ -214,7 +218,7 @@ def test_no_output_of_a_command_can_be_one_of_its_inputs_by_any_name(scratch, ca
 
 
 # Options that name what is read; what is not among these is written, and has to be in `COMMAND`
-READ = {"--params", "--urdf", "--gnss", "--attitude", "--motion-of"}
+READ = {"--params", "--urdf", "--gnss", "--attitude", "--motion-of", "--simulator", "--simulator-params"}
 # A trial reads nothing, and goes on in its folder; the demo's bag is its own
 APART = {("diagnose", "--out"), ("diagnose", "--page"), ("demo", "--report")}
 
