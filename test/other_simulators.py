@@ -18,7 +18,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.writer import BagWriter
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.encode import SampleWriter
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 from dvl_calib_ros.simulation.waves import Waves, add_waves
@@ -214,7 +214,8 @@ class BagLog:
         velocity = velocity + self.rng.normal(0.0, self.reference_std, velocity.shape)
         truth = np.eye(3) * self.reference_std**2
         reference = [
-            ReferenceSample(self._stamp(t), tuple(row), truth) for t, row in zip(at, velocity.tolist(), strict=True)
+            ReferenceSample(self._stamp(t), tuple(row), truth, VelocityFrame.ENU)
+            for t, row in zip(at, velocity.tolist(), strict=True)
         ]
         every = slice(None, None, 5)
         attitude = Rotation.from_matrix(self.motion.rotation_enu_from_body[every]).as_quat().tolist()

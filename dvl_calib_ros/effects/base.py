@@ -7,7 +7,7 @@ diagnosis, through one function, `trace`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import ClassVar
@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
+from ..errors import InputError
 
 
 @dataclass(frozen=True)
@@ -205,6 +206,10 @@ class MountingEffect(Effect):
         ) @ motion.rotation_dvl_from_body
 
 
+Disturbance = Callable[[Array, EffectInput], Array]
+"""Samples (N, 3) m/s of one sensor and the motion at their times -> the samples as they come out."""
+
+
 class NoiseEffect(AnyEffect, ABC):
     """An effect on the noise: it changes samples by chance, so it has no trace; the diagnosis has tests of its own."""
 
@@ -213,3 +218,10 @@ class NoiseEffect(AnyEffect, ABC):
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
         """Samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, as they come out with the effect."""
+
+    def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
+        """The same for samples that come one by one, or few at a time, which are then a continuation of those before.
+
+        Raises InputError where that cannot be done.
+        """
+        raise InputError(f"effect {self.name}: cannot be made sample by sample; simulate a recorded motion instead")

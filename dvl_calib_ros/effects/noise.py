@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, EffectInput, Needs, NoiseEffect, ParameterSpec
+from .base import ActsOn, Disturbance, EffectInput, Needs, NoiseEffect, ParameterSpec
 
 _SHARE = "share of the samples, 0 .. 1"
 
@@ -30,6 +31,10 @@ class Outliers(NoiseEffect):
         hit = rng.random(len(velocity)) < values["share"]
         return velocity + hit[:, None] * rng.normal(0.0, values["std_mps"], velocity.shape)
 
+    def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
+        """As likely and as large; other samples are hit than if all came at once."""
+        return lambda velocity, motion: self.disturb(velocity, motion, values, rng)
+
 
 class StaleSamples(NoiseEffect):
     """Now and then the sample before is sent again with a new stamp."""
@@ -43,9 +48,24 @@ class StaleSamples(NoiseEffect):
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
         """Each stale sample is the last fresh one."""
-        stale = rng.random(len(velocity)) < values["share"]
-        stale[:1] = False
-        return velocity[np.maximum.accumulate(np.where(stale, 0, np.arange(len(velocity))))]
+        return self.following(values, rng)(velocity, motion)
+
+    def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
+        """Remembers the last fresh one."""
+        last: Array = np.empty((0, 3))
+
+        def disturbance(velocity: Array, motion: EffectInput) -> Array:
+            nonlocal last
+            stale = rng.random(len(velocity)) < values["share"]
+            known = np.vstack([last, velocity])
+            before = len(last)
+            stale[: 1 - before] = False
+            fresh = np.where(stale, 0, np.arange(before, len(known)))
+            out: Array = known[np.maximum.accumulate(fresh)]
+            last = out[-1:] if len(out) else last
+            return out
+
+        return disturbance
 
 
 class NoiseInflation(NoiseEffect):
@@ -69,6 +89,10 @@ class NoiseInflation(NoiseEffect):
         std = values["std_mps"] + values["per_speed"] * motion.speed + values["per_turn_rate_m"] * turn_rate
         return velocity + std[:, None] * rng.standard_normal(velocity.shape)
 
+    def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
+        """White noise needs no memory."""
+        return lambda velocity, motion: self.disturb(velocity, motion, values, rng)
+
 
 class ColouredReferenceNoise(NoiseEffect):
     """Noise of the reference that stays alike for a while, as of multipath."""
@@ -85,11 +109,22 @@ class ColouredReferenceNoise(NoiseEffect):
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
         """First-order Gauss-Markov noise, exact at any spacing of the samples."""
-        noise = values["std_mps"] * rng.standard_normal(velocity.shape)
+        return self.following(values, rng)(velocity, motion)
+
+    def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
+        """Remembers the last noise and when that was."""
         tau = values["correlation_time_s"]
-        if tau > 0.0:
-            decay = np.exp(-np.diff(motion.time) / tau)
-            fresh = np.sqrt(1.0 - decay**2)
-            for i in range(1, len(noise)):
-                noise[i] = decay[i - 1] * noise[i - 1] + fresh[i - 1] * noise[i]
-        return velocity + noise
+        last: tuple[float, Array] | None = None
+
+        def disturbance(velocity: Array, motion: EffectInput) -> Array:
+            nonlocal last
+            noise = values["std_mps"] * rng.standard_normal(velocity.shape)
+            if tau > 0.0:
+                for i, time in enumerate(motion.time.tolist()):
+                    if last is not None:
+                        decay = math.exp(-(time - last[0]) / tau)
+                        noise[i] = decay * last[1] + math.sqrt(1.0 - decay**2) * noise[i]
+                    last = time, noise[i]
+            return velocity + noise
+
+        return disturbance

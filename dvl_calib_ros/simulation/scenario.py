@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from .. import __version__
 from ..bags.writer import BagWriter, Compression, Storage
@@ -74,30 +76,55 @@ class Run:
 
 
 @dataclass(frozen=True)
-class _World:
-    """What all sensors share: the motion and its length, the same as effects see it, and the effects with seeds."""
+class World:
+    """What all sensors share: the motion, or as much of it as is known; the same as effects see it; how samples of a
+    sensor are disturbed. Made by `world_of`.
+    """
 
     motion: Motion
-    seconds: float
     input: EffectInput
-    seeded: Sequence[tuple[Injection, np.random.SeedSequence]]
+    disturbed: Callable[[Array, EffectInput, ActsOn], Array]
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """Of what is by chance: one for each sensor, for the motion and for each effect."""
+
+    dvl: np.random.SeedSequence
+    gnss: np.random.SeedSequence
+    imu: np.random.SeedSequence
+    motion: np.random.SeedSequence
+    effects: tuple[np.random.SeedSequence, ...]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Seeds:
+        """Every kind of noise has a random stream of its own: what is added leaves that of the others as it was."""
+        dvl, gnss, imu, motion, *effects = np.random.SeedSequence(scenario.seed).spawn(4 + len(scenario.effects))
+        return cls(dvl, gnss, imu, motion, tuple(effects))
 
 
 def simulate(scenario: Scenario) -> Run:
-    """Simulate a run. The same scenario gives the same run; every kind of noise has a random stream of its own.
+    """Simulate a run. The same scenario gives the same run. Raises InputError for a recording without motion."""
+    motion, seconds = motion_of(scenario)
+    seeds = Seeds.of(scenario)
+    seeded = list(zip(scenario.effects, seeds.effects, strict=True))
 
-    So what one option adds leaves the noise of the others as it was. Raises InputError for a recording without motion.
-    """
-    dvl_seed, gnss_seed, imu_seed, motion_seed, *seeds = np.random.SeedSequence(scenario.seed).spawn(
-        4 + len(scenario.effects)
-    )
-    motion, seconds = _motion(scenario, motion_seed)
-    world = _World(motion, seconds, _effect_input(scenario, motion), list(zip(scenario.effects, seeds, strict=True)))
+    def all_at_once(velocity: Array, at: EffectInput, acts_on: ActsOn) -> Array:
+        return disturbed(velocity, seeded, at, acts_on)
+
+    world = world_of(scenario, motion, all_at_once)
+    imu_times = motion.time[:: max(1, round(MOTION_RATE_HZ / scenario.imu_rate))] if scenario.imu_rate else np.zeros(0)
+    gnss_times = _times(seconds, scenario.gnss_rate, GNSS_PHASE_S) if scenario.gnss_rate else np.zeros(0)
     return Run(
-        _simulate_dvl(scenario, world, np.random.default_rng(dvl_seed)),
-        _simulate_gnss(scenario, world, np.random.default_rng(gnss_seed)),
-        _simulate_imu(scenario, motion, np.random.default_rng(imu_seed)),
+        dvl_at(scenario, world, _times(seconds, scenario.dvl_rate, 0.0), np.random.default_rng(seeds.dvl)),
+        gnss_at(scenario, world, gnss_times, np.random.default_rng(seeds.gnss)),
+        imu_at(scenario, world, imu_times, np.random.default_rng(seeds.imu)),
     )
+
+
+def motion_of(scenario: Scenario) -> tuple[Motion, float]:
+    """The motion of a scenario, and its length in s. Raises InputError for a recording without one."""
+    return _motion(scenario, Seeds.of(scenario).motion)
 
 
 def _motion(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Motion, float]:
@@ -114,15 +141,18 @@ def _motion(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Motion, f
     return motion, seconds
 
 
-def _effect_input(scenario: Scenario, motion: Motion) -> EffectInput:
-    return EffectInput(
+def world_of(scenario: Scenario, motion: Motion, disturbed_by: Callable[[Array, EffectInput, ActsOn], Array]) -> World:
+    """The world of sensors over a motion, whose times are since the beginning of the run."""
+    seen = EffectInput(
         motion.time,
         motion.velocity_body,
         rotation_from_rpy(scenario.mounting_rpy).T,
         motion.rotation_enu_from_body,
         motion.angular_velocity,
         scenario.gnss_frame,
+        start=0.0,
     )
+    return World(motion, seen, disturbed_by)
 
 
 def write_bag(
@@ -154,8 +184,8 @@ def truth_document(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _simulate_dvl(scenario: Scenario, world: _World, rng: np.random.Generator) -> list[DvlSample]:
-    at = _times(world.seconds, scenario.dvl_rate, 0.0)
+def dvl_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[DvlSample]:
+    """What the DVL measures at times (N,) s."""
     moved = at_dvl(scenario.effects, world.input)
     velocity = _interpolate(at, moved.time, moved.velocity_body)
     turn = turns(scenario.effects, moved)
@@ -163,22 +193,22 @@ def _simulate_dvl(scenario: Scenario, world: _World, rng: np.random.Generator) -
     measured = measure_dvl(velocity, scenario.errors, moved.rotation_dvl_from_body, rng, turn)
     added = traces(scenario.effects, moved, ActsOn.DVL) @ moved.rotation_dvl_from_body.T
     measured = measured + _interpolate(at, moved.time, added)
-    measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.DVL)
+    measured = world.disturbed(measured, _input_at(world, at), ActsOn.DVL)
     covariance = axis_covariance(scenario.errors.beam_std) if scenario.errors.beam_std else None
     stamped = at + late(scenario.effects, ActsOn.DVL_CLOCK, at)
     return [DvlSample(stamp, (x, y, z), covariance) for stamp, (x, y, z) in _stamped(stamped, measured)]
 
 
-def _simulate_gnss(scenario: Scenario, world: _World, rng: np.random.Generator) -> list[ReferenceSample]:
-    if not scenario.gnss_rate:
+def gnss_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[ReferenceSample]:
+    """What the receiver measures at times (N,) s, outages left out."""
+    if not len(at):
         return []
-    at = _times(world.seconds, scenario.gnss_rate, GNSS_PHASE_S)
     motion = world.motion
     velocity = motion.velocity_body - traces(scenario.effects, world.input, ActsOn.REFERENCE)
     if scenario.gnss_frame is VelocityFrame.ENU:
         velocity = np.einsum("nij,nj->ni", motion.rotation_enu_from_body, velocity)
     measured = measure_gnss(_interpolate(at, motion.time, velocity), scenario.gnss_std, rng)
-    measured = disturbed(measured, world.seeded, _input_at(world, at), ActsOn.REFERENCE)
+    measured = world.disturbed(measured, _input_at(world, at), ActsOn.REFERENCE)
     covariance = np.eye(3) * scenario.gnss_std**2 if scenario.gnss_std else None
     stamped = at + late(scenario.effects, ActsOn.REFERENCE_CLOCK, at)
     return [
@@ -188,13 +218,16 @@ def _simulate_gnss(scenario: Scenario, world: _World, rng: np.random.Generator) 
     ]
 
 
-def _simulate_imu(scenario: Scenario, motion: Motion, rng: np.random.Generator) -> list[ImuSample]:
-    if not scenario.imu_rate:
+def imu_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[ImuSample]:
+    """What the IMU measures at times (N,) s."""
+    if not len(at):
         return []
-    every = max(1, round(MOTION_RATE_HZ / scenario.imu_rate))
-    at, attitudes, rates = (
-        each[::every] for each in (motion.time, motion.rotation_enu_from_body, motion.angular_velocity)
-    )
+    motion = world.motion
+    nearest = _nearest(motion.time, at)
+    attitudes, rates = motion.rotation_enu_from_body[nearest], motion.angular_velocity[nearest]
+    if not np.allclose(motion.time[nearest], at, rtol=0.0, atol=1e-9):
+        attitudes = Slerp(motion.time, Rotation.from_matrix(motion.rotation_enu_from_body))(at).as_matrix()
+        rates = _interpolate(at, motion.time, motion.angular_velocity)
     if scenario.imu_errors != ImuErrors():
         attitudes, rates = measure_imu(attitudes, rates, scenario.imu_errors, rng)
     stamped = at + late(scenario.effects, ActsOn.ATTITUDE_CLOCK, at)
@@ -204,10 +237,10 @@ def _simulate_imu(scenario: Scenario, motion: Motion, rng: np.random.Generator) 
     ]
 
 
-def _input_at(world: _World, at: Array) -> EffectInput:
+def _input_at(world: World, at: Array) -> EffectInput:
     """The motion at a sensor's times, to the nearest sample: what effects on the noise go by."""
-    nearest = np.clip(np.rint(at * MOTION_RATE_HZ).astype(int), 0, len(world.motion.time) - 1)
     motion = world.motion
+    nearest = _nearest(motion.time, at)
     return replace(
         world.input,
         time=at,
@@ -215,6 +248,14 @@ def _input_at(world: _World, at: Array) -> EffectInput:
         rotation_enu_from_body=motion.rotation_enu_from_body[nearest],
         angular_velocity=motion.angular_velocity[nearest],
     )
+
+
+def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
+    """(N,) index of the time that is nearest to each of `at` (N,), the earlier of two."""
+    after = np.clip(np.searchsorted(time, at), 1, max(len(time) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(time) - 1)
+    return np.where(np.abs(time[after] - at) < np.abs(at - time[before]), after, before)
 
 
 def _times(seconds: float, rate: float, phase: float) -> Array:
