@@ -37,7 +37,7 @@ def _parameter_completions(**_: Any) -> list[str]:
     return choices + [f"{name}:=" for name, spec in SCHEMA.items() if not spec.choices]
 
 
-def add_topic_options(parser: argparse.ArgumentParser) -> None:
+def add_topic_options(parser: argparse._ActionsContainer) -> None:
     """--dvl-topic, --gnss-topic, --imu-topic, of the node."""
     for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
         parser.add_argument(f"--{role}-topic", default=default, metavar="TOPIC", help=f"default: {default}")

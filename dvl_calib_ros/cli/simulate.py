@@ -1,11 +1,18 @@
-"""Write a bag from a motion, an error model and any effects. The same options and seed give the same bag."""
+"""Write a bag from a motion, an error model and any effects. The same options and seed give the same bag.
+
+With --live, publish the same on ROS 2 instead, or what the sensors measure on a vehicle whose odometry is followed.
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from . import common
+from . import common, simulate_live
+
+if TYPE_CHECKING:
+    from ..simulation.scenario import Scenario
 
 NAME = "simulate"
 HELP = "write a bag from a motion, an error model and any effects"
@@ -18,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..simulation.injection import FORM
     from ..simulation.trajectories import TRAJECTORIES
 
-    parser.add_argument("output", type=Path, metavar="BAG", help="folder to write; must not exist")
+    parser.add_argument("output", nargs="?", type=Path, metavar="BAG", help="folder to write; must not exist")
     motion = parser.add_mutually_exclusive_group()
     motion.add_argument("--trajectory", choices=TRAJECTORIES, default="box", help="default: %(default)s")
     motion.add_argument(
@@ -46,6 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--effect", action="append", default=[], metavar=FORM,
         help="add an effect, such as lever_arm:x_m=0.3; repeatable (dvl-calib parameters --effects lists them)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--diagnosis", type=Path, metavar="FILE",
+        help="the DVL that was found (diagnose --json, or a result file): mounting, scale, noise, rate and effects",
     )  # fmt: skip
     parser.add_argument(
         "--truth", action="store_true", help="attach all that was simulated to the bag, as truth.json (MCAP only)"
@@ -81,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--gyro-bias", nargs=3, type=float, default=none, metavar=("X", "Y", "Z"), help="IMU, degrees per second"
     )
     common.add_storage_options(parser)
+    simulate_live.add_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -96,6 +108,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulation.waves import Waves
 
     _check(arguments)
+    defaults = _defaults()
+    simulate_live.check(arguments, defaults)
     common.check_outputs(arguments, folders=["output"])
     roll, pitch, yaw = map(math.radians, arguments.misalignment)
     scale = [0.01 * s for s in arguments.scale] * (3 if len(arguments.scale) == 1 else 1)
@@ -125,9 +139,40 @@ def run(arguments: argparse.Namespace) -> None:
         waves=Waves(*arguments.waves) if arguments.waves else None,
         effects=tuple(injection(text) for text in arguments.effect),
     )
+    if arguments.diagnosis is not None:
+        scenario = _with_diagnosis(arguments, defaults, scenario)
+    if arguments.live:
+        simulate_live.run(arguments, scenario)
+        return
     storage, compression = Storage(arguments.storage), Compression(arguments.compression)
     write_bag(scenario, arguments.output, storage, compression, with_truth=arguments.truth)
     print(f"wrote {arguments.output}")
+
+
+# Options that say of the DVL what a diagnosis says
+OF_THE_DVL = ("misalignment", "scale", "mounting_rpy", "beam_std", "beam_bias", "dvl_rate")
+
+
+def _defaults() -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    return parser.parse_args([])
+
+
+def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
+    from ..errors import InputError
+    from ..export.description import load_description
+    from ..simulation.diagnosed import with_dvl
+
+    for name in OF_THE_DVL:
+        if getattr(arguments, name) != getattr(defaults, name):
+            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} says it; leave one of the two out")
+    scenario, left_out = with_dvl(scenario, load_description(arguments.diagnosis))
+    if left_out:
+        common.print_warnings(
+            [f"{arguments.diagnosis}: not simulated, as its size is not known: {', '.join(left_out)}"]
+        )
+    return scenario
 
 
 # Option -> smallest and largest value

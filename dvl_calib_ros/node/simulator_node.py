@@ -1,0 +1,214 @@
+"""Our simulator as a node: publishes DVL, GNSS and IMU of a simulated run, or of a motion that it follows.
+
+Publishing follows the stamps: in a run, a sample goes out when its stamp's time has come; following an odometry topic,
+when the odometry has reached the stamp and is one message past the time of measurement (`simulation.live`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Imu
+
+from ..calibration.frames import rotation_from_quaternion
+from ..calibration.samples import DvlSample, ReferenceSample
+from ..calibration.screening import unit_quaternion
+from ..errors import InputError
+from ..messages.decode import stamp_ns
+from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
+from ..messages.encode import FRAME_IDS
+from ..simulation.live import Follower, MotionSample, Sample, in_order, shifted
+from ..simulation.scenario import START_NS, Scenario, simulate
+from .dvl_message import fill
+from .ending import Ending
+from .message_types import message_class
+
+NODE_NAME = "dvl_simulator"
+# Messages that may wait for a slow subscriber, or in the queue of the odometry
+QUEUE = 1000
+PATIENCE = Duration(seconds=10)
+# How long a wait for a subscriber, or for the next stamp, goes on without looking whether to end, s
+BREATH_S = 0.05
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Topics, and the type of the DVL's messages (a name of `messages.drivers`). Raises InputError for another."""
+
+    dvl: str = "dvl/twist"
+    gnss: str = "gnss/twist"
+    imu: str = "imu/data"
+    dvl_type: str = field(default=TWIST_TYPE)
+
+    def __post_init__(self) -> None:
+        if self.dvl_type not in TYPES_OF["dvl_type"]:
+            raise InputError(f"--dvl-type {self.dvl_type}: none of {', '.join(TYPES_OF['dvl_type'])}")
+
+
+class SimulatorNode(Node):  # type: ignore[misc]
+    """Publishers of the three sensors. depth: messages that may wait for a subscriber. Raises InputError."""
+
+    def __init__(self, outputs: Outputs, depth: int = QUEUE) -> None:
+        kind = message_class("--dvl-type", outputs.dvl_type)
+        super().__init__(NODE_NAME)
+        self._dvl_class, self._dvl_type = kind, VELOCITY_TYPES[outputs.dvl_type]
+        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+        self._dvl = self.create_publisher(kind, outputs.dvl, profile)
+        self._gnss = self.create_publisher(TwistWithCovarianceStamped, outputs.gnss, profile)
+        self._imu = self.create_publisher(Imu, outputs.imu, profile)
+        self.sent = 0
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether every topic has a subscriber."""
+        return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu))
+
+    def publish(self, samples: Sequence[Sample]) -> None:
+        """Publish samples, in order."""
+        for sample in samples:
+            if isinstance(sample, DvlSample):
+                self._dvl.publish(fill(self._dvl_class(), self._dvl_type, sample))
+            elif isinstance(sample, ReferenceSample):
+                self._gnss.publish(_reference(sample))
+            else:
+                self._imu.publish(_imu(sample))
+            self.sent += 1
+
+    def finish(self) -> None:
+        """Wait until subscribers have what was published."""
+        for each in (self._dvl, self._gnss, self._imu):
+            each.wait_for_all_acked(PATIENCE)
+
+    def follow(self, topic: str, scenario: Scenario) -> None:
+        """Publish what the sensors measure on the motion of an odometry topic. Raises InputError."""
+        self._scenario = scenario
+        Follower(scenario)  # raises what is wrong with the scenario
+        self._follower: Follower | None = None
+        self._start_ns, self._last_ns = 0, 0
+        self._subscribe(topic, ReliabilityPolicy.RELIABLE)
+
+    def _subscribe(self, topic: str, reliability: ReliabilityPolicy) -> None:
+        """Reliable, which loses nothing; made anew when a publisher turns up that is best effort, to hear that."""
+
+        def on_incompatible(event: Any) -> None:
+            if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
+                assert self.executor is not None  # it runs this callback
+                self.executor.create_task(resubscribe)
+
+        def resubscribe() -> None:
+            self.destroy_subscription(subscription)
+            self._subscribe(topic, ReliabilityPolicy.BEST_EFFORT)
+
+        profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
+        events = SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False)
+        subscription = self.create_subscription(Odometry, topic, self._on_odometry, profile, event_callbacks=events)
+
+    def _on_odometry(self, message: Any) -> None:
+        now_ns = stamp_ns(message.header.stamp)
+        orientation = message.pose.pose.orientation
+        q = unit_quaternion((orientation.x, orientation.y, orientation.z, orientation.w))
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        velocity, rates = np.array([linear.x, linear.y, linear.z]), np.array([angular.x, angular.y, angular.z])
+        if q is None or not np.isfinite(velocity).all() or not np.isfinite(rates).all():
+            self.get_logger().warning("odometry without attitude, velocity or turn rates is left out", once=True)
+            return
+        if self._follower is None or now_ns < self._last_ns:
+            if self._follower is not None:
+                self.get_logger().info("odometry went back in time; beginning anew")
+            self._follower, self._start_ns = Follower(self._scenario, now_ns), now_ns
+        elif now_ns == self._last_ns:
+            return
+        self._last_ns = now_ns
+        sample = MotionSample(1e-9 * (now_ns - self._start_ns), velocity, rotation_from_quaternion(q), rates)
+        self.publish(self._follower.add(sample))
+
+
+def run_until(
+    ending: Ending, scenario: Scenario, outputs: Outputs, ros_args: Sequence[str], follow: str | None, speed: float,
+    wait: bool,
+) -> int:  # fmt: skip
+    """Run until the run is over, or it is told to end. Returns how many messages were sent. Raises InputError.
+
+    follow: odometry topic, None for a run of the scenario's own motion, that many times as fast as real time. wait:
+    begin when every topic has a subscriber.
+    """
+    run = None if follow else simulate(scenario)
+    samples: list[Sample] = [] if run is None else in_order(run)
+    try:
+        rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rclpy raises types of its own for bad --ros-args
+        raise InputError(" ".join(str(error).split())) from error
+    node = None
+    try:
+        node = SimulatorNode(outputs, max(QUEUE, len(samples)))
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        ending.tell(lambda: executor.create_task(lambda: None))
+        while wait and not node.is_heard and not ending.requested:
+            executor.spin_once(timeout_sec=BREATH_S)
+        if follow:
+            node.follow(follow, scenario)
+            while not ending.requested:
+                executor.spin_once()
+        else:
+            _play(node, executor, ending, samples, speed)
+        return node.sent
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _play(
+    node: SimulatorNode, executor: SingleThreadedExecutor, ending: Ending, samples: list[Sample], speed: float
+) -> None:
+    """Publish samples at their stamps, which begin now, that many times as fast."""
+    start_ns = node.get_clock().now().nanoseconds
+    began = time.monotonic()
+    for sample in shifted(samples, start_ns - START_NS):
+        due = began + 1e-9 * (sample.stamp_ns - start_ns) / speed
+        while (left := due - time.monotonic()) > 0.0 and not ending.requested:
+            executor.spin_once(timeout_sec=min(left, BREATH_S))
+        if ending.requested:
+            return
+        node.publish([sample])
+    node.finish()
+
+
+def _header(message: Any, sample: Sample, frame_id: str) -> Any:
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(sample.stamp_ns, 1_000_000_000)
+    message.header.frame_id = frame_id
+    return message
+
+
+def _reference(sample: ReferenceSample) -> Any:
+    message = _header(TwistWithCovarianceStamped(), sample, FRAME_IDS[sample.frame])
+    linear = message.twist.twist.linear
+    linear.x, linear.y, linear.z = sample.velocity
+    if sample.covariance is not None:
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = sample.covariance
+        message.twist.covariance = covariance.ravel()
+    return message
+
+
+def _imu(sample: Any) -> Any:
+    message = _header(Imu(), sample, "base_link")
+    q, w = message.orientation, message.angular_velocity
+    q.x, q.y, q.z, q.w = sample.orientation
+    w.x, w.y, w.z = sample.angular_velocity
+    message.linear_acceleration_covariance[0] = -1.0
+    return message

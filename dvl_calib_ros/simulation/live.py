@@ -1,0 +1,147 @@
+"""A simulation that follows a motion as it comes, sample by sample: the composed model of `scenario` on a short window.
+
+A sample is computed when the motion is known up to one sample after the time at which it is measured (slopes, as a
+lag needs them, are taken across), and handed out when the motion has reached its stamp: a late stamp is what a driver
+gives that stamps on arrival. Nothing depends on a clock, so the same motion gives the same samples.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..effects.base import ActsOn, EffectInput, NoiseEffect
+from ..effects.composition import Injection
+from .scenario import GNSS_PHASE_S, START_NS, Run, Scenario, Seeds, dvl_at, gnss_at, imu_at, world_of
+from .trajectories import Motion
+
+Sample = DvlSample | ReferenceSample | ImuSample
+# Across longer gaps nothing is known of the motion, and nothing is measured
+MAX_GAP_S = 1.0
+# A filter has forgotten what was so many time constants before, to 1e-13
+REMEMBERED_CONSTANTS = 30.0
+
+
+@dataclass(frozen=True)
+class MotionSample:
+    """The vehicle at one time. time: s since the beginning. velocity_body: (3,) m/s over ground of the reference point.
+    rotation_enu_from_body: (3, 3). angular_velocity: (3,) rad/s, body frame, forward-left-up.
+    """
+
+    time: float
+    velocity_body: Array
+    rotation_enu_from_body: Array
+    angular_velocity: Array
+
+
+class Follower:
+    """The sensors of a scenario on a motion that is handed on; stamps are `start_ns` and the time of the motion.
+
+    Equal to `simulate` of the same motion, but for what is drawn for outliers and for the IMU's noise. Raises
+    InputError for an effect of the noise that cannot be made sample by sample.
+    """
+
+    def __init__(self, scenario: Scenario, start_ns: int = START_NS) -> None:
+        self._scenario = scenario
+        self._late_ns = start_ns - START_NS
+        seeds = Seeds.of(scenario)
+        self._disturbances = [
+            (each.effect, each.effect.following(each.values, np.random.default_rng(seed)))
+            for each, seed in zip(scenario.effects, seeds.effects, strict=True)
+            if isinstance(each.effect, NoiseEffect)
+        ]
+        makers: tuple[Callable[..., Any], ...] = (dvl_at, gnss_at, imu_at)
+        rates = (scenario.dvl_rate, scenario.gnss_rate, scenario.imu_rate)
+        self._sensors = [
+            _Sensor(make, 0.0 if make is not gnss_at else GNSS_PHASE_S, rate, np.random.default_rng(seed))
+            for make, rate, seed in zip(makers, rates, (seeds.dvl, seeds.gnss, seeds.imu), strict=True)
+            if rate
+        ]
+        self._memory_s = REMEMBERED_CONSTANTS * _longest_time_constant(scenario.effects)
+        self._window: deque[MotionSample] = deque()
+        self._pending: list[tuple[int, int, Sample]] = []
+        self._number = itertools.count()
+
+    def add(self, sample: MotionSample) -> list[Sample]:
+        """Samples, in order of stamps, that the motion up to this one brings. Times must increase (ValueError)."""
+        window = self._window
+        if window and sample.time <= window[-1].time:
+            raise ValueError(f"time {sample.time} does not come after {window[-1].time}")
+        window.append(sample)
+        if len(window) > 2 or (len(window) == 2 and self._pending_from_the_start()):
+            self._measure(window[-3].time if len(window) > 2 else -np.inf, window[-2].time)
+        while len(window) > 3 and window[1].time < sample.time - self._memory_s:
+            window.popleft()
+        reached = START_NS + round(1e9 * sample.time)
+        out = []
+        while self._pending and self._pending[0][0] <= reached:
+            ready = heapq.heappop(self._pending)[2]
+            out.append(ready._replace(stamp_ns=ready.stamp_ns + self._late_ns))
+        return out
+
+    def _pending_from_the_start(self) -> bool:
+        return all(sensor.taken == 0 for sensor in self._sensors)
+
+    def _measure(self, after: float, until: float) -> None:
+        """Samples of what is measured in (after, until]."""
+        is_gap = np.isfinite(after) and until - after > MAX_GAP_S
+        due = [(sensor, sensor.times(until)) for sensor in self._sensors]
+        if is_gap or not any(len(at) for _, at in due):
+            return
+        window = list(self._window)
+        motion = Motion(
+            np.array([each.time for each in window]),
+            np.array([each.velocity_body for each in window]),
+            np.array([each.rotation_enu_from_body for each in window]),
+            np.array([each.angular_velocity for each in window]),
+        )
+        world = world_of(self._scenario, motion, self._disturbed)
+        for sensor, at in due:
+            at = at[at > after]
+            for made in sensor.make(self._scenario, world, at, sensor.rng) if len(at) else ():
+                heapq.heappush(self._pending, (made.stamp_ns, next(self._number), made))
+
+    def _disturbed(self, velocity: Array, motion: EffectInput, acts_on: ActsOn) -> Array:
+        for effect, disturbance in self._disturbances:
+            if effect.acts_on is acts_on:
+                velocity = disturbance(velocity, motion)
+        return velocity
+
+
+class _Sensor:
+    """One that measures at phase, phase + 1 / rate, ... s. make: of `scenario`. taken: how many have been."""
+
+    def __init__(self, make: Callable[..., Any], phase: float, rate: float, rng: np.random.Generator) -> None:
+        self.make, self.rng, self.taken = make, rng, 0
+        self._phase, self._step = phase, (phase + 1.0 / rate) - phase  # as numpy.arange counts
+
+    def times(self, until: float) -> Array:
+        """The times (N,) s up to one that have not been taken yet."""
+        at = []
+        while (time := self._phase + self.taken * self._step) <= until:
+            at.append(time)
+            self.taken += 1
+        return np.array(at)
+
+
+def _longest_time_constant(effects: tuple[Injection, ...]) -> float:
+    return max((each.values.get("time_constant_s", 0.0) for each in effects), default=0.0)
+
+
+def in_order(run: Run) -> list[Sample]:
+    """All samples of a run, in order of stamps."""
+    return sorted([*run.imu, *run.gnss, *run.dvl], key=attrgetter("stamp_ns"))
+
+
+def shifted(samples: list[Sample], late_ns: int) -> list[Sample]:
+    """The same samples, stamped so much later."""
+    return [sample._replace(stamp_ns=sample.stamp_ns + late_ns) for sample in samples]
