@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvl_calib_ros.calibration.bank import Assembler
+from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.frames import Array
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.parameters import Parameters

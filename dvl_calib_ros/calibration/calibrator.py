@@ -1,6 +1,6 @@
 """The calibration of one DVL: feed it samples, read estimates.
 
-    samples ─► Aligner: rows of DVL samples with what the other streams say ─► ModelBank ─► estimates
+    samples ─► Aligner: rows of DVL samples with what the other streams say ─► groups of models ─► estimates
                                         └─► Selection: is there GNSS, which model is the one
 
 The node, the replay and the evaluation all use this class. The node feeds it sample by sample, recordings come as
@@ -10,19 +10,21 @@ columns; that, and block_size, change nothing but the speed.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from .alignment import Aligner
-from .bank import ModelBank, ModelCounts, gate_of, nis_bounds, prior
+from .assembly import gate_of, nis_bounds, prior
+from .bank import Group, ModelCounts, groups_of
 from .delay.filter import DelayFilter
 from .delay.hold_out import Recording, Terms
-from .folds import Moments, folds_of
 from .frames import Array, Vector
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
 from .models import LINEAR_MODELS, MODELS, Model, Needs
 from .observability import convergence, observability
+from .observations import Observations
 from .observe import Observer
 from .parameters import ParameterError, Parameters
 from .results import Estimate, Result
@@ -38,6 +40,19 @@ _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.ATTITUDE: lambda block: block.oriented,
     Needs.REFERENCE: lambda block: block.paired,
 }
+
+
+class _Seen(NamedTuple):
+    """Rows first .. decided - 1 as models with some needs see them: those that have these, with their numbers.
+
+    observations: None where no row has them.
+    """
+
+    first: int
+    decided: int
+    block: AlignedBlock
+    numbers: Numbers
+    observations: Observations | None
 
 
 class Calibrator:
@@ -88,7 +103,8 @@ class Calibrator:
     def _start(self) -> None:
         self.selection = Selection()
         self._n_selected = 0  # rows that the selection knows of
-        self._bank = ModelBank(LINEAR_MODELS, self.parameters, self._initial, self._verified)
+        self._groups = groups_of(LINEAR_MODELS, self.parameters, self._initial, self._verified)
+        self._group_of = {name: group for group in self._groups for name in group.index}
         extended = MODELS["G2"]
         unknown = prior(extended, self.parameters)
         self._delay = DelayFilter(
@@ -100,11 +116,9 @@ class Calibrator:
             self._on_block,
             self._verified,
         )
-        self._moments = Moments()
-        # by need, the number of the first row that the models have not had
-        self._n_seen = dict.fromkeys(Needs, 0)
+        self._seen: dict[Needs, _Seen] = {}
         if self._trace is not None:
-            self._trace.clear()
+            self._trace.start(self._groups)
 
     def _restart(self, back_s: float) -> None:
         self.restarts += 1
@@ -152,9 +166,9 @@ class Calibrator:
             at = slice(self._n_selected - rows.base, aligner.n_paired - rows.base)
             self.selection.update(rows.stamps_ns[at], rows.pairing[at] == Pairing.PAIRED, self.parameters)
             self._n_selected = aligner.n_paired
-        for needs in Needs:
-            if aligner.given[needs] - self._bank.n_given(needs) >= self._block_size:
-                self._update(needs)
+        for group in self._groups:
+            if aligner.given[group.needs] - group.n_given >= self._block_size:
+                self._update(group)
 
     def _on_block(self, from_ns: int) -> None:
         """Let the selection, and the trace, know what G2 says after another block."""
@@ -164,40 +178,50 @@ class Calibrator:
 
     # ------------------------------------------------------------------ models
 
-    def _update(self, needs: Needs) -> None:
-        """Give the models with these needs the rows that are decided and that they have not had."""
-        aligner = self._aligner
-        decided = {
-            Needs.NOTHING: aligner.n_judged, Needs.ATTITUDE: aligner.n_oriented, Needs.REFERENCE: aligner.n_paired,
-        }[needs]  # fmt: skip
-        first = self._n_seen[needs]
+    def _update(self, group: Group) -> None:
+        """Give a group's models the rows that are decided and that they have not had."""
+        decided = self._decided(group.needs)
+        first, group.next_row = group.next_row, decided
         if decided == first:
             return
-        block = aligner.rows.block(first, decided)
-        has = _HAS[needs](block)
-        numbers = np.arange(first, decided)
+        seen = self._observed(group.needs, first, decided)
         wanted = None if self._trace is None else self._trace.wanted(first, decided)
-        if not has.all():
-            block, numbers = block.part(has), numbers[has]
-        ends = None if wanted is None or not len(wanted) else np.searchsorted(numbers, wanted, side="right")
+        ends = None if wanted is None or not len(wanted) else np.searchsorted(seen.numbers, wanted, side="right")
         after = None
-        if len(block):
-            seen = self._observer.observe(block, needs, aligner.prior.sway_heave)
-            share = block.share(needs is Needs.REFERENCE)
-            after = self._bank.update(needs, block.stamps_ns, seen, share, block.prior_known, ends)
-            if self._verified and needs is Needs.REFERENCE:
-                self._moments.add(folds_of(block.stamps_ns, self.parameters), seen)
+        if seen.observations is not None:
+            block = seen.block
+            share = block.share(group.needs is Needs.REFERENCE)
+            after = group.update(block.stamps_ns, seen.observations, share, block.prior_known, ends)
         elif ends is not None:
-            after = self._bank.standing(needs, len(ends))
+            after = group.standing(len(ends))
         if self._trace is not None and wanted is not None and after is not None:
-            self._trace.add(wanted, needs, after)
-        self._n_seen[needs] = decided
+            self._trace.add(wanted, group, after)
         self._forget_rows()
+
+    def _decided(self, needs: Needs) -> int:
+        """Number of the first row that is not decided for models with these needs."""
+        aligner = self._aligner
+        return {
+            Needs.NOTHING: aligner.n_judged, Needs.ATTITUDE: aligner.n_oriented, Needs.REFERENCE: aligner.n_paired,
+        }[needs]  # fmt: skip
+
+    def _observed(self, needs: Needs, first: int, decided: int) -> _Seen:
+        """Rows first .. decided - 1 as models with these needs see them; several groups ask for the same."""
+        seen = self._seen.get(needs)
+        if seen is None or (seen.first, seen.decided) != (first, decided):
+            block = self._aligner.rows.block(first, decided)
+            has = _HAS[needs](block)
+            numbers = np.arange(first, decided)
+            if not has.all():
+                block, numbers = block.part(has), numbers[has]
+            found = self._observer.observe(block, needs, self._aligner.prior.sway_heave) if len(block) else None
+            seen = self._seen[needs] = _Seen(first, decided, block, numbers, found)
+        return seen
 
     def _forget_rows(self) -> None:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
-        done = min(self._n_selected, self._delay.n_taken, *self._n_seen.values())
+        done = min(self._n_selected, self._delay.n_taken, *(group.next_row for group in self._groups))
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
                 self._on_rows(_own(rows.block(rows.begin + rows.base, done)))
@@ -205,8 +229,8 @@ class Calibrator:
 
     def finish(self) -> None:
         """Update all models with what is decided, and tell on_rows of the rest, which may still wait for partners."""
-        for needs in Needs:
-            self._update(needs)
+        for group in self._groups:
+            self._update(group)
         rows = self._aligner.rows
         if self._on_rows is not None and rows.size > rows.begin:
             self._on_rows(_own(rows.block(rows.begin + rows.base, rows.end)))
@@ -249,7 +273,7 @@ class Calibrator:
         pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
         counts["calibration"] = {"restarts": self.restarts}
         for name, model in MODELS.items():
-            tally = self._bank.counts(name) if model.extends is None else self._delay.counts
+            tally = self._group_of[name].counts(name) if model.extends is None else self._delay.counts
             if restarted := tally.restarted:
                 counts["calibration"][f"{name} restarted"] = restarted
         return counts
@@ -303,8 +327,9 @@ class Calibrator:
         model = MODELS[name]
         if model.extends is not None:
             return self._delay.state(self.state(model.extends))
-        self._update(model.needs)
-        return self._bank.state(name)
+        group = self._group_of[name]
+        self._update(group)
+        return group.state(name)
 
     def _source(self, model: Model) -> str | None:
         """The linear model whose estimate a model's is; None for a model of its own that claims more."""
@@ -321,15 +346,16 @@ class Calibrator:
         """
         model = MODELS[name]
         base = model.extends or name
-        standing = trace.standing(model.needs, numbers)
-        state, (used, nis_sum) = self._bank.states_at(base, standing), self._bank.counts_at(base, standing)
+        group = self._group_of[base]
+        standing = trace.standing(group, numbers)
+        state, (used, nis_sum) = group.states_at(base, standing), group.counts_at(base, standing)
         if model.extends is None:
             return state, used, nis_sum
         return self._delay.remembered(stamps_ns, state, used, nis_sum)
 
     def _counts(self, model: Model) -> ModelCounts:
         source = self._source(model)
-        return self._delay.counts if source is None else self._bank.counts(source)
+        return self._delay.counts if source is None else self._group_of[source].counts(source)
 
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
@@ -352,15 +378,16 @@ class Calibrator:
         """The verdict on one model's calibration, by hold-out; for a calibrator made with ``verified``."""
         estimate = self.estimate(name)
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
-        self._update(Needs.REFERENCE)
+        judge = next(group for group in self._groups if group.needs is Needs.REFERENCE)
+        self._update(judge)
         source = self._source(model)
         if source is None:
             held_out = self._delay.held_out_error()
         else:
             held_out = held_out_error(
                 MODELS[source],
-                self._bank.states_without_folds(source),
-                self._moments,
+                self._group_of[source].states_without_folds(source),
+                judge.moments,
                 self.parameters.rotation_dvl_from_body,
             )
         counts = (estimate.used, estimate.gated)

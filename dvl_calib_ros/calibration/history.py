@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .frames import Array
-from .models import Needs
 
 Numbers = NDArray[np.int64]
 
@@ -46,20 +45,20 @@ class StateTrace:
     def __init__(self, limit: int, expected: int = 0) -> None:
         self._limit = limit
         self._expected = expected
-        self.clear()
+        self.start(())
 
-    def clear(self) -> None:
-        """Start anew."""
+    def start(self, groups: Iterable[Hashable]) -> None:
+        """Start anew, with these groups of models."""
         self._stride = max(1, -(-self._expected // self._limit))
-        self._kept: dict[Needs, dict[int, Standing]] = {needs: {} for needs in Needs}
+        self._kept: dict[Hashable, dict[int, Standing]] = {group: {} for group in groups}
 
     def wanted(self, first: int, end: int) -> Numbers:
         """Those of the rows first .. end - 1 after which states are wanted."""
         return np.arange(-(-first // self._stride) * self._stride, end, self._stride)
 
-    def add(self, numbers: Numbers, needs: Needs, after: Standing) -> None:
-        """Take the states of the models with these needs after rows (E)."""
-        kept = self._kept[needs]
+    def add(self, numbers: Numbers, group: Hashable, after: Standing) -> None:
+        """Take the states of a group's models after rows (E)."""
+        kept = self._kept[group]
         for index, number in enumerate(numbers.tolist()):
             kept[number] = after.row(index)
         while max(map(len, self._kept.values())) > self._limit:
@@ -73,6 +72,6 @@ class StateTrace:
         common = set.intersection(*(set(each) for each in self._kept.values()))
         return np.array(sorted(number for number in common if number % self._stride == 0), dtype=np.int64)
 
-    def standing(self, needs: Needs, numbers: Numbers) -> Standing:
-        """The states after these rows."""
-        return Standing.joined([self._kept[needs][number] for number in numbers.tolist()])
+    def standing(self, group: Hashable, numbers: Numbers) -> Standing:
+        """The states of a group's models after these rows."""
+        return Standing.joined([self._kept[group][number] for number in numbers.tolist()])

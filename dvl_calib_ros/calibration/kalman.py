@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from .frames import Array
 
@@ -101,46 +102,65 @@ def recursion(
     """Filter N samples one after the other.
 
     x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q that the state gains before each sample, or None.
-    ends: (E,) ascending numbers of samples (0..N) after which the state is wanted, too.
+    ends: (E,) ascending numbers of samples (0..N) after which the state is wanted, too. Raises LinAlgError where S is
+    not positive definite.
     """
-    k, n_samples = data.z.shape[:2]
-    x, p = x.copy(), p.copy()
-    identity = np.eye(x.shape[1])
-    one_r, one_gate = data.r.shape[1] == 1, data.gate.shape[1] == 1
-    used = np.zeros((k, n_samples), dtype=bool)
-    nis = np.zeros((k, n_samples))
-    weighted = bool((data.weight != 1.0).any())
-    on_the_way = [(x.copy(), p)]
+    # each model by itself: live there is one, and products of single matrices cost a third of those of stacks
+    return Updated.joined(
+        [
+            _recursion_of_one(x[k], p[k], data.model(k), None if process is None else process[:, k], ends)
+            for k in range(len(x))
+        ]
+    )
+
+
+def _recursion_of_one(
+    x: Array, p: Array, data: Measurements, process: Array | None, ends: NDArray[np.intp] | None
+) -> Updated:
+    """`recursion` of one model: x (n,), P (n, n), data with K = 1, Q (N, n, n)."""
+    n_samples, n = data.z.shape[1], len(x)
+    identity = np.eye(n)
+    z, h_all = data.z[0], data.h[0]
+    r = data.r[0] if data.r.shape[1] == n_samples else [data.r[0, 0]] * n_samples
+    gate = data.gate[0].tolist() * (1 if data.gate.shape[1] == n_samples else n_samples)
+    usable, weight = data.usable[0].tolist(), data.weight[0].tolist()
+    used, nis = [], []
+    on_the_way = [(x, p)]
     for i in range(n_samples):
         if process is not None:
-            p += process[i]
-        h, r_i, weight = data.h[:, i], data.r[:, 0 if one_r else i], data.weight[:, i]
-        pht = p @ h.transpose(0, 2, 1)
+            p = p + process[i]
+        h, r_i = h_all[i], r[i]
+        pht = p @ h.T
         hpht = h @ pht
-        innovation = data.z[:, i, :, None] - h @ x[:, :, None]
-        if weighted:  # the gate asks whether this sample fits; the update, how much it may weigh
-            shared_r = r_i / weight[:, None, None]
-            for_gate, s_inverse = np.linalg.inv(hpht + np.stack(np.broadcast_arrays(r_i, shared_r)))
-            r_i = shared_r
-        else:
-            for_gate = s_inverse = np.linalg.inv(hpht + r_i)
-        nis_i = (innovation.transpose(0, 2, 1) @ for_gate @ innovation)[:, 0, 0]
-        used_i = data.usable[:, i] & (nis_i <= data.gate[:, 0 if one_gate else i])
-        gain = (pht @ s_inverse) * used_i[:, None, None]  # a gain of zero leaves x and P exactly as they are
-        x += (gain @ innovation)[:, :, 0]
-        # Joseph form: a sum of two positive semidefinite terms, so rounding cannot make P indefinite
-        ikh = identity - gain @ h
-        p = ikh @ p @ ikh.transpose(0, 2, 1) + gain @ r_i @ gain.transpose(0, 2, 1)
-        p = 0.5 * (p + p.transpose(0, 2, 1))
-        used[:, i] = used_i
-        nis[:, i] = nis_i
+        innovation = z[i] - h @ x
+        nis_i = float(innovation @ _solve_definite(hpht + r_i, innovation))
+        use = usable[i] and nis_i <= gate[i]
+        if use:
+            if weight[i] != 1.0:  # the gate asks whether this sample fits; the update, how much it may weigh
+                r_i = r_i / weight[i]
+            gain = _solve_definite(hpht + r_i, pht.T).T
+            x = x + gain @ innovation
+            # Joseph form: a sum of two positive semidefinite terms, so rounding cannot make P indefinite
+            ikh = identity - gain @ h
+            p = ikh @ p @ ikh.T + gain @ r_i @ gain.T
+            p = 0.5 * (p + p.T)
+        used.append(use)
+        nis.append(nis_i if usable[i] else 0.0)
         if ends is not None:
-            on_the_way.append((x.copy(), p))
+            on_the_way.append((x, p))
     at = None
     if ends is not None:
         wanted = [on_the_way[end] for end in ends.tolist()]
-        at = GaussianState(np.array([x for x, _ in wanted]), np.array([p for _, p in wanted]))
-    return Updated(x, p, used, np.where(data.usable, nis, 0.0), at)
+        at = GaussianState(np.array([[x] for x, _ in wanted]), np.array([[p] for _, p in wanted]))
+    return Updated(x[None], p[None], np.array([used]), np.array([nis]), at)
+
+
+def _solve_definite(s: Array, b: Array) -> Array:
+    """S⁻¹b for one symmetric positive definite S (m, m). Raises LinAlgError where it is not."""
+    _, solution, failed = dposv(s, b)
+    if failed:
+        raise np.linalg.LinAlgError("S is not positive definite")
+    return solution
 
 
 def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None = None) -> Updated:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bank import prior
+from .assembly import prior
 from .frames import Array
 from .models import Model
 from .parameters import Parameters

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..calibration import kalman
 from ..calibration.alignment import align
-from ..calibration.bank import Assembler
+from ..calibration.assembly import Assembler
 from ..calibration.frames import Array
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model, Needs

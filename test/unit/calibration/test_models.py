@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from dvl_calib_ros.calibration import kalman
-from dvl_calib_ros.calibration.bank import ModelBank, prior
+from dvl_calib_ros.calibration.assembly import prior
+from dvl_calib_ros.calibration.bank import groups_of
 from dvl_calib_ros.calibration.error_model import correct, distort
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, skew
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
@@ -175,23 +176,23 @@ def test_m7_finds_half_the_angle_as_the_paper_leaves_it(rng):
 
 
 def run_filter(model, velocity_dvl, velocity_body, t, sway_heave=PRIOR):
-    bank = ModelBank([model], Parameters(initial_std_misalignment=1.0, initial_std_scale=0.5, gate_probability=0.0))
+    parameters = Parameters(initial_std_misalignment=1.0, initial_std_scale=0.5, gate_probability=0.0)
+    [group] = groups_of([model], parameters)
     seen = observations(velocity_dvl, velocity_body, t, sway_heave, noise=np.eye(3)[None] * 1e-6)
     n = len(velocity_dvl)
-    bank.update(model.needs, np.arange(n), seen, np.ones(n), np.ones(n, dtype=bool))
-    return bank.state(model.name).x
+    group.update(np.arange(n), seen, np.ones(n), np.ones(n, dtype=bool))
+    return group.state(model.name).x
 
 
 @each_model
-def test_a_padded_model_in_the_bank_is_the_model_alone(name, rng):
-    """Padding to the largest model changes nothing: the bank's state is that of a filter of the model's own size."""
+def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
     model, parameters = MODELS[name], Parameters()
     velocity_body = rng.normal([1.5, 0.1, 0.0], 0.2, (60, 3))
     seen = observations(
         velocity_body + rng.normal(0, 0.1, (60, 3)), velocity_body, np.eye(3), noise=0.04 * np.eye(3)[None]
     )
-    bank = ModelBank(LINEAR_MODELS, parameters)
-    bank.update(model.needs, np.arange(60), seen, np.ones(60), np.ones(60, dtype=bool))
+    group = next(each for each in groups_of(LINEAR_MODELS, parameters) if name in each.index)
+    group.update(np.arange(60), seen, np.ones(60), np.ones(60, dtype=bool))
     z, h = model.linearise(seen)
     m = model.n_measurement
     r = (seen.noise if model.noise is None else model.noise(seen))[:, :m, :m]
@@ -202,10 +203,9 @@ def test_a_padded_model_in_the_bank_is_the_model_alone(name, rng):
         prior(model, parameters).p[None],
         kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
-    after = bank.standing(model.needs, 1)
-    k = [each.name for each in LINEAR_MODELS if each.needs is model.needs].index(name)
-    np.testing.assert_allclose(after.x[0, k, : model.n_state], alone.x[0], atol=1e-12)
-    np.testing.assert_allclose(after.p[0, k, : model.n_state, : model.n_state], alone.p[0], atol=1e-12)
+    after, k = group.standing(1), group.index[name]
+    np.testing.assert_allclose(after.x[0, k], alone.x[0], atol=1e-12)
+    np.testing.assert_allclose(after.p[0, k], alone.p[0], atol=1e-12)
 
 
 def test_a_tilted_mounting_keeps_its_known_tilt_when_heave_is_zeroed(rng):

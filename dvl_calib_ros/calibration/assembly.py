@@ -1,0 +1,146 @@
+"""Between models and the Kalman filter: what it starts from, what its rows are, and what its states mean."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.special import chdtr, gammaincinv, ndtri
+
+from . import kalman
+from .correction_parameters import PriorOnErrors, to_correction, to_errors
+from .frames import Array
+from .kalman import GaussianState
+from .models import Model
+from .observations import Observations, Unmeasured
+from .parameters import Parameters
+from .samples import Mask
+
+
+class Assembler:
+    """Between the Kalman filter and K models that differ in z and H only: they are of one size, with one noise.
+
+    start: what the filter starts from, x (K, n), P (K, n, n): the prior, or `initial` for the models named there
+    (shapes as the models' states). process_rate: Q per second (K, n, n): a random walk of misalignment and scale, not
+    of nuisance states; None for none.
+    """
+
+    def __init__(
+        self, models: Sequence[Model], parameters: Parameters, initial: Mapping[str, GaussianState] | None = None
+    ) -> None:
+        self.models = tuple(models)
+        first = self.models[0]
+        self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise
+        self._motion_is_noise = first.motion_is_noise
+        self._starts = [(initial or {}).get(model.name) or prior(model, parameters) for model in self.models]
+        held = [
+            to_correction(state) if model.in_correction_parameters else state
+            for model, state in zip(self.models, self._starts, strict=True)
+        ]
+        self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
+        self._prior_on_errors = {
+            index: PriorOnErrors(held[index], self._starts[index])
+            for index, model in enumerate(self.models)
+            if model.in_correction_parameters
+        }
+        # by how many of its rows are left where axes of the reference are not measured
+        self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m)])
+        self._gate = np.full((len(self.models), 1), self._gates[0])
+        self._needs_prior = np.array([model.needs_prior for model in self.models])
+        rate = np.zeros(self.start.p.shape)
+        for index, model in enumerate(self.models):
+            std = [parameters.process_std_misalignment] * 3 + [parameters.process_std_scale] * (model.n_errors - 3)
+            rate[index, : model.n_errors, : model.n_errors] = np.diag(np.square(std))
+        self.process_rate = rate if rate.any() else None
+
+    def start_of(self, index: int) -> GaussianState:
+        """State and covariance that one model starts from."""
+        return self._starts[index]
+
+    def state(self, index: int, x: Array, p: Array) -> GaussianState:
+        """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
+        held = GaussianState(x.copy(), p.copy())
+        if not self.models[index].in_correction_parameters:
+            return held
+        if self.process_rate is not None:  # what the prior still weighs is then not known
+            return to_errors(held)
+        return self._prior_on_errors[index].to_errors(held)
+
+    def measurements(self, seen: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:
+        """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
+        heave were known at the sample; models that need them skip it where not."""
+        k, n_samples = len(self.models), len(seen.velocity_dvl)
+        z = np.empty((k, n_samples, self._m))
+        h = np.empty((k, n_samples, self._m, self._n))
+        for index, model in enumerate(self.models):
+            z[index], h[index] = model.linearise(seen)
+        usable = ~self._needs_prior[:, None] | prior_known
+        noise = (seen.noise if self._model_noise is None else self._model_noise(seen))[None, :, : self._m, : self._m]
+        own_weight = (seen.motion_weight if self._motion_is_noise else weight)[None]
+        if seen.unmeasured is None:
+            return kalman.Measurements(z, h, noise, own_weight, usable, self._gate)
+        noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
+        return kalman.Measurements(z, h, noise, own_weight, usable, gate)
+
+    def rows_left(self, unmeasured: Unmeasured) -> Array:
+        """Rows that each model is told by each sample (K, N)."""
+        dropped = [_dropped_axes(model, unmeasured).sum(axis=1) for model in self.models]
+        return self._m - np.array(dropped, dtype=float)
+
+    def _drop_unmeasured(
+        self, z: Array, h: Array, noise: Array, seen: Observations, unmeasured: Unmeasured
+    ) -> tuple[Array, Array]:
+        """R (K, N, 3, 3) and gate (K, N), with z and H turned into the reference's frame, unmeasured rows taken out."""
+        k, n_samples = z.shape[:2]
+        noise = np.broadcast_to(noise, (k, n_samples, 3, 3)).copy()
+        gate = np.repeat(self._gate, n_samples, axis=1)
+        for index, model in enumerate(self.models):
+            axes = _dropped_axes(model, unmeasured)
+            at = np.flatnonzero(axes.any(axis=1))
+            if not len(at):
+                continue
+            turned = unmeasured.rotation_reference_from_body[at]
+            if not model.rows_in_body:
+                turned = turned @ seen.rotation_dvl_from_body.T
+            kept = ~axes[at]
+            z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
+            h[index, at] = turned @ h[index, at] * kept[:, :, None]
+            r = turned @ noise[index, at] @ turned.swapaxes(1, 2) * (kept[:, :, None] & kept[:, None, :])
+            noise[index, at] = r + np.eye(3) * axes[at, None, :]
+            gate[index, at] = self._gates[axes[at].sum(axis=1)]
+        return noise, gate
+
+
+def _dropped_axes(model: Model, unmeasured: Unmeasured) -> Mask:
+    """(N, 3) axes of the reference's frame that a model would need, and that are not measured."""
+    needed = (model.aided, model.aided, model.vertical_from_reference)
+    dropped: Mask = unmeasured.axes & needed
+    return dropped
+
+
+def prior(model: Model, parameters: Parameters) -> GaussianState:
+    """Zero errors with the prior standard deviations of the parameters."""
+    std = [parameters.initial_std_misalignment] * 3 + [parameters.initial_std_scale] * (model.n_errors - 3)
+    std += [getattr(parameters, each.std) if isinstance(each.std, str) else each.std for each in model.nuisance]
+    return GaussianState(np.zeros(model.n_state), np.diag(np.square(std)))
+
+
+def gate_of(rows: float, parameters: Parameters) -> float:
+    """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
+    if parameters.gate_probability in (0.0, 1.0):
+        return float("inf")
+    return 2.0 * float(gammaincinv(0.5 * rows, parameters.gate_probability))
+
+
+def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
+    """Two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: of a sample, on average.
+
+    Gated samples are not in the mean, so it is that of a chi-square variable cut off at the gate:
+    E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal.
+    """
+    m, gate = rows, gate_of(rows, parameters)
+    inside = chdtr(m, gate)
+    mean = m * chdtr(m + 2, gate) / inside
+    variance = m * (m + 2) * chdtr(m + 4, gate) / inside - mean**2
+    half = float(ndtri(0.5 + 0.5 * confidence) * np.sqrt(variance / max(used, 1)))
+    return float(mean) - half, float(mean) + half
