@@ -6,7 +6,8 @@
     run.plot()
 
 Angles in degrees and lengths in metres where a name says so, else SI. Errors of files, topics and values are
-`InputError`, of parameters `ParameterError`, each one sentence with the remedy.
+`InputError`, of parameters `ParameterError`, each one sentence with the remedy. (Long, because it is a table of
+functions with their documentation.)
 """
 
 from __future__ import annotations

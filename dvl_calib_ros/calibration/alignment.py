@@ -7,7 +7,7 @@
 A row waits for attitude, and then for its reference, no longer than they can still come (streams.py), in order; models
 that need neither do not wait. `Aligner` takes samples one by one (live) or as columns (recordings). Columns with
 a jump of time among them, rare as they are, go row by row. So every rule has one meaning, and test_alignment.py holds
-both ways equal. (The module is long because each rule stands beside its twin.)
+both ways equal. (Long, because each rule stands beside its twin.)
 """
 
 from __future__ import annotations

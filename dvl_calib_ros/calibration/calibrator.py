@@ -4,7 +4,8 @@
                                         └─► Selection: is there GNSS, which model is the one
 
 The node, the replay and the evaluation all use this class. The node feeds it sample by sample, recordings come as
-columns; that, and block_size, change nothing but the speed.
+columns; that, and block_size, change nothing but the speed. (Long, because it is the one door of the core, and each
+question that is asked of it is a method.)
 """
 
 from __future__ import annotations

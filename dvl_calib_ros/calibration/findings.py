@@ -1,7 +1,8 @@
 """What can be wrong with data, configuration and network: every warning with its code, its meaning and its remedy.
 
 The one table of them. /diagnostics, the notes of a replay and the table in docs/troubleshooting.md are made from it, so
-a warning is an entry here and a call of `finding` where it is noticed. Codes are stable: users search for them.
+a warning is an entry here and a call of `finding` where it is noticed. Codes are stable: users search for them. (Long,
+because it is a table.)
 """
 
 from __future__ import annotations

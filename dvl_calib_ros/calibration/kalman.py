@@ -1,15 +1,15 @@
 """The Kalman filter over a constant state, for K models at once: sample by sample, or a whole block.
 
 Letters as in the literature: x state, P covariance, z measurement, H its matrix, R its noise, S innovation
-covariance, K gain. Models of different sizes share arrays by padding: rows of z and H that a model does not have are
-zero with a unit R, states that it does not have are never touched because their columns of H are zero.
+covariance, K gain.
 
 Two ways to the same numbers (equal to 1e-10, proved in test_kalman.py):
 
 `recursion` is the filter: one predict and update per sample, covariance in Joseph form.
 `batch` uses that with Φ = I and Q = 0 the filter is prior-regularised weighted least squares for every k at once: the
 information of the first k samples is a running sum. Vectorised over time it is about a hundred times faster, and the
-state after any sample comes with it.
+state after any sample comes with it. (Long, because two ways to the same numbers stand in one place, with the small
+dense algebra of one of them.)
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class GaussianState(NamedTuple):
 
 @dataclass(frozen=True)
 class Measurements:
-    """N measurements for each of K models, padded to m rows and n states.
+    """N measurements for each of K models, of m rows, on n states.
 
     z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N), share
     of its own information that a sample adds, in 0..1 (below 1 for samples that share their noise with others).

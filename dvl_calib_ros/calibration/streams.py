@@ -201,6 +201,11 @@ class Track(Table):
                 oldest_ns = min(oldest_ns, wanted_ns)
             self.begin += int(np.searchsorted(self.stamps_ns[self.begin : self.size], oldest_ns))
 
+    def in_time(self, from_ns: int, to_ns: int) -> Index:
+        """Slots of samples between two stamps that were not late: live, the others come when a block is closed."""
+        span = self.between(self.stamps_ns, from_ns, to_ns)
+        return np.flatnonzero(~self.late[span]) + span.start
+
     def decided(self, stamp_ns: int, horizon_ns: int) -> bool:
         """Whether `bracket(stamp_ns)` can no longer change, with horizon_ns the newest stamp of any stream.
 

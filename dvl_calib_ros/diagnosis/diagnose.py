@@ -1,4 +1,7 @@
-"""The diagnosis: from bags to an answer."""
+"""The diagnosis: from bags to an answer.
+
+(Long, because the steps of one diagnosis stand in their order.)
+"""
 
 from __future__ import annotations
 

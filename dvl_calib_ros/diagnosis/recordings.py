@@ -1,4 +1,7 @@
-"""What a diagnosis looks at: of each recording the streams as they are, each with stamps of its own."""
+"""What a diagnosis looks at: of each recording the streams as they are, each with stamps of its own.
+
+(Long, because every way from a recording's streams to columns is here.)
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ Columns propose: about the best fit so far, every effect's derivatives make one 
 of up to three effects are small least squares problems. The composed model decides: the best proposals are fitted in
 it until they stand still, and compared by what they explain less what so many parameters explain by chance. About the
 winner it is asked again, with the noise that is left by everything together: so that no effect is taken for noise.
+(Long, because proposing, fitting and comparing hypotheses share their noise and their costs.)
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """What a recording says of itself: topics, mounting, lever arm and frames, so that a calibration needs no options.
 
-What the user gives always stands. What is found is said, with its source; nothing is changed silently.
+What the user gives always stands. What is found is said, with its source; nothing is changed silently. (Long, because
+each thing that is found is said with its source, in one place.)
 """
 
 from __future__ import annotations

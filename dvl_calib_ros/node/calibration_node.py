@@ -1,4 +1,7 @@
-"""The node ``dvl_calibration``: topics, parameters, services and diagnostics around a `Calibrator`."""
+"""The node ``dvl_calibration``: topics, parameters, services and diagnostics around a `Calibrator`.
+
+(Long, because all that the node says and hears is this one class.)
+"""
 
 from __future__ import annotations
 

@@ -17,18 +17,18 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.findings import Finding, finding
-from ..calibration.frames import ENU_FROM_NED, rotation_from_quaternion
+from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
-from ..calibration.samples import AlignedBlock, Stream, VelocityFrame
-from ..calibration.screening import is_valid_velocity, unit_quaternion
+from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
+from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..calibration.verification import verification_document
 from ..errors import InputError
 from ..files.result_file import estimate_document, load_initial_calibration
 from ..messages.columns import sample_streams
-from ..messages.decode import MessageDecoder, Refusal
+from ..messages.decode import MessageDecoder
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
 from .navigation import Navigation, navigation_of
 from .recorder import Recorder, RunHistory
@@ -224,42 +224,60 @@ def _feed_all(
 
 
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
-    """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError."""
-    rotation = None
-    velocities: list[Any] = []
+    """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError.
+
+    A velocity in an earth frame is turned by the attitude that came last before it.
+    """
+    velocities: list[Array] = []
     first_ns: int | None = None
+    attitude = no_samples(Stream.IMU)
     with BagReader(paths, KNOWN_DEFINITIONS) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
-        typed = _of_types(bag, chosen, parameters)
-        decoder = MessageDecoder(typed)
-        for topic, log_ns, message, undecodable in bag.messages([chosen.gnss, chosen.imu]):
-            if undecodable:
+        decoder = MessageDecoder(_of_types(bag, chosen, parameters))
+        for stretch in sample_streams(bag, {chosen.gnss: Stream.REFERENCE, chosen.imu: Stream.IMU}, decoder):
+            _, reference, imu = stretch.streams
+            given = (imu.refused == 0) & ~np.isnan(unit_quaternions(imu.orientation)[:, 0])
+            attitude = attitude.joined(imu.part(given))
+            reference = reference.part(
+                (reference.refused == 0) & are_valid_velocities(reference.values, parameters.max_speed)
+            )
+            if not len(reference):
                 continue
-            if topic == chosen.imu:
-                attitude = decoder.imu(message, log_ns)
-                orientation = None if isinstance(attitude, Refusal) else unit_quaternion(attitude.orientation)
-                rotation = None if orientation is None else rotation_from_quaternion(orientation).T
-                continue
-            sample = decoder.reference(message, log_ns)
-            if isinstance(sample, Refusal) or not is_valid_velocity(sample.velocity, parameters.max_speed):
-                continue
-            first_ns = sample.stamp_ns if first_ns is None else first_ns
-            if sample.stamp_ns - first_ns >= parameters.prior_window * 1e9:
+            first_ns = int(reference.stamps_ns[0]) if first_ns is None else first_ns
+            over = reference.stamps_ns - first_ns >= parameters.prior_window * 1e9
+            is_over = bool(over.any())
+            velocities.append(
+                _in_body(reference.part(slice(int(np.argmax(over))) if is_over else slice(None)), attitude)
+            )
+            if is_over:
                 break
-            velocity = np.array(sample.velocity)
-            if sample.frame is not VelocityFrame.BODY:
-                if rotation is None:
-                    continue
-                velocity = rotation @ (ENU_FROM_NED @ velocity if sample.frame is VelocityFrame.NED else velocity)
-            velocities.append(velocity)
-    if not velocities:
+            attitude = attitude.part(slice(-1, None))
+    mean = np.concatenate([*velocities, np.zeros((0, 3))])
+    if not len(mean):
         raise InputError(
             f"prior_source reference: topic {topics.gnss} has no velocity that can be turned into the body frame in "
             f"its first {parameters.prior_window:g} s; set --gnss-topic, or use prior_source fixed"
         )
-    _, sway, heave = np.mean(velocities, axis=0).tolist()
+    _, sway, heave = mean.mean(axis=0).tolist()
     return sway, heave
+
+
+def _in_body(reference: SampleBlock, attitude: SampleBlock) -> Array:
+    """Those velocities (N, 3) m/s of a reference that an attitude, which came before them, turns into the body frame.
+
+    Attitudes all have one.
+    """
+    before = np.searchsorted(attitude.arrival, reference.arrival) - 1
+    is_body = reference.frames == FRAME_CODES[VelocityFrame.BODY]
+    is_ned = reference.frames == FRAME_CODES[VelocityFrame.NED]
+    if not len(attitude):
+        return reference.values[is_body]
+    enu = np.where(is_ned[:, None], reference.values @ ENU_FROM_NED.T, reference.values)
+    rotation_enu_from_body = rotation_from_quaternion(unit_quaternions(attitude.orientation))[before]
+    turned = np.matmul(enu[:, None], rotation_enu_from_body)[:, 0]
+    velocity: Array = np.where(is_body[:, None], reference.values, turned)[is_body | (before >= 0)]
+    return velocity
 
 
 def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[Finding]:

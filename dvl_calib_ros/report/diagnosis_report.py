@@ -1,4 +1,7 @@
-"""The report of a diagnosis: `dvl-calib diagnose --report out.html`."""
+"""The report of a diagnosis: `dvl-calib diagnose --report out.html`.
+
+(Long, because it is the order of one page.)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The report of an evaluation: `dvl-calib evaluate --report out.html`."""
+"""The report of an evaluation: `dvl-calib evaluate --report out.html`.
+
+(Long, because it is the order of one page.)
+"""
 
 from __future__ import annotations
 

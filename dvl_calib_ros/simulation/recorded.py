@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -11,12 +12,13 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..bags.reader import BagReader
-from ..calibration.frames import ENU_FROM_NED, Array, Quaternion, Vector
+from ..calibration.frames import ENU_FROM_NED, Array
 from ..calibration.parameters import Parameters
-from ..calibration.samples import VelocityFrame
-from ..calibration.screening import is_valid_velocity, unit_quaternion
+from ..calibration.samples import FRAME_CODES, Codes, Index, SampleBlock, Stamps, Stream, VelocityFrame, no_samples
+from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..errors import InputError
-from ..messages.decode import MessageDecoder, Refusal
+from ..messages.columns import sample_streams
+from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES
 from ..replay.replay import Topics
 from .trajectories import Motion
@@ -45,11 +47,12 @@ class Recording:
 
 @dataclass(frozen=True)
 class _Samples:
-    """Times (N,) s and velocities (N, 3) m/s with their frames (N); times (M,) s and quaternions (M, 4) xyzw."""
+    """Times (N,) s and velocities (N, 3) m/s with their frames (N), places in `FRAMES`; times (M,) s and quaternions
+    (M, 4) xyzw."""
 
     velocity_time: Array
     velocity: Array
-    frames: list[VelocityFrame]
+    frames: Codes
     attitude_time: Array
     attitude: Array
 
@@ -74,42 +77,40 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
 
 
 def _read(recording: Recording) -> _Samples:
-    velocities: dict[int, tuple[Vector, VelocityFrame]] = {}
-    attitudes: dict[int, Quaternion] = {}
     with BagReader([recording.path], KNOWN_DEFINITIONS) as bag:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
         _check_topics(recording, topics, bag.topics)
         parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=bag.topics[topics.gnss])
         decoder = MessageDecoder(parameters)
-        for topic, log_ns, message, undecodable in bag.messages([topics.gnss, topics.imu]):
-            if undecodable:
-                continue
-            if topic == topics.imu:
-                attitude = decoder.imu(message, log_ns)
-                if isinstance(attitude, Refusal):
-                    continue
-                orientation = unit_quaternion(attitude.orientation)
-                if orientation is not None:
-                    attitudes[attitude.stamp_ns] = orientation
-                continue
-            sample = decoder.reference(message, log_ns)
-            if not isinstance(sample, Refusal) and is_valid_velocity(sample.velocity, parameters.max_speed):
-                velocities[sample.stamp_ns] = sample.velocity, sample.frame
-    for what, found in ((recording.gnss_topic, velocities), (recording.imu_topic, attitudes)):
-        if len(found) < 2:
+        references, attitudes = [no_samples(Stream.REFERENCE)], [no_samples(Stream.IMU)]
+        for stretch in sample_streams(bag, {topics.gnss: Stream.REFERENCE, topics.imu: Stream.IMU}, decoder):
+            _, reference, imu = stretch.streams
+            valid = are_valid_velocities(reference.values, parameters.max_speed)
+            references.append(reference.part((reference.refused == 0) & valid))
+            attitudes.append(imu.part((imu.refused == 0) & ~np.isnan(unit_quaternions(imu.orientation)[:, 0])))
+    velocity_ns, at = _last_of_each(references)
+    attitude_ns, attitude_at = _last_of_each(attitudes)
+    for what, stamps_ns in ((recording.gnss_topic, velocity_ns), (recording.imu_topic, attitude_ns)):
+        if len(stamps_ns) < 2:
             raise InputError(
-                f"{recording.path}: {what} holds {len(found)} usable samples; a motion takes reference velocity and "
-                f"attitude. {' '.join(map(str, decoder.problems.values()))}".strip()
+                f"{recording.path}: {what} holds {len(stamps_ns)} usable samples; a motion takes reference velocity "
+                f"and attitude. {' '.join(map(str, decoder.problems.values()))}".strip()
             )
-    velocity_ns, attitude_ns = sorted(velocities), sorted(attitudes)
     first_ns = min(velocity_ns[0], attitude_ns[0])
     return _Samples(
-        1e-9 * (np.array(velocity_ns) - first_ns),
-        np.array([velocities[stamp][0] for stamp in velocity_ns]),
-        [velocities[stamp][1] for stamp in velocity_ns],
-        1e-9 * (np.array(attitude_ns) - first_ns),
-        np.array([attitudes[stamp] for stamp in attitude_ns]),
+        1e-9 * (velocity_ns - first_ns),
+        np.concatenate([each.values for each in references])[at],
+        np.concatenate([each.frames for each in references])[at],
+        1e-9 * (attitude_ns - first_ns),
+        unit_quaternions(np.concatenate([each.orientation for each in attitudes])[attitude_at]),
     )
+
+
+def _last_of_each(blocks: Sequence[SampleBlock]) -> tuple[Stamps, Index]:
+    """The stamps that rows have, in order, and the last row of each, counted over all blocks."""
+    stamps_ns = np.concatenate([each.stamps_ns for each in blocks])
+    found, from_the_end = np.unique(stamps_ns[::-1], return_index=True)
+    return found, len(stamps_ns) - 1 - from_the_end
 
 
 def _check_topics(recording: Recording, topics: Topics, present: dict[str, str]) -> None:
@@ -152,8 +153,8 @@ def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
 def _in_body(samples: _Samples, attitude: RotationSpline) -> Array:
     """Velocities (N, 3) m/s in the body frame."""
     earth = samples.velocity.copy()
-    is_ned = np.array([frame is VelocityFrame.NED for frame in samples.frames])
-    is_body = np.array([frame is VelocityFrame.BODY for frame in samples.frames])
+    is_ned = samples.frames == FRAME_CODES[VelocityFrame.NED]
+    is_body = samples.frames == FRAME_CODES[VelocityFrame.BODY]
     earth[is_ned] = earth[is_ned] @ ENU_FROM_NED.T
     span = np.clip(samples.velocity_time, samples.attitude_time[0], samples.attitude_time[-1])
     turned = attitude(span).inv().apply(earth)

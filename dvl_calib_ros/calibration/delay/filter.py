@@ -20,9 +20,9 @@ from ..frames import ENU_FROM_NED, Array
 from ..kalman import GaussianState
 from ..observations import Assumptions, Observations
 from ..parameters import Parameters
-from ..samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
+from ..samples import FRAME_CODES, FRAMES, Stamps, VelocityFrame, Verdict
 from ..selection import NO_EVIDENCE, Evidence
-from ..streams import LONG_AGO_NS, LONGEST_NS, Track
+from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
 from .bank import DelayBank, Posterior
@@ -60,12 +60,6 @@ class _Dvl(Table):
     stamps_ns: Stamps
     velocity: Array
     covariance: Array
-
-
-def _in_time(track: Track, from_ns: int, to_ns: int) -> Index:
-    """Slots of a track's samples between two stamps that came in time: live, the others come when a block is closed."""
-    span = track.between(track.stamps_ns, from_ns, to_ns)
-    return np.flatnonzero(~track.late[span]) + span.start
 
 
 class DelayFilter:
@@ -294,7 +288,7 @@ class DelayFilter:
     def _compare_coarsely(self, block_ns: int, end_ns: int, dvl: DvlColumns, imu: ImuColumns) -> None:
         """Give the block's references, as their messages had them, to `coarse`."""
         track = self._aligner.reference
-        at = _in_time(track, block_ns, end_ns)
+        at = track.in_time(block_ns, end_ns)
         at = at[thinned(track.stamps_ns[at])]
         times, raw = self._seconds(track.stamps_ns[at]), track.values[at, :3]
         if len(dvl.times) < 2:
@@ -323,7 +317,7 @@ class DelayFilter:
 
     def _imu(self, from_ns: int, to_ns: int) -> ImuColumns:
         track = self._aligner.imu
-        at = _in_time(track, from_ns, to_ns)
+        at = track.in_time(from_ns, to_ns)
         values = track.values[at]
         rates = np.where(np.abs(values[:, 4:7]) < FASTEST_TURN, values[:, 4:7], np.nan)
         return ImuColumns(self._seconds(track.stamps_ns[at]), values[:, :4], rates)
@@ -331,7 +325,7 @@ class DelayFilter:
     def _reference(self, from_ns: int, to_ns: int) -> tuple[ReferenceColumns, Stamps]:
         """References between two stamps, thinned, and their stamps."""
         track = self._aligner.reference
-        at = _in_time(track, from_ns, to_ns)
+        at = track.in_time(from_ns, to_ns)
         at = at[thinned(track.stamps_ns[at])]
         values, frames = track.values[at], track.frames[at]
         noise = values[:, 3:12].reshape(-1, 3, 3)

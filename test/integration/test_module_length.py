@@ -1,0 +1,29 @@
+"""Modules stay short enough to be read at one sitting, or say why they are not."""
+
+from __future__ import annotations
+
+import ast
+
+import pytest
+from conftest import ROOT
+
+LONGEST = 350
+MODULES = sorted(path for folder in ("dvl_calib_ros", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
+
+
+def lacks_reason(text: str) -> bool:
+    """Whether a module is long, and its docstring does not say in brackets why: "(Long, because ...)"."""
+    said = " ".join((ast.get_docstring(ast.parse(text)) or "").split())
+    return len(text.splitlines()) > LONGEST and "(Long, because" not in said
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_module_is_above_350_lines_without_a_reason_at_its_top(path):
+    assert not lacks_reason(path.read_text())
+
+
+def test_a_long_module_is_noticed_until_it_says_why():
+    body = "x = 1\n" * LONGEST
+    assert lacks_reason(f'"""About."""\n{body}')
+    assert not lacks_reason(f'"""About. (Long, because it is a table.)"""\n{body}')
+    assert not lacks_reason('"""About."""\n' + "x = 1\n" * (LONGEST - 1))
