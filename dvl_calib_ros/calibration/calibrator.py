@@ -404,7 +404,7 @@ class Calibrator:
         if source is None:
             return [Terms.of_state(state.x) for state in self._delay.without_folds()]
         terms = MODELS[source].error_terms_from_state
-        states = self._bank.states_without_folds(source)
+        states = self._group_of[source].states_without_folds(source)
         return [Terms(terms @ state.x, np.zeros(3), 0.0) for state in states]
 
     @property

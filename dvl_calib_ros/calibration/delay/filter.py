@@ -2,7 +2,7 @@
 
 A hypothesis of 3 s of delay needs what comes 3 s later, so G2's samples are used when the others' have long been. It
 reads what the aligner holds of the streams as soon as all that may belong to a block has come or is overdue; nobody
-waits for it.
+waits for it. (Long, because what is taken from the aligner and what is told of the outcome go by the same blocks.)
 """
 
 from __future__ import annotations
