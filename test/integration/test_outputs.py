@@ -63,7 +63,9 @@ COMMAND = {
         "import runs/T_dvl.npy --gnss runs/T_gnss.npy", ("runs/T_dvl.npy", "runs/T_gnss.npy"), (), ("-o",)
     ),
     "import a folder": Command("import runs", ("runs", "runs/T_dvl.npy"), (), ("-o",)),
-    "simulate": Command("simulate --motion-of bag", ("bag", "bag/bag.mcap"), (), ("",)),
+    "simulate": Command(
+        "simulate --motion-of bag --diagnosis result.yaml", ("bag", "bag/bag.mcap", "result.yaml"), (), ("",)
+    ),
 }  # fmt: skip
 
 
@@ -218,7 +220,7 @@ def test_no_output_of_a_command_can_be_one_of_its_inputs_by_any_name(scratch, ca
 
 
 # Options that name what is read; what is not among these is written, and has to be in `COMMAND`
-READ = {"--params", "--urdf", "--gnss", "--attitude", "--motion-of", "--simulator", "--simulator-params"}
+READ = {"--params", "--urdf", "--gnss", "--attitude", "--motion-of", "--diagnosis", "--simulator", "--simulator-params"}
 # A trial reads nothing, and goes on in its folder; the demo's bag is its own
 APART = {("diagnose", "--out"), ("diagnose", "--page"), ("demo", "--report")}
 
