@@ -3,7 +3,8 @@
 The level of a DVL that is fast enough is what its samples show against their own neighbours, to which motion and
 reference are nothing; that of a slow one is of its residual, in which the reference's noise is too. Levels are compared
 over blocks of as many samples on both sides, so whatever the noise's distribution is, it is in the scatter of blocks.
-"""(Long, because each kind of noise has its own estimate.)
+(Long, because each kind of noise has its own estimate.)
+"""
 
 from __future__ import annotations
 
