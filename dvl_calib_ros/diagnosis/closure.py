@@ -156,7 +156,7 @@ def closure_alone(selection: Selection, gap: Gap, name: str) -> float:
     chosen = [effect for effect in fit.effects if effect.name == name]
     if len(fit.effects) == 1 or not np.isfinite(gap.closure):
         return gap.closure
-    alone = fitter.fit(fit.hypothesis.with_effects(chosen, len(fit.seen), {}), fit.noise)
+    alone = fitter.fit_kept(fit.hypothesis.with_effects(chosen, len(fit.seen), {}), fit.noise)
     without, with_it = (
         float(np.mean((fitter.problem.errors(each.seen) ** 2).sum(axis=1))) for each in (selection.base, alone)
     )

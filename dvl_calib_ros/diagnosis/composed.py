@@ -187,6 +187,8 @@ class Problem:
     grids: tuple[Grid, ...]
     of_axes: tuple[bool, bool, bool] = (True, True, True)
     _kept: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
+    # Hypotheses as they were fitted last, by what they are made of: where to start from again
+    fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
     # ------------------------------------------------------------------ the data
 
@@ -458,7 +460,11 @@ def _by_turn(hypothesis: Hypothesis, seen: Seen) -> Array:
     D⁻¹ y with y the unscaled velocity is Exp(θ)ᵀ y, and Exp(θ + δ) = Exp(J δ) Exp(θ) with J the left Jacobian.
     """
     matrix = seen.body_from_measured * (1.0 + hypothesis.scale)
-    return np.asarray(matrix @ skew(seen.measured / (1.0 + hypothesis.scale)) @ _left_jacobian(seen.angles))
+    unscaled, jacobian = seen.measured / (1.0 + hypothesis.scale), _left_jacobian(seen.angles)
+    if matrix.ndim == 2:  # linear in the velocity: one product of matrices in place of many small ones
+        of_axes = (matrix @ skew(np.eye(3)) @ jacobian).reshape(3, 9)
+        return np.asarray((unscaled @ of_axes).reshape(-1, 3, 3))
+    return np.asarray(matrix @ skew(unscaled) @ jacobian)
 
 
 def _left_jacobian(angles: Array) -> Array:

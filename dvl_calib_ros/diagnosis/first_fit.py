@@ -8,6 +8,7 @@ the scatter about the best fit, never from that of a poor one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -48,6 +49,18 @@ class _Look:
     def recording(self) -> Recording:
         return self.problem.recordings[0]
 
+    @cached_property
+    def rotation(self) -> Array | None:
+        """(N, 3, 3), earth from body, at the times."""
+        return None if self.recording.attitude is None else self.recording.rotation_enu_from_body(self.times)
+
+    @cached_property
+    def rates(self) -> Array | None:
+        """(N, 3) rad/s at the times."""
+        if Needs.ANGULAR_VELOCITY not in self.recording.available:
+            return None
+        return self.recording.angular_velocity(self.times)
+
     def solved(self, offsets: Offsets) -> tuple[float, Array]:
         """Spread of the best half, and (15,) C - Tᵀ row by row, lever arm, bias."""
         recording, problem = self.recording, self.problem
@@ -56,13 +69,10 @@ class _Look:
         if known.mean() < 0.5:
             return np.inf, np.zeros(15)
         at = at[known]
+        rotation = None if self.rotation is None else self.rotation[known]
+        rates = None if self.rates is None else self.rates[known]
         velocity = recording.dvl(at + offsets.dvl)
         g = recording.reference(at + offsets.reference)
-        rotation = rates = None
-        if recording.attitude is not None:
-            rotation = recording.rotation_enu_from_body(at)
-        if Needs.ANGULAR_VELOCITY in recording.available:
-            rates = recording.angular_velocity(at)
         if recording.frame is not VelocityFrame.BODY and rotation is not None:
             g = np.einsum("nji,nj->ni", rotation, g)
         nominal = problem.rotation_dvl_from_body
@@ -86,12 +96,13 @@ def _robust(columns: Array, target: Array) -> tuple[float, Array]:
     weight = np.ones(len(target))
     held = np.diag((_NOISE_MPS / _PRIOR) ** 2)
     x = np.zeros(columns.shape[2])
+    kept = len(target) * 3 // 4
     for _ in range(3):
         a = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
         x = np.linalg.solve(a.T @ a + held, a.T @ (target * weight[:, None]).ravel())
         distance = np.linalg.norm(target - columns @ x, axis=1)
-        weight = (distance <= np.quantile(distance, 0.75)).astype(float)
-    best = np.sort(distance)[: max(len(distance) * 3 // 4, 1)]
+        best = np.partition(distance, kept)[: kept + 1]
+        weight = (distance <= best[kept]).astype(float)
     return float(np.sqrt(np.mean(best**2))), x
 
 

@@ -18,7 +18,11 @@ from .settings import SETTINGS
 
 # Gauss-Newton: at most so many steps; it stands still when none is longer than this share of its standard deviation
 MAX_STEPS, STANDS_STILL = 30, 0.01
+# or when one gains less than this in deviance, of which differences of 1 begin to count
+GAINS_NOTHING = 1e-3
 HALVINGS = 5
+# Squared cosine between steps from which on they are one series
+ALIKE = 0.9
 # Standard deviations of what other noise explains by chance that are taken off
 BY_CHANCE = 1.5
 # Prior of an effect's parameters, in their typical sizes: wide enough to do nothing but where the data says nothing
@@ -144,13 +148,15 @@ class Fitter:
         hypothesis = start
         seen, residual = self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
+        length, before = 1.0, np.zeros(len(kept))
         for _ in range(max_steps):
             columns = self.columns(hypothesis, seen)
             system = self._system(noise, columns, residual, hypothesis)
             free = np.flatnonzero(~kept)
             step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
             step[free] = system.part(free).solution() if len(free) else 0.0
-            moved, tried = False, step
+            length = _length(step / std, before, length)
+            moved, tried, before = False, length * step, step / std
             for _ in range(HALVINGS):
                 trial = hypothesis.moved(tried)
                 trial_seen, trial_residual = self.evaluated(trial)
@@ -163,7 +169,7 @@ class Fitter:
                 break
             gained = misfit - trial_misfit
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
-            if np.abs(tried / std).max() < STANDS_STILL or gained < 1e-4:
+            if np.abs(step / std).max() < STANDS_STILL or gained < GAINS_NOTHING:
                 break
         columns = self.columns(hypothesis, seen)
         system = self._system(noise, columns, residual, hypothesis)
@@ -194,9 +200,14 @@ class Fitter:
             for spec in effect.parameters
             if is_time_of_run(spec)
         )
-        key = (id(noise), tuple(sorted(effect.name for effect in start.effects)), windows)
+        what = tuple(sorted(effect.name for effect in start.effects)), windows
+        key = (id(noise), *what)
         if key not in self._fits:
-            self._fits[key] = self.fit(start, noise)
+            starts = [start, *self.problem.fitted.get(what, [])]
+            if len(starts) > 1:  # under other noise it ended nearby
+                starts.sort(key=lambda each: self._misfit(noise, self.evaluated(each)[1], each))
+            self._fits[key] = self.fit(starts[0], noise)
+            self.problem.fitted[what] = [self._fits[key].hypothesis]
         return self._fits[key]
 
     def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
@@ -240,6 +251,18 @@ class Fitter:
                 as_good.append(at)
                 step *= 1.6
         return value, min(as_good), max(as_good)
+
+
+def _length(step: Array, before: Array, length: float) -> float:
+    """How far to go along a Gauss-Newton step (n,), having gone a length of the one before (n,); both whitened.
+
+    Far from what explains the data (an effect left out that is there) the second derivatives count: each step is the
+    one before it times nearly the same factor, to and fro. Then this length leads to where they would end (Aitken's Δ²).
+    """
+    before_square, along = float(before @ before), float(step @ before)
+    if along**2 < ALIKE * before_square * float(step @ step) or before_square == 0.0:
+        return 1.0
+    return float(np.clip(length / max(1.0 - along / before_square, 0.1), 0.3, 5.0))
 
 
 def names_of(effects: Sequence[Effect]) -> frozenset[str]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve
 
 from ..calibration.frames import Array
 
@@ -41,7 +40,7 @@ class WhitenedLeastSquares:
     def solution(self) -> Array:
         """x (n,)."""
         right = self.gram[:-1, -1] + self.centre / self.std**2
-        return np.asarray(solve(self._normal, right, assume_a="pos"))
+        return np.linalg.solve(self._normal, right)
 
     def misfit(self, x: Array) -> float:
         """What is minimised, at x (n,)."""

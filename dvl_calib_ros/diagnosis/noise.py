@@ -36,6 +36,8 @@ class Arma:
 
     def innovations(self, series: Array) -> Array:
         """Innovations (M, ...) over std, of series (M, ...) that begins after a gap."""
+        if not len(self.ar) and not self.ma:
+            return series / self.std
         numerator = np.concatenate([[1.0], -self.ar])
         white = lfilter(numerator, [1.0, self.ma], series, axis=0) / self.std
         white[0] /= self.ratio  # nothing is known before the first, so it is as uncertain as the noise itself
@@ -187,14 +189,16 @@ def _searched(frequency: Array, power: Array, n: int, memory: float, p: int, q: 
     bound = float(np.arctanh(memory))
     centre, reach = np.zeros(2), np.array([bound if p else 0.0, 2.5 if q else 0.0])
     best = (np.inf, 0.0, 0.0)
+    wave = np.cos(frequency)
     for _ in range(5):
         axes = [np.unique(np.clip(np.linspace(c - r, c + r, 15), -b, b)) if r else np.zeros(1)
                 for c, r, b in zip(centre, reach, (bound, 2.5), strict=True)]  # fmt: skip
-        ar, ma = (each.ravel() for each in np.meshgrid(np.tanh(axes[0]), np.tanh(axes[1])))
-        wave = np.cos(frequency)
-        numerator = 1.0 + ma[:, None] ** 2 + 2.0 * ma[:, None] * wave
-        shape = numerator / (1.0 + ar[:, None] ** 2 - 2.0 * ar[:, None] * wave)
-        deviance = n * np.log(np.maximum(((power / shape) @ counts) / counts.sum(), 1e-300))
+        ars, mas = np.tanh(axes[0])[:, None], np.tanh(axes[1])[:, None]
+        numerator = 1.0 + mas**2 + 2.0 * mas * wave
+        denominator = 1.0 + ars**2 - 2.0 * ars * wave
+        mean = (1.0 / numerator) @ (power * counts * denominator).T / counts.sum()
+        deviance = n * np.log(np.maximum(mean, 1e-300)).ravel()
+        ar, ma = (each.ravel() for each in np.meshgrid(ars, mas))
         # no noise is quieter at low frequencies than at high ones: where it looks so, a fit has taken them in
         deviance = np.where(ar + ma >= -1e-12, deviance, np.inf)
         at = int(np.argmin(deviance))

@@ -124,7 +124,7 @@ def select(
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
     fitter, fit, columns = _about(fitter, fit, effects)
-    base = fitter.fit(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
+    base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
     return Selection(ordered, base, fit, fitter, columns, guesses)
@@ -407,7 +407,7 @@ def _tried(effect: Effect) -> float:
 
 def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
     rest = [other for other in fit.effects if other is not effect]
-    return fitter.fit(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
+    return fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
 
 
 def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
@@ -423,7 +423,7 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """A fit without those effects that are not called for given all others, or add next to nothing to a strong one."""
     threshold = float(np.log(SETTINGS.level / n_effects))
     while fit.effects:
-        base = fitter.fit(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
+        base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         explained = base.deviance - fit.deviance
         rests = [(effect, _without(fitter, fit, effect)) for effect in fit.effects]
         weak = [
@@ -493,7 +493,7 @@ def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapp
     for name, index in best_of.items():
         if name == effect.name or drops[index] < 0.7 * min(straight, drop) - 4.0 * SETTINGS.indistinguishable:
             continue
-        rival = fitter.fit(_hypothesis(fitter, rest, table, [*own, index]), fit.noise)
+        rival = fitter.fit_kept(_hypothesis(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
         if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * fewer):

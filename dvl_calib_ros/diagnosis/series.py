@@ -52,7 +52,7 @@ def collect_series(
     for effect in fit.effects:
         others = [other for other in fit.effects if other is not effect]
         # the calibration takes in what it can of the trace, so it is fitted anew without the effect
-        without = fitter.fit(fit.hypothesis.with_effects(others, n, {}), fit.noise)
+        without = fitter.fit_kept(fit.hypothesis.with_effects(others, n, {}), fit.noise)
         traces[effect.name] = problem.errors(without.seen) - errors
     recording_of = problem.recording_of[problem.bin_of]
     times = [problem.sample_time[recording_of == recording] for recording in range(n)]
