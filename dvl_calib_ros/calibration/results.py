@@ -64,8 +64,12 @@ class Estimate:
 
     def _beyond(self, *names: str) -> Array:
         """States of these names, zero where the model has none."""
+        return np.array([self.state_of(name) for name in names])
+
+    def state_of(self, name: str) -> float:
+        """State of this name, zero where the model has none."""
         own = self.state_names
-        return np.array([self.state[own.index(name)] if name in own else 0.0 for name in names])
+        return float(self.state[own.index(name)]) if name in own else 0.0
 
     def std_of(self, *names: str) -> Array | None:
         """Standard deviations of states of these names; None if the model has none of them."""

@@ -286,14 +286,16 @@ def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Work
     from ..evaluation.bags import cross_check, cross_check_document
     from ..replay.replay import Topics
 
-    for option in ("csv", "report"):
-        if getattr(arguments, option) is not None:
-            raise InputError(f"--{option}: only for a folder of trajectories; for bags there is --json")
+    if arguments.csv is not None:
+        raise InputError("--csv: only for a folder of trajectories; for bags there is --json")
+    write_report = report_writer(arguments, "write_cross_check_report")
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
         check = cross_check(arguments.paths, common.load(arguments), models, topics, workers, on_progress)
     if arguments.json is not None:
         common.write_json(arguments.json, cross_check_document(check))
+    if write_report is not None:
+        write_report(arguments.report, check)
     _print_cross_check(check)
 
 
@@ -311,4 +313,29 @@ def _print_cross_check(check: CrossCheck) -> None:
         table.add_section()
         for model, row in zip(check.models, rows, strict=True):
             table.add_row(escape(bag), model, *map(_cell, row))
-    common.console().print(table)
+    out = common.console()
+    out.print(table)
+    if check.navigation:
+        out.print(_drift_table(check))
+
+
+def _drift_table(check: CrossCheck) -> Table:
+    """Dead reckoning of each bag by each other one."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    title = "Dead reckoning: drift in m per km, on bags that were not calibrated on"
+    caption = "with the lever arm of the bag calibrated on; the delay, which is the day's, is that of the bag itself"
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    _set_columns(table, ["calibrated on", "model"], [escape(bag) for bag in check.bags])
+    nothing = [
+        next((each.before.per_km for (_, bag), each in check.navigation.items() if bag == verified), float("nan"))
+        for verified in check.bags
+    ]
+    table.add_row("nothing", "as mounted", *(_cell(value, 1) for value in nothing))
+    for calibrated, model in zip(check.bags, check.selected, strict=True):
+        found = [check.navigation.get((calibrated, verified)) for verified in check.bags]
+        table.add_row(
+            escape(calibrated), model, *("-" if each is None else _cell(each.after.per_km, 1) for each in found)
+        )
+    return table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,18 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..calibration.calibrator import Calibrator
+from ..calibration.delay.hold_out import Recording, Terms
 from ..calibration.error_model import correction_matrix
 from ..calibration.frames import Array
-from ..calibration.models import Needs
+from ..calibration.models import MODELS, Needs
 from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
+from ..calibration.results import Estimate
 from ..calibration.samples import AlignedBlock
 from ..errors import InputError
 from ..parallel import Workers, run_all
+from ..replay.navigation import Navigation, dead_reckoned, navigation_document
 from ..replay.replay import Topics, replay
 from .metrics import Moments, vrmse
 
@@ -29,7 +33,9 @@ class CrossCheck:
 
     bags: (L,). models: (M,). n_paired: (L,) samples that had a reference. uncorrected: (L,) verified on. corrected:
     (L, M, L) calibrated on, model, verified on; nan on the bag itself, without paired samples, and where the model had
-    nothing to calibrate with. notes: what the replays said.
+    nothing to calibrate with; a model with lever arm and delay has them corrected, the delay being that of the day: as
+    the bag verified on shows it, where it does. selected: (L,) model that `navigation` of a bag calibrated on is by.
+    navigation: dead reckoning by (calibrated on, verified on). notes: what the replays said.
     """
 
     bags: tuple[str, ...]
@@ -39,16 +45,25 @@ class CrossCheck:
     corrected: Array
     notes: tuple[str, ...]
     parameters: Mapping[str, Any]
+    selected: tuple[str, ...] = ()
+    navigation: Mapping[tuple[str, str], Navigation] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class _Replayed:
-    """corrections: (M, 3, 3), nan where a model had no sample. moments: of the paired samples, None without."""
+    """corrections: (M, 3, 3), nan where a model had no sample. moments: of the paired samples, None without.
+
+    delayed: by model with a lever arm and delay, if it claims any, what it corrects. recording: all streams, thinned.
+    selected: model that was selected, and what it corrects; None if it used nothing.
+    """
 
     corrections: Array
     moments: Moments | None
     n_paired: int
     notes: tuple[str, ...]
+    delayed: Mapping[str, Terms]
+    recording: Recording | None
+    selected: tuple[str, Terms | None]
 
 
 def cross_check(
@@ -74,6 +89,9 @@ def cross_check(
         for calibrated, other in enumerate(found):
             if calibrated != verified:
                 corrected[calibrated, :, verified] = vrmse(each.moments, other.corrections)
+                for name in set(other.delayed) & set(models):
+                    terms = other.delayed[name]
+                    corrected[calibrated, models.index(name), verified] = _delayed_rmse(each, terms, parameters)
     return CrossCheck(
         bags=tuple(map(str, bags)),
         models=tuple(models),
@@ -82,7 +100,42 @@ def cross_check(
         corrected=corrected,
         notes=tuple(f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in each.notes),
         parameters=parameters.as_dict(),
+        selected=tuple(each.selected[0] for each in found),
+        navigation=_navigation(bags, found, parameters),
     )
+
+
+def _of_the_day(terms: Terms, verified: _Replayed) -> Terms:
+    """With the delay that the bag verified on shows: clocks are synchronised anew every day."""
+    own = next(iter(verified.delayed.values()), None)
+    return terms if own is None else terms._replace(time_offset=own.time_offset)
+
+
+def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> float:
+    if verified.recording is None:
+        return float("nan")
+    every = np.arange(len(verified.recording.dvl.times))
+    error = verified.recording.compared(every, _of_the_day(terms, verified), parameters).error
+    error = error[np.isfinite(error[:, 0])]
+    return float(np.sqrt(np.mean((error**2).sum(axis=1)))) if len(error) else float("nan")
+
+
+def _navigation(
+    bags: Sequence[Path], found: Sequence[_Replayed], parameters: Parameters
+) -> Mapping[tuple[str, str], Navigation]:
+    """Dead reckoning of every bag, corrected by what every other one says."""
+    navigation = {}
+    for calibrated, one in zip(bags, found, strict=True):
+        for verified, other in zip(bags, found, strict=True):
+            _, terms = one.selected
+            if verified == calibrated or terms is None or other.recording is None:
+                continue
+            folds = np.zeros(len(other.recording.dvl.times), dtype=np.int64)
+            # as mounted, the delay is what it is
+            reckoned = dead_reckoned(other.recording, folds, [_of_the_day(terms, other)], parameters)
+            if reckoned is not None:
+                navigation[str(calibrated), str(verified)] = reckoned
+    return navigation
 
 
 def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:
@@ -100,7 +153,13 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
         measured.clear()
         reference.clear()
 
-    replayed = replay([bag], parameters, topics, on_rows=keep_paired, on_restart=forget)
+    kept: list[Recording] = []
+
+    def keep_recording(calibrator: Calibrator) -> None:
+        if calibrator.recording is not None:
+            kept.append(calibrator.recording[0])
+
+    replayed = replay([bag], parameters, topics, on_rows=keep_paired, on_restart=forget, on_finished=keep_recording)
     corrections = np.full((len(models), 3, 3), np.nan)
     for index, name in enumerate(models):
         estimate = replayed.result.estimates[name]
@@ -109,7 +168,25 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
             corrections[index] = correction_matrix(estimate.misalignment, estimate.scale, rotation)
     n_paired = sum(map(len, measured))
     moments = Moments.of(np.concatenate(measured), np.concatenate(reference)) if n_paired else None
-    return _Replayed(corrections, moments, n_paired, replayed.notes)
+    result = replayed.result
+    delayed = {
+        name: _terms(result.estimates[name])
+        for name in dict.fromkeys([*models, result.selected])
+        if (found := result.estimates[name]).used and any(found.state_of(beyond) for beyond in BEYOND)
+    }
+    selected = result.selected, _terms(result.estimate) if result.estimate.used else None
+    return _Replayed(corrections, moments, n_paired, replayed.notes, delayed, kept[0] if kept else None, selected)
+
+
+# States of a lever arm and a delay
+BEYOND = ("lever_arm_x", "lever_arm_y", "lever_arm_z", "time_offset")
+
+
+def _terms(estimate: Estimate) -> Terms:
+    """What an estimate corrects."""
+    errors = MODELS[estimate.model].error_terms_from_state @ estimate.state
+    *arm, late = (estimate.state_of(name) for name in BEYOND)
+    return Terms(errors, np.array(arm), late)
 
 
 def cross_check_document(check: CrossCheck) -> dict[str, Any]:
@@ -125,6 +202,15 @@ def cross_check_document(check: CrossCheck) -> dict[str, Any]:
             for calibrated, rows in by_bag(check.corrected)
         },
         "paired": dict(by_bag(check.n_paired)),
+        "selected": dict(by_bag(check.selected)),
+        "navigation": {
+            calibrated: {
+                bag: navigation_document(check.navigation.get((calibrated, bag)))
+                for bag in check.bags
+                if bag != calibrated
+            }
+            for calibrated in check.bags
+        },
         "notes": list(check.notes),
         "parameters": dict(check.parameters),
         "version": __version__,

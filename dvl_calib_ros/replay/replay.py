@@ -93,12 +93,13 @@ def replay(
     with_history: bool = False,
     on_rows: Callable[[AlignedBlock], None] | None = None,
     on_restart: Callable[[], None] = lambda: None,
+    on_finished: Callable[[Calibrator], None] = lambda _: None,
 ) -> Replayed:
     """Calibrate with the bags at `paths`, read as one in order of log time.
 
     on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way, else on_rows is
-    given the aligned rows, and on_restart told, as by `Calibrator`. Raises InputError if there is no bag or no usable
-    DVL topic.
+    given the aligned rows, and on_restart told, as by `Calibrator`. on_finished: given that at its end.
+    Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
@@ -126,6 +127,7 @@ def replay(
         decoder = MessageDecoder(calibrator.parameters)
         _feed_all(bag, chosen, decoder, calibrator, on_progress)
         calibrator.finish()
+        on_finished(calibrator)
         found += decoder.problems.values()
     result = calibrator.result()
     found += _warnings(result, topics, decoder)

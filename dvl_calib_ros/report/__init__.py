@@ -4,6 +4,7 @@ Needs matplotlib and jinja2; nothing else in the package imports this, the comma
 """
 
 from .comparison_report import write_comparison_report
+from .cross_check_report import write_cross_check_report
 from .diagnosis_report import write_diagnosis_report
 from .evaluation_report import write_evaluation_report
 from .replay_report import write_replay_report
@@ -11,6 +12,7 @@ from .unpaired_report import write_unpaired_report
 
 __all__ = [
     "write_comparison_report",
+    "write_cross_check_report",
     "write_diagnosis_report",
     "write_evaluation_report",
     "write_replay_report",

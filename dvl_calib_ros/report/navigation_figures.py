@@ -28,7 +28,8 @@ def navigation_section(navigation: Navigation | None) -> dict[str, Any] | None:
 def navigation_pictures(one: Navigation, corrected: Mapping[str, Navigation], where: str = "") -> Sequence[Picture]:
     """Map, if headings are known, and error along the track.
 
-    one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone.
+    one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone; the first
+    four are drawn.
     """
     told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
     alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"

@@ -50,7 +50,7 @@ COMMAND = {
         "evaluate runs --partial --params params.yaml", ("runs", "runs/T_dvl.npy", "params.yaml"),
         ("--json", "--csv", "--report"),
     ),
-    "evaluate bags": Command("evaluate bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), ("--json",)),
+    "evaluate bags": Command("evaluate bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), ("--json", "--report")),
     "apply": Command("apply result.yaml", ("result.yaml",), ("--launch", "--fusion")),
     "apply to a URDF": Command(
         "apply result.yaml --urdf r.urdf", ("result.yaml", "r.urdf"), ("-o", "--launch", "--fusion")

@@ -1,0 +1,42 @@
+"""`dvl-calib evaluate BAG BAG`: lever arm and delay are corrected across bags, with drift and pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import succeed
+
+from dvl_calib_ros.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory) -> list[Path]:
+    """Two days of a DVL 1.5 m aft of the reference point, whose clock is 0.6 s and 0.3 s late."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    for name, late in (("monday", "0.6"), ("tuesday", "0.3")):
+        effects = ("--effect", "lever_arm:x_m=-1.5", "--effect", f"dvl_time_offset:seconds={late}")
+        common = ("--trajectory", "figure8", "--duration", "180", "--gnss-std", "0.02", "--gnss-frame", "body")
+        assert main(["simulate", str(folder / name), *common, *effects, "--seed", late[-1]]) == 0
+    return [folder / "monday", folder / "tuesday"]
+
+
+def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_delay(bags, tmp_path, capsys):
+    page, out = tmp_path / "x.html", tmp_path / "x.json"
+    said, _ = succeed(capsys, "evaluate", *bags, "--models", "G1,G2", "--jobs", "1", "--report", page, "--json", out)
+    document = json.loads(out.read_text())
+    monday, tuesday = map(str, bags)
+    by_monday = document["corrected"][monday]
+    assert by_monday["G2"][tuesday] < 0.06 and by_monday["G2"][tuesday] < 0.6 * by_monday["G1"][tuesday]
+    assert document["selected"][monday] == "G2"
+    navigation = document["navigation"][monday][tuesday]
+    assert navigation["drift_m_per_km"]["after"] < navigation["drift_m_per_km"]["before"]
+    assert "Dead reckoning: drift in m per km" in said
+    text = page.read_text()
+    assert text.count("<img") == 4 and "Track, monday" in text and "Error of position, tuesday" in text
+
+
+def test_the_table_for_spreadsheets_is_for_trajectories_only(bags, tmp_path, capsys):
+    assert main(["evaluate", *map(str, bags), "--csv", str(tmp_path / "x.csv")]) == 2
+    assert "only for a folder of trajectories" in capsys.readouterr().err
