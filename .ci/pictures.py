@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -18,6 +20,10 @@ TARGET = ROOT / "docs" / "images"
 HARBOUR_BOX = Path("bags", "harbour_box")  # as it is to stand in a report
 COLOURS = 64
 WIDTH = 1000  # pixels
+BARS = ("#bd1f01", "#ffa90e", "#b9ac70", "#3f90da")
+# A DVL as Gazebo has it: Gaussian noise of one size on the beams, its reference the truth
+GAZEBO = ("--trajectory", "free", "--duration", 300, "--beam-std", 0.01, "--dvl-rate", 5, "--gnss-std", 0,
+          "--gnss-rate", 10, "--seed", 3)  # fmt: skip
 
 
 def dvl_calib(*arguments: object) -> str:
@@ -93,7 +99,45 @@ def diagnosis(folder: Path) -> None:
     screenshot(page, "diagnosis", 1100)
 
 
-PICTURES = {each.__name__: each for each in (demo, watch, report, diagnosis)}
+def simulators(folder: Path) -> None:
+    """Five recordings at sea against a simulator's DVL: the error as it is, with what it lacks, and the noise."""
+    from matplotlib.figure import Figure
+
+    from dvl_calib_ros.report.style import drawing
+
+    sea = Path(os.environ.get("DVL_CALIB_SNAPIR", ROOT.parent / "shared" / "data" / "snapir")).parent / "snapir_ins"
+    bags, made, page = folder / "bags", folder / "gz", folder / "simulators.html"
+    dvl_calib("import", sea, "-o", bags, "--gnss-frame", "ned", "--dvl-std", 0.01, "--gnss-std", 0.01)
+    dvl_calib("simulate", made, *GAZEBO)
+    answers = {}
+    for bag in sorted(bags.iterdir()):
+        report = ["--report", page] if bag.name == "T03" else []
+        dvl_calib("diagnose", bag, "--simulator", made, "--json", folder / f"{bag.name}.json", *report)
+        answers[bag.name] = json.loads((folder / f"{bag.name}.json").read_text())
+    screenshot(page, "simulators_report", 1300)
+    models = ("as it is", "with lever_arm", "with dvl_time_offset", "all effects")
+    with drawing():
+        figure = Figure(figsize=(7.0, 3.0))
+        axes = figure.add_subplot()
+        for place, model in enumerate(models):
+            errors = [next(r["error_mps"] for r in a["shrinks"] if r["model"] == model) for a in answers.values()]
+            at = [index + 0.2 * (place - 1.5) for index in range(len(answers))]
+            axes.bar(at, [1e3 * e for e in errors], 0.18, label=model, color=BARS[place])
+        for index, answer in enumerate(answers.values()):
+            axes.hlines(1e3 * answer["noise_floor_mps"], index - 0.4, index + 0.4, color="#222222", linestyle=":")
+        axes.set_yscale("log")
+        axes.set_yticks([5, 10, 20, 50, 100, 200], ["5", "10", "20", "50", "100", "200"])
+        axes.minorticks_off()
+        axes.set_xticks(range(len(answers)), list(answers))
+        axes.set_ylabel("recorded less simulated, mm/s")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4)
+        figure.savefig(TARGET / "simulators_gap.png", dpi=150)
+    image = Image.open(TARGET / "simulators_gap.png").convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    image.save(TARGET / "simulators_gap.png", optimize=True)
+    print("simulators_gap.png")
+
+
+PICTURES = {each.__name__: each for each in (demo, watch, report, diagnosis, simulators)}
 
 if __name__ == "__main__":
     TARGET.mkdir(parents=True, exist_ok=True)

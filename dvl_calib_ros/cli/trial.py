@@ -30,6 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--case", action="append", metavar="KEY", help="one case, by its key or id (as in sealed/); may be given again"
     )
     amount.add_argument("--full", action="store_true", help="all cases (hours)")
+    amount.add_argument(
+        "--pairs", type=int, metavar="N",
+        help="instead: N pairs of logs of a vehicle and a simulator, for --simulator; 60 are a whole round",
+    )  # fmt: skip
     group.add_argument("--kinds", choices=KIND_CHOICES, default="all", help="of trajectory; default: %(default)s")
     group.add_argument(
         "--family", choices=FAMILY_CHOICES, action="append",
@@ -64,6 +68,9 @@ def run(arguments: argparse.Namespace) -> None:
     from ..trial.truth import unseal
 
     _check(arguments)
+    if arguments.pairs is not None:
+        _run_pairs(arguments)
+        return
     kinds = {"all": KINDS, "tuning": TUNING_KINDS, "held-out": HELD_OUT_KINDS}[arguments.kinds]
     errors = common.console(stderr=True)
     if RECORDED in kinds and not has_ins(recordings_folder()):
@@ -91,6 +98,21 @@ def run(arguments: argparse.Namespace) -> None:
         out.print(_rich(table))
     if result.n_failed:
         errors.print(f"[red]{result.n_failed} cases failed[/]; {trial.answers} says how")
+
+
+def _run_pairs(arguments: argparse.Namespace) -> None:
+    """Compare what is left of the pairs, print the figures and what was not right, write both to the folder."""
+    from ..files.atomic import save_text
+    from ..trial.pairs_run import by_row, figures, misses, run_pairs, score_pair
+
+    with common.progress("pairs") as on_progress:
+        numbers = range(arguments.pairs)
+        found = run_pairs(arguments.out, arguments.seed, numbers, on_progress, 60.0 * arguments.minutes)
+    lines = [str(figure) for figure in figures([score_pair(*each) for each in found])]
+    lines += [f"{row}: {right} of {n} right" for row, (right, n) in by_row(found).items()]
+    lines += misses(found)
+    save_text(arguments.out / "pairs.txt", "\n".join(lines) + "\n")
+    print(*lines, sep="\n")
 
 
 def _chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
@@ -122,6 +144,8 @@ def _check(arguments: argparse.Namespace) -> None:
 
     if arguments.cases is not None and arguments.cases < 1:
         raise InputError(f"--cases: {arguments.cases} is no number of cases; give 1 or more, or --full")
+    if arguments.pairs is not None and arguments.pairs < 1:
+        raise InputError(f"--pairs: {arguments.pairs} is no number of pairs; give 1 or more")
     if arguments.jobs < 0:
         raise InputError(f"--jobs: {arguments.jobs} is negative; give a number of processes, or 0 for one per core")
     if not arguments.minutes >= 0.0:

@@ -47,9 +47,17 @@ def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[flo
 
 
 def run_pairs(
-    folder: Path, seed: int, numbers: Iterable[int], on_progress: Callable[[float], None] = lambda _: None
+    folder: Path,
+    seed: int,
+    numbers: Iterable[int],
+    on_progress: Callable[[float], None] = lambda _: None,
+    seconds: float = math.inf,
 ) -> list[tuple[Document, Document]]:
-    """(truth, answer) of pairs; those that the folder has already are not compared again. Raises InputError."""
+    """(truth, answer) of pairs; those that the folder has already are not compared again. Raises InputError.
+
+    seconds: no further pair is begun after this time.
+    """
+    until = time.monotonic() + seconds
     _prepare(folder, seed)
     done = read_answers(folder / "answers.jsonl")
     wanted = list(numbers)
@@ -57,6 +65,8 @@ def run_pairs(
     with (folder / "answers.jsonl").open("a", encoding="utf-8") as file:
         for place, number in enumerate(wanted, start=1):
             name = pair_id(number, seed)
+            if name not in done and time.monotonic() > until:
+                break
             if name not in done:
                 done[name] = _answer(number, seed, folder)
                 file.write(json.dumps(done[name], sort_keys=True, default=float) + "\n")

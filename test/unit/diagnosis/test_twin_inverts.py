@@ -1,0 +1,45 @@
+"""The forward model of twins and of comparisons is the inverse of the one that the diagnosis fits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.diagnosis.composed import Offsets, is_time_of_run, make_problem, no_effect
+from dvl_calib_ros.diagnosis.recordings import Curve, make_recording
+from dvl_calib_ros.diagnosis.twin import simulated
+from dvl_calib_ros.effects.registry import EFFECTS
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Two minutes of turns, tilts and changes of speed, without noise; the DVL's values are not used."""
+    t = np.arange(0.0, 120.0, 0.1)
+    euler = np.column_stack([0.8 * np.sin(0.11 * t) + 0.02 * t, 0.1 * np.sin(0.3 * t), 0.08 * np.cos(0.23 * t)])
+    attitude = Rotation.from_euler("ZYX", euler)
+    body = np.column_stack([1.4 + 0.5 * np.sin(0.17 * t), 0.15 * np.sin(0.21 * t), 0.1 * np.cos(0.19 * t)])
+    return make_recording("run", (t, body), (t, attitude.apply(body)), attitude=(t, attitude.as_quat()))
+
+
+@pytest.mark.parametrize("name", list(EFFECTS))
+def test_what_an_effect_adds_at_four_times_its_typical_size_is_taken_off_again(recording, name):
+    effect = EFFECTS[name]
+    values = {
+        spec.name: (60.0 if spec.name == "at_s" else effect.defaults[spec.name])
+        if is_time_of_run(spec)
+        else 4.0 * spec.typical
+        for spec in effect.parameters
+    }
+    calibration = no_effect(np.array([0.02, -0.01, 0.03]), np.full(3, 0.005))
+    hypothesis = calibration.with_effects([effect], 1, {name: (values,)})
+    plain = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
+    dvl = Curve(recording.dvl.time, simulated(plain, hypothesis, 0))
+    problem = make_problem([replace(recording, dvl=dvl, _kept={})], np.eye(3), np.zeros(3), [Offsets()])
+    inside = slice(10, -10)  # a delay reaches beyond the ends
+    added = np.abs(problem.residual(problem.all_seen(calibration))[inside]).max()
+    left = np.abs(problem.residual(problem.all_seen(hypothesis))[inside]).max()
+    assert added > 1e-3
+    assert left < 0.02 * added
