@@ -263,7 +263,7 @@ def _sentence(
         text = ", ".join(parts)
         text = text if text.startswith("The") else f"The simulator {text}"
         text += (
-            f": with that the error on the vehicle's own motion falls from {1e3 * before.error_mps:.1f} to "
+            f"; put right, its error on the vehicle's own motion falls from {1e3 * before.error_mps:.1f} to "
             f"{1e3 * after.error_mps:.1f} mm/s, held out"
         )
     elif verdict is Verdict.CANNOT_TELL:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import f as f_distribution
-from scipy.stats import norm
+from scipy.stats import norm, t
 
 from ..calibration.frames import Array
 from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
@@ -31,6 +31,8 @@ THERE = 1e-3
 WORTH_IT = 0.1
 # A regime is named if it holds this share of an effect, and so many times as much as its share of the time
 MOST, DENSER = 0.4, 1.2
+# Parameters of the calibration beside the effects; degrees of freedom that an interval is given at least
+CALIBRATION, FEWEST_DOF = 6, 4
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Size:
     """An effect on one side. values: (p,) its parameters with a derivative, of the day's the mean of the days'.
 
     stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p). dof: of that.
-    found: the side's own diagnosis named it.
+    found: the side's own diagnosis named it. recordings: names of those that have their own, none if they share it.
     """
 
     effect: Effect
@@ -46,6 +48,7 @@ class Size:
     covariance: Array
     dof: int
     found: bool
+    recordings: tuple[str, ...] = ()
 
     @property
     def mean(self) -> tuple[Array, Array]:
@@ -57,12 +60,15 @@ class Size:
         return covariance @ design.T @ weight @ self.stacked.ravel(), np.asarray(covariance)
 
     def intervals(self) -> dict[str, Triple]:
-        """95 per cent, by name."""
-        values, covariance = self.mean
-        reach = norm.ppf(0.975) * np.sqrt(np.diag(covariance))
+        """95 per cent, by name; of the days of several recordings by name and recording."""
+        # the covariance is estimated from as many blocks, which have to tell the calibration and these parameters
+        dof = max(self.dof - CALIBRATION - len(self.covariance), FEWEST_DOF)
+        reach = t.ppf(0.975, dof) * np.sqrt(np.diag(self.covariance))
+        whose = [f" of {name}" for name in self.recordings] or [""]
+        names = [f"{spec.name}{of}" for of in whose for spec in amplitudes(self.effect)]
         return {
-            spec.name: (float(v), float(v - w), float(v + w))
-            for spec, v, w in zip(amplitudes(self.effect), values, reach, strict=True)
+            name: (float(v), float(v - w), float(v + w))
+            for name, v, w in zip(names, self.stacked.ravel(), reach, strict=True)
         }
 
     def p_absent(self) -> float:
@@ -164,11 +170,13 @@ def sizes(selection: Selection, fit: Fit, found: Sequence[str]) -> dict[str, Siz
     n = len(fit.seen)
     result, at = {}, 6
     for effect in fit.effects:
-        p, r = len(amplitudes(effect)), len(whose_parameters(effect, n))
+        whose = whose_parameters(effect, n)
+        p, r = len(amplitudes(effect)), len(whose)
         part = slice(at, at + p * r)
         at += p * r
         stacked = vector[part].reshape(r, p)
-        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found)
+        own = tuple(selection.fitter.problem.recordings[i].name for i in whose if i is not None)
+        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, own)
     return result
 
 
