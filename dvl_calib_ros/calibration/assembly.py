@@ -33,9 +33,10 @@ class Assembler:
         self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise
         self._motion_is_noise = first.motion_is_noise
         self._starts = [(initial or {}).get(model.name) or prior(model, parameters) for model in self.models]
+        self._floors = [_floor(model, parameters) for model in self.models]
         held = [
-            to_correction(state) if model.in_correction_parameters else state
-            for model, state in zip(self.models, self._starts, strict=True)
+            to_correction(state) if model.in_correction_parameters else _without(floor, state)
+            for model, floor, state in zip(self.models, self._floors, self._starts, strict=True)
         ]
         self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
         self._prior_on_errors = {
@@ -61,7 +62,8 @@ class Assembler:
         """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
         held = GaussianState(x.copy(), p.copy())
         if not self.models[index].in_correction_parameters:
-            return held
+            floor = self._floors[index]
+            return held if floor is None else GaussianState(held.x, held.p + floor)
         if self.process_rate is not None:  # what the prior still weighs is then not known
             return to_errors(held)
         return self._prior_on_errors[index].to_errors(held)
@@ -109,6 +111,24 @@ class Assembler:
             noise[index, at] = r + np.eye(3) * axes[at, None, :]
             gate[index, at] = self._gates[axes[at].sum(axis=1)]
         return noise, gate
+
+
+def _floor(model: Model, parameters: Parameters) -> Array | None:
+    """Covariance (n, n) that no data take away: of `Model.sideslip_std`, about the body's z; None for none."""
+    if not model.sideslip_std:
+        return None
+    along = np.zeros(model.n_state)
+    along[:3] = parameters.rotation_dvl_from_body[:, 2]
+    return np.outer(along, along) * model.sideslip_std**2
+
+
+def _without(floor: Array | None, state: GaussianState) -> GaussianState:
+    """What a filter starts from: what its data can never take away is added to what comes out of it."""
+    if floor is None:
+        return state
+    p = state.p - floor
+    # a state that is not of this model may claim to be better
+    return GaussianState(state.x, p) if np.linalg.eigvalsh(p)[0] > 0.0 else state
 
 
 def _dropped_axes(model: Model, unmeasured: Unmeasured) -> Mask:

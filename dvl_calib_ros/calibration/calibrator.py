@@ -21,6 +21,7 @@ from .bank import Group, ModelCounts, groups_of
 from .delay.filter import DelayFilter
 from .delay.hold_out import Recording, Terms
 from .frames import Array, Vector
+from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
 from .models import LINEAR_MODELS, MODELS, Model, Needs
@@ -117,6 +118,8 @@ class Calibrator:
             self._on_block,
             self._verified,
         )
+        self._headings = Headings(self.parameters)
+        self._n_headings = 0  # rows that it has had
         self._seen: dict[Needs, _Seen] = {}
         if self._trace is not None:
             self._trace.start(self._groups)
@@ -162,6 +165,7 @@ class Calibrator:
         if aligner.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
             self._delay.take_rows()
         self._delay.advance()
+        self._look_at_headings()
         if aligner.n_paired > self._n_selected:
             rows = aligner.rows
             at = slice(self._n_selected - rows.base, aligner.n_paired - rows.base)
@@ -170,6 +174,24 @@ class Calibrator:
         for group in self._groups:
             if aligner.given[group.needs] - group.n_given >= self._block_size:
                 self._update(group)
+
+    def _look_at_headings(self) -> None:
+        """Let the selection know once headings show the current: later than the last row could be decided."""
+        aligner, rows = self._aligner, self._aligner.rows
+        first, decided = self._n_headings, aligner.n_oriented
+        if self._headings.shown or decided == first:
+            return
+        if not self._headings.waits_for(int(rows.stamps_ns[decided - 1 - rows.base])):
+            return
+        seen = self._observed(Needs.ATTITUDE, first, decided)
+        oriented = np.zeros(decided - first, dtype=bool)
+        oriented[seen.numbers - first] = True
+        stamps_ns = rows.stamps_ns[first - rows.base : decided - rows.base]
+        shown_ns = self._headings.add(stamps_ns, oriented, seen.observations)
+        self._n_headings = decided
+        if shown_ns is not None:
+            wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
+            self.selection.headings_show_the_current(shown_ns + wait_ns)
 
     def _on_block(self, from_ns: int) -> None:
         """Let the selection, and the trace, know what G2 says after another block."""
@@ -223,6 +245,7 @@ class Calibrator:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
         done = min(self._n_selected, self._delay.n_taken, *(group.next_row for group in self._groups))
+        done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
                 self._on_rows(_own(rows.block(rows.begin + rows.base, done)))

@@ -115,7 +115,8 @@ class Parameters:
     )
     gnss_free_model: str = _parameter(
         "F1",
-        "What auto runs while GNSS is not available; under iac M7, unless this is M5 or M6.",
+        "What auto runs while GNSS is not available: F1, and A1 in its place once there is attitude and headings show "
+        "the current; any other as it is. Under iac M7, unless this is M5 or M6.",
         choices=_UNAIDED,
         read_only=False,
     )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
-from .models import EXTENDED_BY
+from .models import EXTENDED_BY, WITH_HEADINGS
 from .parameters import AUTO, IAC, Parameters
 from .samples import Mask, Stamps
 
@@ -98,12 +99,20 @@ class Selection:
         self._evidence = NO_EVIDENCE
         self._extended = False
         self._referenced_until_ns = 0
-        # what is to be taken note of once DVL samples reach its stamp
-        self._coming: deque[tuple[int, Evidence]] = deque()
+        self._headings = False
+        # what is to be taken note of once DVL samples reach its stamp: evidence, or that headings show the current
+        self._coming: deque[tuple[int, Evidence | None]] = deque()
 
     def extend(self, from_ns: int, evidence: Evidence) -> None:
         """From this stamp on, go by this evidence for the model that extends the one with GNSS."""
-        self._coming.append((from_ns, evidence))
+        self._note(from_ns, evidence)
+
+    def headings_show_the_current(self, from_ns: int) -> None:
+        """From this stamp on, a model with attitude can do without GNSS."""
+        self._note(from_ns, None)
+
+    def _note(self, from_ns: int, what: Evidence | None) -> None:
+        insort(self._coming, (from_ns, what), key=lambda each: each[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         """Take note of DVL samples (N,), in order of stamps, and of whether they were paired."""
@@ -113,6 +122,10 @@ class Selection:
             if at:
                 self._update(stamps_ns[:at], paired[:at], parameters)
             stamps_ns, paired = stamps_ns[at:], paired[at:]
+            if evidence is None:
+                self._headings = True
+                self.record(int(stamps_ns[0]), parameters)
+                continue
             self._evidence = evidence
             self._referenced_until_ns = from_ns + EVIDENCE_HOLDS_NS
             extended = evidence.chi_square >= (EXTENDED_UNTIL if self._extended else EXTENDED_FROM)
@@ -149,7 +162,7 @@ class Selection:
         else:
             return parameters.model
         if not self.gnss.available:
-            return unaided
+            return WITH_HEADINGS.get(unaided, unaided) if parameters.model == AUTO and self._headings else unaided
         if parameters.model == AUTO and self._extended:
             return EXTENDED_BY.get(aided, aided)
         return aided
@@ -159,6 +172,9 @@ class Selection:
         if parameters.model not in (AUTO, IAC):
             return "set by parameter model"
         reason = f"{parameters.model}: {self.gnss.reason}"
+        if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
+            told = "headings tell" if self._headings else "no attitude over headings that would tell"
+            return f"{reason}; {told} a current from the mounting"
         if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
             return reason
         return f"{reason}; {parameters.gnss_model} does not explain the data, which show {self._evidence.found}"

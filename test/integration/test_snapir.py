@@ -84,3 +84,27 @@ def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectorie
 
 def vector_rmse(error) -> float:
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+# Yaw of the vehicle's DVL, deg: what G2 says with the INS as reference on T01 T03 T05 T13, 0.01 to 0.22.
+YAW_DEG = 0.1
+
+
+@pytest.mark.slow
+def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_auto_runs_it(snapir, tmp_path):
+    """Ten manoeuvring recordings as they are, with the recorded attitude."""
+    errors, sigmas, selected = [], [], []
+    for number in range(1, 11):
+        name = f"T{number:02d}"
+        dvl, attitude = (snapir / f"{name}_{kind}.csv" for kind in ("dvl", "attitude"))
+        import_recording(dvl, None, attitude, tmp_path / name, ImportOptions())
+        result = replay([tmp_path / name], Parameters()).result
+        estimate = result.estimates["A1"]
+        errors.append(np.degrees(estimate.state[2]) - YAW_DEG)
+        sigmas.append(np.degrees(estimate.std[2]))
+        selected.append(result.selected)
+    error, scaled = np.array(errors), np.array(errors) / sigmas
+    assert np.median(np.abs(error)) < 0.25
+    assert np.sqrt(np.mean(error**2)) < 0.6
+    assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.1
+    assert selected.count("A1") >= 9

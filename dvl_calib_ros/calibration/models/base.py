@@ -60,6 +60,8 @@ class Model:
     vehicle's motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first
     five states are those of the correction, see `correction_parameters`. extends: the model whose states its own begin
     with, and which it equals while the data show nothing more; such a model is filtered by `DelayFilter`.
+    sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
+    for none. instead_of: the model that `auto` leaves for this one once headings show the current (headings.py).
     """
 
     name: str
@@ -78,6 +80,8 @@ class Model:
     rows_in_body: bool = False
     in_correction_parameters: bool = False
     extends: str | None = None
+    instead_of: str | None = None
+    sideslip_std: float = 0.0
 
     @property
     def aided(self) -> bool:

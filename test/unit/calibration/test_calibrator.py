@@ -237,7 +237,8 @@ def test_a_flapping_receiver_does_not_flap_the_output():
         s for s in make_samples(run)
         if not (isinstance(s, ReferenceSample) and ((s.stamp_ns - START_NS) // SECOND) % 8 < 5)
     ]  # fmt: skip
-    assert len(calibrate(flapping, Parameters(gnss_hysteresis=6.0)).selection.segments) == 1
+    segments = calibrate(flapping, Parameters(gnss_hysteresis=6.0)).selection.segments
+    assert [segment.model for segment in segments] == ["F1", "A1"]
 
 
 def test_a_model_set_by_parameter_is_selected_at_once_and_stays():

@@ -176,6 +176,37 @@ def test_without_attitude_a1_learns_nothing_and_the_others_are_not_kept_waiting(
     assert calibrator.counts["pairing"]["not_oriented"] > 0
 
 
+def test_no_number_of_headings_tells_yaw_better_than_a_vehicle_swims_straight(rng):
+    samples = run_without_gnss((20.0, 200.0) * 4, (0.2, -0.1), (0.0, 0.0, 0.04), rng)
+    yaw = calibrate(samples, Parameters(current_std=0.3), block_size=512).estimate("A1").std[2]
+    assert np.deg2rad(0.5) < yaw < np.deg2rad(0.7)
+
+
+def test_auto_runs_a1_once_headings_tell_a_current_from_the_mounting_and_says_so(rng):
+    samples = run_without_gnss((20.0, 200.0, 20.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
+    calibrator = calibrate(samples, block_size=512)
+    first, second = calibrator.selection.segments
+    assert (first.model, second.model) == ("F1", "A1")
+    assert 100.0 < 1e-9 * (second.from_ns - first.from_ns) < 200.0  # on the second heading
+    assert "headings tell a current from the mounting" in calibrator.result().selected_because
+    for block_size in (1, 30):
+        assert calibrate(samples, block_size=block_size).selection.segments == calibrator.selection.segments
+    assert calibrate(samples, Parameters(gnss_free_model="M7")).selected == "M7"
+
+
+def test_auto_stays_with_f1_on_one_heading_or_without_attitude_and_says_so(rng):
+    samples = run_without_gnss((20.0,) * 3, (0.2, -0.1), (0.0, 0.0, 0.04), rng)
+    for each in (samples, only(run_without_gnss((20.0, 200.0), (0.0, 0.0), (0.0, 0.0, 0.0), rng), DvlSample)):
+        calibrator = calibrate(each)
+        assert calibrator.selected == "F1"
+        assert "no attitude over headings that would tell" in calibrator.result().selected_because
+
+
+def test_with_gnss_headings_change_nothing():
+    segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
+    assert [segment.model for segment in segments] == ["F1", "G1"]
+
+
 def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
     samples = run_without_gnss((20.0,), (0.0, 0.0), (0.0, 0.03, -0.04), rng, seconds_each=400)
     calibrator = calibrate(samples, Parameters(current_std=0.05), block_size=512)
