@@ -151,10 +151,15 @@ class Curve:
 
     @cached_property
     def noise(self) -> Array:
-        """(k,) standard deviation of what is noise: no more than the roughness, and than is claimed."""
+        """(k,) standard deviation of what is noise: the roughness; of a slow stream no more than is claimed.
+
+        Between the samples of a slow stream a vehicle turns, which is rough as well; else a claim is not believed.
+        """
         if self.like is not None:
             return self.like.noise
-        return self.roughness if self.claimed is None else np.minimum(self.roughness, self.claimed)
+        if self.claimed is None or self.interval <= FAST_ENOUGH_S:
+            return self.roughness
+        return np.minimum(self.roughness, self.claimed)
 
     def shaken(self, rng: np.random.Generator) -> Curve:
         """The same with as much noise again."""
