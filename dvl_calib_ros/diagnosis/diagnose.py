@@ -23,6 +23,7 @@ from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
 from .far_clocks import check_clocks
 from .fitting import prior_std
+from .instead import matters, settled
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
 from .recordings import Recording, load_recordings
@@ -31,7 +32,7 @@ from .selection import Selected, Selection, blocks_of, select
 from .series import collect_series
 from .settings import SETTINGS
 from .twin import twins
-from .unexplained import Unexplained, holds_out, unexplained
+from .unexplained import Unexplained, unexplained
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -84,7 +85,7 @@ def diagnose_recordings(
         why = f"{len(selection.fitter.problem.bin_of)} samples have DVL, reference and attitude together"
         return _nothing_to_say(f"{why}; record {SETTINGS.min_seconds:.0f} s at least, better 600 s", notes)
     _check_bounds(selection)
-    rest = unexplained(selection.fitter, selection.fit)
+    selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
     if selection.selected and not _is_borne_out(selection, gap, len(testable)):
@@ -196,22 +197,8 @@ def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
     return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before
 
 
-def _matters(selection: Selection, rest: Unexplained) -> bool:
-    """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
-    problem = selection.fitter.problem
-    if rest.energy < max(SETTINGS.unexplained_energy, SETTINGS.unexplained_size * selection.fit.residual.size):
-        return False
-    stretch = np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds
-    return holds_out(selection.fitter, selection.fit, rest, stretch) > SETTINGS.unexplained_held_out * rest.energy
-
-
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
-    explained = max(0.0, selection.base.deviance - selection.fit.deviance)
-    if (
-        rest.found
-        and _matters(selection, rest)
-        and rest.energy > SETTINGS.unexplained_share * (explained + rest.energy)
-    ):
+    if matters(selection.fitter.problem, selection.fit, rest):
         return Verdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)

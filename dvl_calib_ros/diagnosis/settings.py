@@ -26,10 +26,12 @@ class DiagnosisSettings:
     that no colour of the noise upsets.
 
     Judging: block, folds: of hold-out. noise_tolerance: so many standard errors may the noise of all frequencies lie
-    above that of the high ones. unexplained_share: of the gap, from which a combination of effects does not explain it.
-    unexplained_energy: what is unexplained must have at least, in units of the noise variance, and as a share of all
-    samples, unexplained_size: what interpolation leaves in sharp corners has less. unexplained_held_out: share of it
-    that must be there on stretches that it was not fitted to.
+    above that of the high ones. unexplained_energy: what is unexplained must have at least, in units of the noise
+    variance. unexplained_held_out: deviance that it must explain on stretches that it was not fitted to; there, what
+    is by chance or for how curves are interpolated makes it worse. No share of the gap is asked for: beside a large
+    effect anything is small. instead_of: deviance of effects that an unknown cause may stand in for; more would show
+    without a test, and what a curve between samples leaves of it is more than noise. instead_share: of that, by which
+    it must explain more.
     prior_angle, prior_scale: standard deviation of misalignment and scale, held so where the data says little (roll,
     the scale of sway): else these would take in much of a lever arm.
     """
@@ -54,10 +56,10 @@ class DiagnosisSettings:
     block: float = 20.0
     folds: int = 5
     noise_tolerance: float = 3.0
-    unexplained_share: float = 0.25
-    unexplained_energy: float = 80.0
-    unexplained_size: float = 0.025
-    unexplained_held_out: float = 0.5
+    unexplained_energy: float = 20.0
+    unexplained_held_out: float = 10.0
+    instead_of: float = 1500.0
+    instead_share: float = 0.15
     prior_angle: float = 0.1
     prior_scale: float = 0.02
 

@@ -14,22 +14,20 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..calibration.frames import Array
-from .composed import Grid, Problem, Seen
+from .composed import Problem, Seen
+from .dictionary import ALTERNATIVES, dictionary
 from .fitting import Fit, Fitter
 from .least_squares import WhitenedLeastSquares
+from .made_up import made_up
 from .noise import Noise
 
 LEVEL = 0.001
-TIME_KNOTS = 7
-SPEED_KNOTS = 7
-STEPS = 11
-# Time constants, s, in which a turn may go on acting
-FADES_S = (4.0, 12.0, 40.0)
-# Of these one is enough, and is looked for by itself
-ALTERNATIVES = ("a step in time", "a band of speeds", "turns before")
-HEADING_HARMONICS = 4
 # Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
+# Standard deviation, m/s, of what nothing is known of
+WIDE = 10.0
+# Made-up recordings that tell what is chance, and degrees of freedom of the belief that this is as it should be
+MADE_UP, PRIOR_DOF = 12, 4.0
 # Directions of the dictionary that hold less of their length than this beside the others are left out
 INDEPENDENT = 1e-3
 
@@ -38,13 +36,17 @@ INDEPENDENT = 1e-3
 class Unexplained:
     """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
     variance, beyond what chance brings. about: what the rest follows. columns: (M, A, f), the dictionary; empty if
-    nothing is left, since it would only explain noise.
+    nothing is left, since it would only explain noise. clearest: (M, A, c), those of them that are clearest;
+    clear_energy: of these; price: what the best of as many would explain by chance, once in 1 / LEVEL recordings.
     """
 
     log_p: float
     energy: float
     about: str
     columns: Array
+    clearest: Array
+    clear_energy: float = 0.0
+    price: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -52,108 +54,101 @@ class Unexplained:
         return self.log_p < np.log(LEVEL)
 
 
-def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
-    """Name -> (M, c) functions of motion or time, without unit."""
-    parts = [_of_motion(grid, each) for grid, each in zip(problem.grids, seen, strict=True)]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
-    motion = seen.motion
-    velocity, speed = motion.velocity_body, motion.speed
-    acceleration = np.gradient(velocity[:, 0], motion.time)
-    typical = max(float(np.median(speed)), 0.1)
-    hats = _hats(motion.time, np.linspace(motion.time[0], motion.time[-1], TIME_KNOTS))
-    s = speed / typical
-    found: dict[str, Array] = {
-        "speed": np.column_stack([np.ones_like(s), s, s**2, s**3, np.maximum(s - 1.0, 0.0)]),
-        "a band of speeds": _hats(
-            speed, np.quantile(speed, 0.01) + np.linspace(0.0, 1.0, SPEED_KNOTS) * _spread(speed)
-        ),
-        "acceleration": np.column_stack([acceleration, np.abs(acceleration)]),
-        "sway and heave": np.column_stack([velocity[:, 1:], np.abs(velocity[:, 1:])]),
-        "time": np.column_stack([hats, hats * s[:, None]]),
-        "a step in time": _steps(motion.time, STEPS),
-    }
-    if motion.rotation_enu_from_body is not None:
-        rotation = motion.rotation_enu_from_body
-        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-        roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
-        once = np.column_stack([np.cos(yaw), np.sin(yaw)])
-        more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
-        found["heading"] = np.column_stack([once, once * s[:, None], *more])
-        found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
-        steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
-        up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
-        found["depth"] = np.cumsum(up * steps)[:, None]
-    if motion.angular_velocity is not None:
-        rate = motion.angular_velocity
-        turning = rate[:, 2]
-        found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
-        found["turns before"] = np.column_stack([_faded(motion.time, turning, seconds) for seconds in FADES_S])
-        found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
-    return {name: grid.averaged(values) for name, values in found.items()}
-
-
-def _spread(speed: Array) -> float:
-    return max(float(np.quantile(speed, 0.99) - np.quantile(speed, 0.01)), 1e-3)
-
-
-def _steps(time: Array, count: int) -> Array:
-    """(N, count) functions that step from zero to one at even parts of the time."""
-    at = np.linspace(time[0], time[-1], count + 2)[1:-1]
-    return (time[:, None] >= at).astype(float)
-
-
-def _faded(time: Array, values: Array, seconds: float) -> Array:
-    """(N,) what values (N,) were, fading with a time constant."""
-    steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
-    decay = np.exp(-steps / seconds)
-    out = np.zeros_like(values)
-    for i in range(1, len(values)):
-        out[i] = decay[i] * out[i - 1] + (1.0 - decay[i]) * values[i]
-    return out
-
-
-def _hats(values: Array, knots: Array) -> Array:
-    """Piecewise linear functions (N, knots) that are one at one knot and zero at the others."""
-    return np.column_stack([np.interp(values, knots, row) for row in np.eye(len(knots))])
-
-
 def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
-    """Look for what the residual of a fit still follows."""
+    """Look for what the residual of a fit still follows.
+
+    What is found is held against made-up recordings: in these nothing but the fit is there.
+    """
     problem, noise = fitter.problem, fit.noise
-    known = fit.columns
+    looks, white, raw = _looked(fitter, fit, problem, fit.seen, fit.residual)
+    followed = lines(problem, white.reshape(-1, problem.axes))
+    recoloured: list[tuple[float, float, str]] = []
+    if noise.is_coloured:  # what changes with time alone may as well be noise
+        recoloured = [
+            (*_recoloured(noise, fit.columns, columns, fit.residual), name)
+            for name, columns in raw.items()
+            if name != "time"
+        ]
+    looked_at = float(np.log(len(looks) + len(followed) + len(recoloured)))
+    nominal = [*(look.log_p() for look in looks), *(line.log_p for line in followed), *(each[0] for each in recoloured)]
+    nothing = raw["time"][:, :, :0]
+    if min(nominal) + looked_at > np.log(LEVEL):
+        return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
+    grown = _grown(fitter, fit, looks)
+    of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
+    tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
+    tests += [
+        (line.log_p, f"a period of {line.period_s:.0f} s", _along_axes(line.waves, problem.axes)) for line in followed
+    ]
+    others = [(log_p / of_group[name], name, raw[name]) for log_p, _, name in recoloured]
+    best = min(tests, key=_first)
+    if best[0] + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
+        best = min([*tests, *others], key=_first)
+    log_p = min(best[0], *(each[0] for each in others), 0.0) + looked_at
+    whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
+    energy = max(*(each - dof for each, dof in whole), *(each / of_group[name] for _, each, name in recoloured), 0.0)
+    # the best of many lines would always explain some of the noise
+    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
+    columns = np.concatenate([*raw.values(), *clear], axis=2)
+    clear_energy = explained(_orthonormal(noise.whiten(fit.columns)), noise.whiten(best[2]), white, 1.0)[1]
+    clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(best[1], 1.0)
+    cost = float(chi2.isf(LEVEL / np.exp(looked_at), best[2].shape[2]))
+    found = Unexplained(min(log_p, 0.0), energy, best[1], columns, best[2], clear_energy, cost)
+    return found if found.found else replace(found, columns=nothing, clearest=nothing)
+
+
+def _first(each: tuple[float, str, Array]) -> float:
+    return each[0]
+
+
+@dataclass(frozen=True)
+class Look:
+    """One test. name: of the group of functions; at: which of its columns. energy: explained, chi-square of so many
+    dof; is_whole: of the whole group.
+    """
+
+    name: str
+    at: NDArray[np.intp]
+    is_whole: bool
+    energy: float
+    dof: int
+
+    def log_p(self, grown: float = 1.0) -> float:
+        """Of the energy, which by chance is larger by a factor."""
+        return float(chi2.logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
+
+
+def _looked(
+    fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
+) -> tuple[list[Look], Array, dict[str, Array]]:
+    """All looks at a residual (M, A) of a problem seen through a fit; what it is whitened, of unit variance, beside
+    the fit's columns; and the columns of every group.
+    """
+    noise = fit.noise
+    known = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
     q = _orthonormal(noise.whiten(known))
-    white = noise.whiten(fit.residual)
+    white = noise.whiten(residual)
     white = white - q @ (q.T @ white)
-    variance = float(white @ white) / (len(white) - q.shape[1])
-    tests: list[tuple[float, str]] = []
-    recoloured: list[tuple[float, str]] = []
-    columns, energies = [], [0.0]
-    for name, functions in dictionary(problem, fit.seen).items():
-        raw = _along_axes(functions, problem.axes)
-        columns.append(raw)
-        whitened = noise.whiten(raw)
-        for at in _looks(name, functions.shape[1], problem.axes):
-            tests.append((explained(q, whitened[:, at], white, variance)[0], name))
-        if noise.is_coloured and name != "time":  # what changes with time alone may as well be noise
-            log_p, energy = _recoloured(noise, known, raw, fit.residual)
-            recoloured.append((log_p, name))
-            energies.append(energy)
-    for line in lines(problem, white.reshape(-1, problem.axes) / np.sqrt(variance)):
-        tests.append((line.log_p, f"a period of {line.period_s:.0f} s"))
-        if line.log_p < np.log(LEVEL):  # the best of many would always explain some of the noise
-            columns.append(_along_axes(line.waves, problem.axes))
-    raw = np.concatenate(columns, axis=2)
-    log_p, energy = explained(q, noise.whiten(raw), white, variance)
-    looked_at = float(np.log(len(tests) + len(recoloured) + 1))
-    best, name = min(tests)
-    if best + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
-        best, name = min([*tests, *recoloured])
-    log_p = min(best, *(each for each, _ in recoloured), log_p) + looked_at
-    found = Unexplained(min(log_p, 0.0), max(energy, *energies), name, raw)
-    return found if found.found else replace(found, columns=raw[:, :, :0])
+    white = white / np.sqrt(float(white @ white) / (len(white) - q.shape[1]))
+    looks: list[Look] = []
+    raw: dict[str, Array] = {}
+    for name, functions in dictionary(problem, seen).items():
+        raw[name] = _along_axes(functions, problem.axes)
+        whitened = noise.whiten(raw[name])
+        for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
+            energy, dof = _energy(q, whitened[:, at], white)
+            looks.append(Look(name, at, number == 0, energy, dof))
+    return looks, white, raw
+
+
+def _grown(fitter: Fitter, fit: Fit, looks: Sequence[Look]) -> list[float]:
+    """By what factor each look's energy is larger than chi-square in made-up recordings, at least 1."""
+    energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
+    for other, seen, residual in made_up(fitter.problem, fit, MADE_UP):
+        found, _, _ = _looked(fitter, fit, other, seen, residual)
+        energy += [look.energy for look in found]
+        dof += [look.dof for look in found]
+    return np.maximum(energy / dof, 1.0).tolist()
 
 
 @dataclass(frozen=True)
@@ -194,34 +189,33 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
     return found
 
 
-def holds_out(fitter: Fitter, fit: Fit, rest: Unexplained, fold: NDArray[np.intp]) -> float:
-    """Whitened squares that what the rest follows explains on folds (M,) that it was not fitted to.
+def holds_out(fit: Fit, rest: Unexplained, fold: NDArray[np.intp]) -> float:
+    """Whitened squares that what the rest follows most clearly explains on folds (M,) that it was not fitted to.
 
     One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
     what is there tells of itself elsewhere.
     """
-    functions = dictionary(fitter.problem, fit.seen).get(rest.about)
-    if functions is None:  # a line in the spectrum, which is one of very many
-        return rest.energy
-    raw = _along_axes(functions, fitter.problem.axes)
+    raw = rest.clearest
     size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
     known = fit.columns / np.maximum(np.sqrt((fit.columns**2).mean(axis=(0, 1))), 1e-12)
     white = fit.noise.whiten(np.concatenate([known, raw / size], axis=2))
     series = fit.noise.whiten(fit.residual)
-    rows = np.repeat(fold, fitter.problem.axes)
+    # what is left is no larger than the residual: without that, stretches without a turn would be told of any size
+    likely = float(np.sqrt(np.mean(fit.residual**2)))
+    std = np.concatenate([np.full(known.shape[2], WIDE), np.full(raw.shape[2], likely)])
+    rows = np.repeat(fold, fit.residual.shape[1])
     gain = 0.0
     for held in np.unique(fold):
         train, test = rows != held, rows == held
-        solution = _solved(white[train], series[train])
-        base = _solved(white[train][:, : known.shape[2]], series[train])
+        solution = _solved(white[train], series[train], std)
+        base = _solved(white[train][:, : known.shape[2]], series[train], std[: known.shape[2]])
         left = series[test] - white[test][:, : known.shape[2]] @ base
         gain += float(left @ left - np.sum((series[test] - white[test] @ solution) ** 2))
     return gain
 
 
-def _solved(white: Array, series: Array) -> Array:
-    ridge = np.full(white.shape[1], 10.0)
-    return WhitenedLeastSquares.of(white, series, ridge, np.zeros_like(ridge)).solution()
+def _solved(white: Array, series: Array, std: Array) -> Array:
+    return WhitenedLeastSquares.of(white, series, std, np.zeros_like(std)).solution()
 
 
 def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:
@@ -260,11 +254,17 @@ def _orthonormal(white: Array) -> Array:
 
 def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
     """log p of what columns explain of a whitened series, and their energy beyond chance."""
+    energy, dof = _energy(q, white_columns, white)
+    energy /= variance
+    return (float(chi2.logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
+
+
+def _energy(q: Array, white_columns: Array, white: Array) -> tuple[float, int]:
+    """Square that columns explain of a whitened series, beside those of q, and of how many dimensions."""
     lengths = np.linalg.norm(white_columns, axis=0)
     left = white_columns - q @ (q.T @ white_columns)
     keep = np.linalg.norm(left, axis=0) > 0.02 * np.maximum(lengths, 1e-300)
     if not keep.any():
-        return 0.0, 0.0
+        return 0.0, 0
     u = _orthonormal(left[:, keep])
-    energy = float(np.sum((u.T @ white) ** 2)) / variance
-    return float(chi2.logsf(energy, u.shape[1])), energy - u.shape[1]
+    return float(np.sum((u.T @ white) ** 2)), u.shape[1]

@@ -1,0 +1,56 @@
+"""Effects in whose place something that is in no library explains more."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects.base import Effect
+from .composed import Problem
+from .fitting import Fit
+from .selection import Selection, price
+from .settings import SETTINGS
+from .unexplained import Unexplained, holds_out, unexplained
+
+
+def settled(selection: Selection, n_tested: int) -> tuple[Selection, Unexplained]:
+    """A selection without what an unknown cause explains better, and what it then leaves.
+
+    Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    rest = unexplained(fitter, fit)
+    best: tuple[float, Selection, Unexplained] | None = None
+    for out in _subsets(selection):
+        names = {effect.name for effect in out}
+        kept = [effect for effect in fit.effects if effect.name not in names]
+        reduced = fitter.fit(fit.hypothesis.with_effects(kept, len(fit.seen), {}), fit.noise)
+        drop = reduced.deviance - fit.deviance
+        if drop > SETTINGS.instead_of or not (other := unexplained(fitter, reduced)).found:
+            continue
+        paid = sum(price(effect, n_tested, len(fit.seen)) for effect in out)
+        gain = (other.clear_energy - other.price) - (drop - paid)
+        if gain < SETTINGS.indistinguishable + SETTINGS.instead_share * drop or not matters(
+            fitter.problem, reduced, other
+        ):
+            continue
+        if best is None or gain > best[0]:
+            chosen = tuple(each for each in selection.selected if each.effect.name not in names)
+            best = gain, replace(selection, selected=chosen, fit=reduced), other
+    return (selection, rest) if best is None else (best[1], best[2])
+
+
+def _subsets(selection: Selection) -> list[tuple[Effect, ...]]:
+    effects = selection.fit.effects
+    return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
+
+
+def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
+    """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
+    if not rest.found or rest.energy < SETTINGS.unexplained_energy:
+        return False
+    stretch: NDArray[np.intp] = np.floor(problem.time / SETTINGS.block).astype(np.intp) % SETTINGS.folds
+    return holds_out(fit, rest, stretch) > SETTINGS.unexplained_held_out
