@@ -96,6 +96,22 @@ def test_noise_alone_is_not_taken_for_an_effect(trajectory, seed):
     assert diagnosed(trajectory, seed=seed).verdict not in CLAIMS
 
 
+@pytest.mark.parametrize("share", [0.2, 5.0])
+def test_messages_that_claim_another_noise_than_they_have_make_no_effect(share):
+    given = scenario(seconds=600.0, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.015, seed=11)
+    honest = recording_of(simulate(given))
+    dvl_std, reference_std = np.full(3, share * 0.004), np.full(3, share * 0.015)
+    dvl, reference = replace(honest.dvl, claimed=dvl_std), replace(honest.reference, claimed=reference_std)
+    claiming = replace(honest, dvl=dvl, reference=reference, dvl_std=dvl_std, reference_std=reference_std)
+    assert diagnose_recordings([claiming], Parameters()).verdict not in CLAIMS
+
+
+@pytest.mark.parametrize("seed", [1, 6])
+def test_noise_of_the_dvl_in_what_the_error_is_held_against_is_no_finding(seed):
+    given = Scenario("box", seconds=600.0, seed=seed, gnss_std=0.01, errors=DvlErrors((0.02, -0.03, 0.05)))
+    assert diagnose_recordings([recording_of(simulate(given))], Parameters()).verdict not in CLAIMS
+
+
 @pytest.mark.parametrize(
     ("text", "name", "values"),
     [
@@ -184,6 +200,40 @@ def test_what_comes_and_goes_with_a_period_of_its_own_is_unknown():
     ]
     diagnosis = diagnose_recordings([recording_of(Run(bursts, run.gnss, run.imu))], Parameters())
     assert diagnosis.verdict is Verdict.UNKNOWN and "no effect of the library" in diagnosis.sentence
+
+
+def with_added(run: Run, added) -> Recording:
+    """A run whose DVL measures more than it does: added (N, 3) m/s of times (N,) s and turn rates (N,) rad/s."""
+    first = run.dvl[0].stamp_ns
+    time, imu_time = (np.array([1e-9 * (s.stamp_ns - first) for s in stream]) for stream in (run.dvl, run.imu))
+    turning = np.interp(time, imu_time, [s.angular_velocity[2] for s in run.imu])
+    measured = [
+        replace_velocity(s, tuple(np.add(s.velocity, more)))
+        for s, more in zip(run.dvl, added(time, turning), strict=True)
+    ]
+    return recording_of(Run(measured, run.gnss, run.imu))
+
+
+def last_side(time, turning):
+    """2 cm/s to the side of the last turn, until one to the other side."""
+    side = np.where(np.abs(turning) > 0.05, np.sign(turning), 0.0)
+    at = np.maximum.accumulate(np.where(side != 0.0, np.arange(len(side)), 0))
+    return 0.02 * np.outer(side[at], [0.0, 1.0, 0.0])
+
+
+def test_what_is_unknown_is_so_beside_a_lever_arm_and_a_delay_a_hundred_times_as_large():
+    given = scenario(effects=[LEVER, "dvl_time_offset:seconds=1.2"], gnss_std=0.02, seconds=600.0)
+    diagnosis = diagnose_recordings([with_added(simulate(given), last_side)], Parameters())
+    assert diagnosis.verdict is Verdict.UNKNOWN and "follows turns before" in diagnosis.sentence
+    assert {"lever_arm", "dvl_time_offset"} <= set(found(diagnosis))
+    assert found(diagnosis)["lever_arm"]["x_m"] == pytest.approx(-1.9, abs=0.1)
+
+
+def test_a_step_in_a_bias_is_unknown_and_no_drift():
+    given = scenario(gnss_std=0.03, seconds=600.0)
+    stepped = with_added(simulate(given), lambda time, _: 0.03 * np.outer(time > 400.0, [0.0, 1.0, 0.0]))
+    diagnosis = diagnose_recordings([stepped], Parameters())
+    assert diagnosis.verdict is Verdict.UNKNOWN and "follows a step in time" in diagnosis.sentence
 
 
 def test_an_effect_in_part_of_the_run_is_found_with_its_times():
