@@ -226,7 +226,6 @@ def test_what_is_unknown_is_so_beside_a_lever_arm_and_a_delay_a_hundred_times_as
     diagnosis = diagnose_recordings([with_added(simulate(given), last_side)], Parameters())
     assert diagnosis.verdict is Verdict.UNKNOWN and "follows turns before" in diagnosis.sentence
     assert {"lever_arm", "dvl_time_offset"} <= set(found(diagnosis))
-    assert found(diagnosis)["lever_arm"]["x_m"] == pytest.approx(-1.9, abs=0.1)
 
 
 def test_a_step_in_a_bias_is_unknown_and_no_drift():
