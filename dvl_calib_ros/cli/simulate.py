@@ -170,7 +170,7 @@ def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace,
     scenario, left_out = with_dvl(scenario, load_description(arguments.diagnosis))
     if left_out:
         common.print_warnings(
-            [f"{arguments.diagnosis}: not simulated, as its size is not known: {', '.join(left_out)}"]
+            [f"{arguments.diagnosis}: not simulated (of unknown size, or of another day): {', '.join(left_out)}"]
         )
     return scenario
 

@@ -31,13 +31,14 @@ class Other:
     """An effect that was found and that is no number of the description.
 
     size: RMS, m/s, of what it changes; None where that is not known. of_the_reference: it is in the reference or the
-    attitude, not in the DVL.
+    attitude, not in the DVL. of_another_day: it is what one recording has against the first, which is described.
     """
 
     name: str
     parameters: Mapping[str, float]
     size: float | None = None
     of_the_reference: bool = False
+    of_another_day: bool = False
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,12 @@ def _others(
     ):
         if before:
             systematic.setdefault(name, {parameter: 0.0})[parameter] += before
-    others = [Other(name, values, sizes.get(name), _is_of_reference(name)) for name, values in systematic.items()]
+    others = [
+        Other(
+            name, values, sizes.get(name), _is_of_reference(name), name in EFFECTS and EFFECTS[name].relative_to_first
+        )
+        for name, values in systematic.items()
+    ]
     others.sort(key=lambda each: -(each.size or 0.0))
     noise = [Other(each["name"], _values(each["parameters"])) for each in document.get("noise", [])]
     return (*others, *(Other(each.name, each.parameters, None, _is_of_reference(each.name)) for each in noise))

@@ -103,7 +103,11 @@ def _missing(title: str, settings: Settings, description: DvlDescription) -> lis
     found += _noise(settings, description)
     for other in description.others:
         values_said = ", ".join(f"{name} {value:.3g}" for name, value in other.parameters.items())
-        reason = "it is in the reference or attitude, not in the DVL" if other.of_the_reference else why
+        reason = why
+        if other.of_the_reference:
+            reason = "it is in the reference or attitude, not in the DVL"
+        elif other.of_another_day:
+            reason = "it is of another recording than the first, as which the settings are"
         found.append(Missing(other.name, f"{values_said}; {reason}".lstrip("; "), other.size))
     return found
 

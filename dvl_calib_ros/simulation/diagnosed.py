@@ -9,7 +9,7 @@ from ..effects.base import AnyEffect
 from ..effects.composition import Injection
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
-from ..export.description import DvlDescription
+from ..export.description import DvlDescription, Other
 from .scenario import Scenario
 from .sensors import JANUS_FROM_VERTICAL, DvlErrors
 
@@ -29,7 +29,7 @@ def with_dvl(scenario: Scenario, description: DvlDescription) -> tuple[Scenario,
     found = {
         "lever_arm": dict(zip(("x_m", "y_m", "z_m"), description.lever_arm, strict=True)),
         "velocity_bias": dict(zip(("x_mps", "y_mps", "z_mps"), description.velocity_bias, strict=True)),
-        **{other.name: dict(other.parameters) for other in description.others if other.name not in _NOT_TAKEN},
+        **{other.name: dict(other.parameters) for other in description.others if _is_taken(other)},
     }
     effects = tuple(_injection(description, name, values) for name, values in found.items() if any(values.values()))
     taken = replace(
@@ -39,7 +39,11 @@ def with_dvl(scenario: Scenario, description: DvlDescription) -> tuple[Scenario,
         dvl_rate=description.rate_hz or scenario.dvl_rate,
         effects=(*effects, *scenario.effects),
     )
-    return taken, tuple(other.name for other in description.others if other.name in _NOT_TAKEN)
+    return taken, tuple(other.name for other in description.others if not _is_taken(other))
+
+
+def _is_taken(other: Other) -> bool:
+    return other.name not in _NOT_TAKEN and not other.of_another_day
 
 
 def _injection(description: DvlDescription, name: str, values: dict[str, float]) -> Injection:
