@@ -4,7 +4,8 @@
 
 A vehicle with effects by chance is simulated and diagnosed, the diagnosis is exported, a simulator is made of the file
 as its settings say (`other_simulators`, which knows nothing of the export), and its log of another motion is diagnosed.
-What then differs from the first diagnosis must be listed as missing.
+What then differs must be listed as missing: number by number between the two diagnoses, and by what
+`diagnose VEHICLE --simulator LOG` claims of the two bags.
 """
 
 from __future__ import annotations
@@ -22,35 +23,44 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.cli.common import write_json
-from dvl_calib_ros.diagnosis.diagnose import diagnose, diagnosis_document
+from dvl_calib_ros.diagnosis.results import diagnosis_document
 from dvl_calib_ros.export.description import load_description
 from dvl_calib_ros.export.simulator import export
 from dvl_calib_ros.export.simulators import SIMULATORS
+from dvl_calib_ros.replay.replay import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.unpaired.compare import compare_logs
+from dvl_calib_ros.unpaired.logs import Log, Source, read_log
 
 SECONDS = 240.0
 # A number of the log that is further from the source's than that, in its own standard deviations, is another one. Of
 # some ten numbers a case, forty cases hold one beyond 4 by chance in one of forty runs
 FAR = 4.0
 SAME_NOISE = 0.25
+# What the comparison of both bags calls what the diagnosis and the export call otherwise
+CALLED = {"heavy_tails": "outliers", "stale": "stale_samples", "repeats": "stale_samples"}
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A case: what the vehicle had, what was found, what differs in the simulator's log, what the export said."""
+    """A case: what the vehicle had, what was found, what differs in the simulator's log, what the export said.
+
+    differs: by the numbers of both diagnoses. claimed: by the comparison of both bags.
+    """
 
     simulator: str
     injected: tuple[str, ...]
     found: tuple[str, ...]
     differs: frozenset[str]
+    claimed: frozenset[str]
     missing: frozenset[str]
 
     @property
     def unsaid(self) -> frozenset[str]:
-        return self.differs - self.missing
+        return (self.differs | self.claimed) - self.missing
 
 
 def effects(rng: np.random.Generator) -> list[str]:
@@ -85,24 +95,36 @@ def run(simulator: str, seed: int, folder: Path) -> Outcome:
     )  # fmt: skip
     write_bag(scenario, folder / "vehicle", Storage.MCAP, Compression.NONE)
     parameters = Parameters(mounting_rpy=mounting, min_speed=0.0)
-    source = diagnosed(folder / "vehicle", parameters)
+    vehicle, source = diagnosed(folder / "vehicle", parameters)
     description = load_description(folder / "vehicle.json")
     exported = export(simulator, SIMULATORS[simulator], description)
     (folder / "settings").write_text(exported.settings.text)
     write_log(folder / "log", READERS[simulator](folder / "settings"), SECONDS, seed + 10_000)
-    log = diagnosed(folder / "log", parameters)
+    made, log = diagnosed(folder / "log", parameters)
     return Outcome(
         simulator,
         tuple(injected),
         tuple(each["name"] for each in source["effects"]),
         frozenset(differences(source, log, description, load_description(folder / "log.json"))),
+        frozenset(claimed(vehicle, made)),
         frozenset(each.name for each in exported.missing),
     )
 
 
-def diagnosed(bag: Path, parameters: Parameters) -> dict:
-    write_json(bag.with_suffix(".json"), diagnosis_document(diagnose([bag], parameters)))
-    return json.loads(bag.with_suffix(".json").read_text())
+def diagnosed(bag: Path, parameters: Parameters) -> tuple[Log, dict]:
+    log = read_log(Source((bag,), parameters, Topics()))
+    write_json(bag.with_suffix(".json"), diagnosis_document(log.diagnosis))
+    return log, json.loads(bag.with_suffix(".json").read_text())
+
+
+def claimed(vehicle: Log, simulator: Log) -> list[str]:
+    """What the comparison of both sides claims to differ, by the names of the export."""
+    comparison = compare_logs(vehicle, simulator)
+    found = [each.name for each in comparison.effects if each.status.is_claim]
+    for each in comparison.noise:
+        if each.status.is_claim:
+            found.append("noise" if each.name.startswith("level_") else CALLED.get(each.name, each.name))
+    return found
 
 
 def differences(source: dict, log: dict, of_source, of_log) -> list[str]:
@@ -161,7 +183,8 @@ def main() -> int:
         print(
             f"{number:3d} {outcome.simulator:13s} {said} | injected {'; '.join(outcome.injected) or 'nothing'}"
             f" | found {', '.join(outcome.found) or 'nothing'}"
-            f" | differs {', '.join(sorted(outcome.differs)) or 'nothing'}",
+            f" | differs {', '.join(sorted(outcome.differs)) or 'nothing'}"
+            f" | claimed {', '.join(sorted(outcome.claimed)) or 'nothing'}",
             flush=True,
         )
     print(f"{good} of {arguments.cases}: nothing but what the export said it could not represent")
