@@ -85,7 +85,7 @@ def _whole(selection: Selection, parameters: Parameters) -> Hypothesis:
     }
     values: dict[str, tuple[Values, ...]] = {}
     for name, known in before.items():
-        if not any(known):
+        if not any(known) or not EFFECTS[name].needs <= selection.fitter.problem.available:
             continue
         found = hypothesis.values.get(name) or (EFFECTS[name].defaults,) * n
         names = dict(zip(_KNOWN_BEFORE[name], known, strict=True))

@@ -247,3 +247,30 @@ def test_the_diagnosis_of_a_bag_says_what_the_export_needs(tmp_path, capsys):
     # ω × l of the whole lever arm, not only of what was found on top
     assert 0.05 < found.sizes["lever_arm"] < 0.3
     assert found.sizes["scale"] == pytest.approx(0.008 * found.speed[0], rel=0.25)
+
+
+def test_a_recording_without_an_imu_is_diagnosed_and_exported_with_the_lever_arm_that_was_given(tmp_path, capsys):
+    succeed(capsys, "simulate", tmp_path / "bag", "--trajectory", "free", "--duration", "120", "--gnss-frame", "body",
+            "--imu-rate", "0")  # fmt: skip
+    given_before = ("-p", "mounting_rpy:=[0.0,0.0,0.0]", "-p", "lever_arm:=[0.5,0.0,0.0]", "-p", "dvl_time_offset:=0.1")
+    succeed(capsys, "diagnose", tmp_path / "bag", "--json", tmp_path / "d.json", *given_before)
+    found = load_description(tmp_path / "d.json")
+    assert found.lever_arm == (0.5, 0.0, 0.0) and "lever_arm" not in found.sizes
+    assert 0.0 < found.sizes["dvl_time_offset"] < 0.2
+    assert {"seconds": pytest.approx(0.1, abs=0.12)} in [each.parameters for each in found.others]
+
+
+@pytest.mark.slow
+def test_several_recordings_are_exported_as_the_first_and_what_the_others_have_is_listed(tmp_path, capsys):
+    common = ("--trajectory", "free", "--duration", "240", "--gnss-std", "0.02", "--waves", "0.3", "5")
+    for day, (yaw, late) in enumerate((("3", "0.2"), ("6", "0.7")), start=1):
+        succeed(capsys, "simulate", tmp_path / f"day{day}", *common, "--misalignment", "0", "0", yaw, "--seed", day,
+                "--effect", f"dvl_time_offset:seconds={late}", "--effect", "lever_arm:x_m=1")  # fmt: skip
+    bags = [tmp_path / "day1", tmp_path / "day2"]
+    succeed(capsys, "diagnose", *bags, "--json", tmp_path / "d.json", "-p", "mounting_rpy:=[0.0,0.0,0.0]")
+    succeed(capsys, "export", "gazebo", tmp_path / "d.json", "-o", tmp_path / "dvl.sdf")
+    rotation = Rotation.from_matrix(READERS["gazebo"](tmp_path / "dvl.sdf").rotation)
+    assert rotation.as_euler("xyz", degrees=True)[2] == pytest.approx(3.0, abs=0.5)
+    beside = {each["name"]: each for each in json.loads((tmp_path / "dvl.sdf.missing.json").read_text())["missing"]}
+    assert "another recording" in beside["mounting_moved"]["says"]
+    assert beside["dvl_time_offset"]["error_mps"] > 0.05
