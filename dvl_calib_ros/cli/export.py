@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("simulator", choices=tuple(SIMULATORS), metavar="SIMULATOR", help=", ".join(SIMULATORS))
     parser.add_argument(
-        "source", type=Path, metavar="DIAGNOSIS", help="what diagnose --json wrote; or a calibration's result file"
+        "source", type=Path, metavar="DIAGNOSIS", help="what diagnose --json wrote; or a result or parameter file"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="settings to write")
 

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--diagnosis", type=Path, metavar="FILE",
-        help="the DVL that was found (diagnose --json, or a result file): mounting, scale, noise, rate and effects",
+        help="the DVL that was found: what diagnose --json wrote, or a result or parameter file",
     )  # fmt: skip
     parser.add_argument(
         "--truth", action="store_true", help="attach all that was simulated to the bag, as truth.json (MCAP only)"

@@ -35,7 +35,8 @@ class DvlSeen:
     mounting_rpy: (3,) rad, nominal, and lever_arm: (3,) m, both as given, without what was found. time_offset: s, and
     clock_drift: s per s, that were taken off its stamps before. rate_hz: samples per second. noise_std: (3,) m/s, of
     its axes, from sample to sample: what the motion does not explain, at most. speed: (3,) m/s, RMS along its axes.
-    sizes: RMS, m/s, of the vector by which each error changes what it measures: `misalignment`, `scale`, effects.
+    sizes: RMS, m/s, of the vector by which each error changes what it measures: `misalignment`, `scale`, effects, and
+    what repeated samples miss.
     """
 
     mounting_rpy: Three
@@ -46,6 +47,10 @@ class DvlSeen:
     noise_std: Three
     speed: Three
     sizes: Mapping[str, float]
+
+
+# Of finding stale_samples: how much the velocity has changed since the sample that is repeated
+STALE = "stale_samples"
 
 
 def dvl_seen(selection: Selection, parameters: Parameters) -> DvlSeen:
@@ -61,6 +66,10 @@ def dvl_seen(selection: Selection, parameters: Parameters) -> DvlSeen:
             for effect in hypothesis.effects
         },
     }
+    sizes = {name: _rms(measured - _measured(problem, each)) for name, each in without.items()}
+    repeats, received = (sum(getattr(each, name) for each in problem.recordings) for name in ("repeats", "received"))
+    if repeats:
+        sizes[STALE] = float(np.sqrt(repeats / received)) * _rms(np.diff(measured, axis=0))
     streams = [recording.dvl for recording in problem.recordings]
     return DvlSeen(
         mounting_rpy=_three(parameters.mounting_rpy),
@@ -70,7 +79,7 @@ def dvl_seen(selection: Selection, parameters: Parameters) -> DvlSeen:
         rate_hz=1.0 / float(np.median([stream.interval for stream in streams])),
         noise_std=_three(_noise(problem.recordings, selection)),
         speed=_three(np.sqrt((measured**2).mean(axis=0))),
-        sizes={name: _rms(measured - _measured(problem, each)) for name, each in without.items()},
+        sizes=sizes,
     )
 
 

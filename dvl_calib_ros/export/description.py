@@ -1,4 +1,4 @@
-"""One description of a DVL for all writers, from a diagnosis or a calibration's result file."""
+"""One description of a DVL for all writers, from a diagnosis, a calibration's result file or a parameter file."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from ..calibration.frames import rotation_from_rpy, rpy_from_rotation
 from ..effects.base import ActsOn, AnyEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
+from ..files.parameter_files import load_parameters
 from ..files.result_file import FORMAT, load_result
 
 Three = tuple[float, float, float]
@@ -24,6 +25,7 @@ GIVEN_AS_NUMBERS = ("lever_arm", "velocity_bias")
 _OF_THE_REFERENCE = (ActsOn.REFERENCE, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
 # A diagnosis has some ten thousand bytes; what is much larger is none, and is not read to find out
 LARGEST_FILE = 1 << 24
+RESULT, PARAMETERS = "result", "parameters"
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,10 @@ class DvlDescription:
 
 
 def load_description(path: Path) -> DvlDescription:
-    """Of a diagnosis (JSON) or a result file (YAML). Raises InputError."""
-    document = _json(path)
-    if document is None:
-        return _of_result(path)
+    """Of a diagnosis (JSON), a result file or a parameter file (YAML). Raises InputError."""
+    document = _document(path)
+    if isinstance(document, str):
+        return _of_result(path) if document == RESULT else _of_parameters(path)
     if not isinstance(document, dict) or "effects" not in document or "calibration" not in document:
         raise InputError(f"{path}: no diagnosis; give what dvl-calib diagnose --json writes, or a result file")
     if "dvl" not in document:
@@ -94,8 +96,8 @@ def load_description(path: Path) -> DvlDescription:
         raise InputError(f"{path}: damaged diagnosis ({type(error).__name__}: {error}); diagnose again") from error
 
 
-def _json(path: Path) -> Any | None:
-    """Content of a JSON file; None if it is a result file. Raises InputError."""
+def _document(path: Path) -> Any:
+    """Content of a JSON file; of another what it is, RESULT or PARAMETERS. Raises InputError."""
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise InputError(f"{path}: is too large for a diagnosis; give what dvl-calib diagnose --json writes")
@@ -109,9 +111,12 @@ def _json(path: Path) -> Any | None:
             return json.loads(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: no valid JSON ({error}); diagnose again") from error
-    if f"format: {FORMAT}" in text:
-        return None
-    raise InputError(f"{path}: neither a diagnosis (JSON) nor a result file (YAML); see dvl-calib diagnose --json")
+    for kind, mark in ((RESULT, f"format: {FORMAT}"), (PARAMETERS, "ros__parameters")):
+        if mark in text:
+            return kind
+    raise InputError(
+        f"{path}: neither a diagnosis (JSON) nor a result or parameter file (YAML); see dvl-calib diagnose --json"
+    )
 
 
 def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
@@ -160,7 +165,10 @@ def _others(
     ]
     others.sort(key=lambda each: -(each.size or 0.0))
     noise = [Other(each["name"], _values(each["parameters"])) for each in document.get("noise", [])]
-    return (*others, *(Other(each.name, each.parameters, None, _is_of_reference(each.name)) for each in noise))
+    return (
+        *others,
+        *(Other(each.name, each.parameters, sizes.get(each.name), _is_of_reference(each.name)) for each in noise),
+    )
 
 
 def _is_of_reference(name: str) -> bool:
@@ -193,3 +201,26 @@ def _of_result(path: Path) -> DvlDescription:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged, it holds no mounting ({type(error).__name__}: {error})") from error
+
+
+def _of_parameters(path: Path) -> DvlDescription:
+    """Of what calibration compensates, as diagnose --apply writes it."""
+    parameters = load_parameters(path, [])
+    east, north = parameters.reference_velocity_offset
+    effects: dict[str, dict[str, float]] = {
+        "dvl_time_offset": {"seconds": parameters.dvl_time_offset},
+        "clock_drift": {"seconds_per_hour": 3600.0 * parameters.dvl_clock_drift},
+        "reference_time_offset": {"seconds": parameters.reference_time_offset},
+        "attitude_time_offset": {"seconds": parameters.imu_time_offset},
+        "water_lock": {"east_mps": -east, "north_mps": -north},
+    }
+    return DvlDescription(
+        source=str(path),
+        mounting_rpy=_three(parameters.mounting_rpy),
+        lever_arm=_three(parameters.lever_arm),
+        others=tuple(
+            Other(name, values, None, _is_of_reference(name))
+            for name, values in effects.items()
+            if any(values.values())
+        ),
+    )

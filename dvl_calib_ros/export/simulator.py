@@ -108,6 +108,8 @@ def _missing(title: str, settings: Settings, description: DvlDescription) -> lis
             reason = "it is in the reference or attitude, not in the DVL"
         elif other.of_another_day:
             reason = "it is of another recording than the first, as which the settings are"
+        elif "factor" in other.parameters:
+            reason = "noise is set as it is; that messages claim less is no setting"
         found.append(Missing(other.name, f"{values_said}; {reason}".lstrip("; "), other.size))
     return found
 

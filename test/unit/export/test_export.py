@@ -209,6 +209,19 @@ def test_a_result_file_of_a_calibration_is_exported_too(tmp_path, capsys):
     assert "rate" in beside["defaults"]
 
 
+def test_a_parameter_file_is_exported_as_what_calibration_compensates(tmp_path, capsys):
+    (tmp_path / "p.yaml").write_text(
+        "/**: {ros__parameters: {lever_arm: [0.5, 0.0, -0.1], mounting_rpy: [0.0, 0.0, 0.3], dvl_time_offset: 0.4,"
+        " reference_velocity_offset: [0.05, 0.0]}}\n"
+    )
+    succeed(capsys, "export", "holoocean", tmp_path / "p.yaml", "-o", tmp_path / "dvl.json")
+    sensor = json.loads((tmp_path / "dvl.json").read_text())
+    assert sensor["location"] == [0.5, 0.0, -0.1] and sensor["rotation"][2] == pytest.approx(math.degrees(0.3))
+    beside = json.loads((tmp_path / "dvl.json.missing.json").read_text())
+    assert {each["name"] for each in beside["missing"]} == {"dvl_time_offset", "water_lock"}
+    succeed(capsys, "simulate", tmp_path / "bag", "--duration", "10", "--diagnosis", tmp_path / "p.yaml")
+
+
 @pytest.mark.parametrize(
     "content, said",
     [
@@ -247,6 +260,15 @@ def test_the_diagnosis_of_a_bag_says_what_the_export_needs(tmp_path, capsys):
     # ω × l of the whole lever arm, not only of what was found on top
     assert 0.05 < found.sizes["lever_arm"] < 0.3
     assert found.sizes["scale"] == pytest.approx(0.008 * found.speed[0], rel=0.25)
+
+
+def test_repeated_samples_have_a_size(tmp_path, capsys):
+    succeed(capsys, "simulate", tmp_path / "bag", "--trajectory", "free", "--duration", "120", "--waves", "0.5", "4",
+            "--effect", "stale_samples:share=0.1")  # fmt: skip
+    succeed(capsys, "diagnose", tmp_path / "bag", "--json", tmp_path / "d.json", "-p", "mounting_rpy:=[0.0,0.0,0.0]")
+    stale = next(each for each in load_description(tmp_path / "d.json").others if each.name == "stale_samples")
+    # the velocity changes by some centimetres per second from sample to sample; a tenth of them is missed
+    assert 0.005 < stale.size < 0.1
 
 
 def test_a_recording_without_an_imu_is_diagnosed_and_exported_with_the_lever_arm_that_was_given(tmp_path, capsys):
