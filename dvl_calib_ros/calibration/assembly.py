@@ -73,9 +73,11 @@ class Assembler:
         heave were known at the sample; models that need them skip it where not."""
         k, n_samples = len(self.models), len(seen.velocity_dvl)
         z = np.empty((k, n_samples, self._m))
-        h = np.empty((k, n_samples, self._m, self._n))
+        h = np.zeros((k, n_samples, self._m, self._n))
         for index, model in enumerate(self.models):
-            z[index], h[index] = model.linearise(seen)
+            # a model that extends another has columns for what that has; the rest is not shown sample by sample
+            z[index], own = model.linearise(seen)
+            h[index, :, :, : own.shape[2]] = own
         usable = ~self._needs_prior[:, None] | prior_known
         noise = (seen.noise if self._model_noise is None else self._model_noise(seen))[None, :, : self._m, : self._m]
         own_weight = (seen.motion_weight if self._motion_is_noise else weight)[None]

@@ -14,6 +14,7 @@ dense algebra of one of them.)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -103,7 +104,7 @@ def recursion(
 
     x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q that the state gains before each sample, or None.
     ends: (E,) ascending numbers of samples (0..N) after which the state is wanted, too. Raises LinAlgError where S is
-    not positive definite.
+    not positive definite, or numbers are not finite.
     """
     # each model by itself: live there is one, and products of single matrices cost a third of those of stacks
     return Updated.joined(
@@ -134,6 +135,8 @@ def _recursion_of_one(
         hpht = h @ pht
         innovation = z[i] - h @ x
         nis_i = float(innovation @ _solve_definite(hpht + r_i, innovation))
+        if not math.isfinite(nis_i):
+            raise np.linalg.LinAlgError("the numbers have run away")
         use = usable[i] and nis_i <= gate[i]
         if use:
             if weight[i] != 1.0:  # the gate asks whether this sample fits; the update, how much it may weigh
@@ -220,46 +223,60 @@ class _Solved(NamedTuple):
 def _solve(x: Array, p: Array, data: Measurements) -> _Solved | None:
     """The information after every sample.
 
-    Whether a sample passes the gate depends on the samples before it. So: assume all pass, compute every state at
-    once, gate every sample against its state, and repeat with what passed until nothing changes. Each pass settles at
-    least the first sample still wrong, so the fixed point is the recursion's own sequence of decisions. None when it
-    does not settle in MAX_GATE_PASSES.
+    Whether a sample passes the gate depends on the samples before it. So: guess by the state before all of them which
+    pass, compute every state at once, gate every sample against its state, and repeat with what passed until nothing
+    changes. Each pass settles at least the first sample still wrong, so the fixed point is the recursion's own sequence
+    of decisions. None when it does not settle in MAX_GATE_PASSES.
     """
-    n, m = x.shape[1], data.z.shape[2]
+    n = x.shape[1]
     prior = np.linalg.inv(p)
     prior_state = (prior @ x[:, :, None])[:, :, 0]
-    h = np.ascontiguousarray(np.moveaxis(data.h, (2, 3), (0, 1)))  # (m, n, K, N)
-    z = np.ascontiguousarray(np.moveaxis(data.z, 2, 0))  # (m, K, N)
-    wh = _weighted(data, h)
+    h, z = _whitened(data)
+    wh = h if (data.weight == 1.0).all() else h * data.weight
     # with room in front for the prior: the running sums are then taken in place
     room = (x.shape[0], data.z.shape[1] + 1)
     gained = [[_gain(wh[:, i], h[:, j], room) for j in range(i + 1)] for i in range(n)]
     gained_state = [_gain(wh[:, i], z, room) for i in range(n)]
+    used = data.usable
     gated = bool(np.isfinite(data.gate).any())
-    used, all_used = data.usable, bool(data.usable.all())
+    if gated:
+        used = used & _passes_before(x, prior, prior_state, h, z, data.gate)
     for _ in range(MAX_GATE_PASSES):
-        mask = None if all_used else used
+        mask = None if used.all() else used
         information = [[_running_sum(prior[:, i, j], gained[i][j], mask) for j in range(i + 1)] for i in range(n)]
         information_state = [_running_sum(prior_state[:, i], gained_state[i], mask) for i in range(n)]
-        nis = _normalised_innovation_squared(information, information_state, h, z, data.r, m)
+        nis = _normalised_innovation_squared(
+            [[column[:, :-1] for column in row] for row in information],
+            [column[:, :-1] for column in information_state],
+            h,
+            z,
+        )
         passed = data.usable & (nis <= data.gate)
         if not gated or np.array_equal(passed, used):
             return _Solved(information, information_state, used, np.where(data.usable, nis, 0.0))
-        used, all_used = passed, False
+        used = passed
     return None
 
 
-def _weighted(data: Measurements, h: Array) -> Array:
-    """R⁻¹H times the samples' weights, (m, n, K, N)."""
-    inverse = _inverse(data.r)
-    m = len(h)
-    if data.r.shape[:2] == (1, 1):
-        wh = (inverse[0, 0] @ h.reshape(m, -1)).reshape(h.shape)
-    else:
-        wh = np.stack([_dot([inverse[..., i, k] for k in range(m)], h) for i in range(m)])
-    if (data.weight != 1.0).any():
-        wh *= data.weight
-    return wh
+def _passes_before(x: Array, prior: Array, prior_state: Array, h: Array, z: Array, gate: Array) -> Mask:
+    """Which samples (K, N) pass the gate by the state x (K, n) with Λ (K, n, n) and Λx (K, n) before all of them."""
+    innovation = [each - _dot(row, x.T[..., None]) for row, each in zip(h, z, strict=True)]
+    passes = _dot(innovation, innovation) <= gate
+    # S is no less than R, so only those that fail with R alone may fail
+    k, at = np.nonzero(~passes)
+    if len(k):
+        n = x.shape[1]
+        information = [[prior[k, i, j] for j in range(i + 1)] for i in range(n)]
+        nis = _normalised_innovation_squared(information, [*prior_state[k].T], h[:, :, k, at], z[:, k, at])
+        passes[k, at] = nis <= np.broadcast_to(gate, passes.shape)[k, at]
+    return passes
+
+
+def _whitened(data: Measurements) -> tuple[Array, Array]:
+    """H (m, n, K, N) and z (m, K, N) of rows that are turned and scaled so that their noise is 1."""
+    h, z = np.moveaxis(data.h, (2, 3), (0, 1)), np.moveaxis(data.z, 2, 0)
+    low, inverse_diagonal = _cholesky([[data.r[..., i, j] for j in range(i + 1)] for i in range(len(z))])
+    return np.stack(_forward(low, inverse_diagonal, h)), np.stack(_forward(low, inverse_diagonal, z))
 
 
 def _gain(a: Array, b: Array, room: tuple[int, int]) -> Array:
@@ -330,7 +347,7 @@ def _forward(low: Elements, inverse_diagonal: Sequence[Array], b: Sequence[Array
     y: list[Array] = []
     for i, value in enumerate(b):
         if i:
-            value = value - _dot(low[i][:i], y)
+            value = value - _dot(y, low[i][:i])
         y.append(value * inverse_diagonal[i])
     return y
 
@@ -347,13 +364,18 @@ def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array, out: Array | No
 
 
 def _normalised_innovation_squared(
-    information: Elements, information_state: Sequence[Array], h: Array, z: Array, r: Array, m: int
+    information: Elements, information_state: Sequence[Array], h: Array, z: Array
 ) -> Array:
-    """νᵀS⁻¹ν (K, N) with S = HPHᵀ + R and ν = z - Hx, from Λ = P⁻¹ = LLᵀ: with U = L⁻¹Hᵀ, HPHᵀ = UᵀU."""
-    low, inverse_diagonal = _cholesky([[column[:, :-1] for column in row] for row in information])
-    y = _forward(low, inverse_diagonal, [column[:, :-1] for column in information_state])
-    u = [_forward(low, inverse_diagonal, h[row]) for row in range(m)]
-    s = [[_dot(u[i], u[j]) + r[..., i, j] for j in range(i + 1)] for i in range(m)]
-    innovation = [z[row] - _dot(u[row], y) for row in range(m)]
+    """νᵀS⁻¹ν (K, N) with S = HPHᵀ + 1 and ν = z - Hx, from Λ = P⁻¹ = LLᵀ: with U = L⁻¹Hᵀ, HPHᵀ = UᵀU.
+
+    information, information_state: Λ and Λx before each sample, elements (K, N or 1).
+    """
+    low, inverse_diagonal = _cholesky(information)
+    y = _forward(low, inverse_diagonal, information_state)
+    u = [_forward(low, inverse_diagonal, row) for row in h]
+    s = [[_dot(u[i], u[j]) for j in range(i + 1)] for i in range(len(u))]
+    for i, row in enumerate(s):
+        row[i] += 1.0
+    innovation = [each - _dot(u[row], y) for row, each in enumerate(z)]
     whitened = _forward(*_cholesky(s), innovation)
     return _dot(whitened, whitened)

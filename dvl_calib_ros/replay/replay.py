@@ -33,7 +33,8 @@ from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE
 from .navigation import Navigation, navigation_of
 from .recorder import Recorder, RunHistory
 
-BLOCK_SIZE = 512
+# Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
+BLOCK_SIZE = 2048
 
 
 @dataclass(frozen=True)
