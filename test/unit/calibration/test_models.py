@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from dvl_calib_ros.calibration import kalman
-from dvl_calib_ros.calibration.assembly import prior
+from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.bank import groups_of
 from dvl_calib_ros.calibration.error_model import correct, distort
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, skew
@@ -199,8 +199,7 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
     weight = seen.motion_weight if model.motion_is_noise else np.ones(60)
     gate = chi2.ppf(parameters.gate_probability, m)
     alone = kalman.recursion(
-        np.zeros((1, model.n_state)),
-        prior(model, parameters).p[None],
+        *Assembler([model], parameters).start,
         kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
     after, k = group.standing(1), group.index[name]
