@@ -257,7 +257,7 @@ def _length(step: Array, before: Array, length: float) -> float:
     """How far to go along a Gauss-Newton step (n,), having gone a length of the one before (n,); both whitened.
 
     Far from what explains the data (an effect left out that is there) the second derivatives count: each step is the
-    one before it times nearly the same factor, to and fro. Then this length leads to where they would end (Aitken's Δ²).
+    one before it times nearly the same factor, to and fro. Then this length leads to where they would end (Aitken, Δ²).
     """
     before_square, along = float(before @ before), float(step @ before)
     if along**2 < ALIKE * before_square * float(step @ step) or before_square == 0.0:
