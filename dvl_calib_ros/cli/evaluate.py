@@ -129,8 +129,12 @@ def _print(e: Evaluation) -> None:
         out.print(f"[yellow]note:[/] {escape(note)}")
     out.print(_score_table(e))
     out.print(escape(_settings(e)))
+    if e.baselines:
+        out.print(_baseline_table(e))
     out.print(_held_out_table(e))
     out.print(_time_table(e))
+    if e.convergence:
+        out.print(_convergence_table(e))
     for study, title in (
         (e.each, "Avg.VRMSE m/s, calibrated on each run with attitude"),
         (e.single_heading, "Avg.VRMSE m/s, calibrated on stretches of a single heading"),
@@ -165,6 +169,35 @@ def _score_table(e: Evaluation) -> Table:
     table.add_row("mean", *map(_cell, e.set_mean))
     if not e.own_generator:
         table.add_row("published mean", *map(_cell, e.published_table.mean(axis=0)))
+    return table
+
+
+def _baseline_table(e: Evaluation) -> Table:
+    from rich.table import Table
+
+    caption = "rotation alone by least squares on SO(3), of displacements (2007) and of velocities (2010); no scale"
+    table = Table(title="Avg.VRMSE m/s, before", title_justify="left", caption=caption, caption_justify="left")
+    _set_columns(table, ["baseline"], [*(each.name for each in e.sets), "mean"])
+    for name, values in e.baselines.items():
+        table.add_row(name, *map(_cell, values), _cell(float(values.mean())))
+    return table
+
+
+def _convergence_table(e: Evaluation) -> Table:
+    from rich.table import Table
+
+    from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
+
+    title = "Error of the misalignment against time, ° rms: whole angle / pitch and yaw"
+    caption = (
+        "calibrated on each run with attitude; by the noise of the reference. Published for a network: "
+        f"{PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s"
+    )
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    _set_columns(table, ["first"], [curve.label for curve in e.convergence])
+    for index, seconds in enumerate(TIMES_S):
+        cells = (f"{each.angle_deg[index]:.2f} / {each.level_deg[index]:.2f}" for each in e.convergence)
+        table.add_row(f"{seconds:g} s", *cells)
     return table
 
 

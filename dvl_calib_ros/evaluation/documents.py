@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.frames import Array
+from .convergence import curves_document
 from .protocol import MANOEUVRING
 from .results import Coverage, EachStudy, Evaluation
 
@@ -39,6 +40,11 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
         "each": _each(e.each, e.columns),
         "single_heading": _each(e.single_heading, e.columns),
         "held_out": [vars(each) for each in e.held_out],
+        "baselines": {
+            name: {**dict(zip(names, values.tolist(), strict=True)), "mean": float(values.mean())}
+            for name, values in e.baselines.items()
+        },
+        "convergence": curves_document(e.convergence),
         "sets": {each.name: {"calibrated_on": each.calibration_run, "window_s": each.window_s} for each in e.sets},
         "trajectories": list(e.trajectories),
         "source": e.source,

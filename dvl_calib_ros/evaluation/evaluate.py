@@ -16,6 +16,8 @@ from ..calibration.observations import Observations
 from ..calibration.parameters import SCHEMA, Parameters
 from ..parallel import Workers, run_all
 from . import protocol
+from .baselines import BASELINES
+from .convergence import curves
 from .holdout import verify_set
 from .metrics import coverage
 from .procedure import (
@@ -104,6 +106,8 @@ def evaluate(
         parameters=parameters.as_dict(),
         version=__version__,
         held_out=tuple(each for of_set in held_out for each in of_set),
+        baselines=dict(zip(BASELINES, np.mean([each.baselines for each in outcomes], axis=0).T, strict=True)),
+        convergence=curves(procedure.models, np.stack([each.convergence for each in outcomes])),
     )
 
 

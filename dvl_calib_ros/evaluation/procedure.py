@@ -14,6 +14,8 @@ from ..calibration.models import MODELS, Model
 from ..calibration.observability import OBSERVED_SHARE
 from ..calibration.parameters import Parameters
 from . import protocol
+from .baselines import BASELINES
+from .convergence import REFERENCE_STD, TIMES_S, curve_keys, squared_errors
 from .estimation import SensorData, estimate
 from .metrics import Moments, heading_spread, vrmse
 from .results import CalibrationRun, CalibrationSet
@@ -69,13 +71,16 @@ class SeedOutcome:
     """One seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
 
     each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) by how much noise in the
-    reference moves the first scale state.
+    reference moves the first scale state. baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`. convergence: (L,
+    curves, T, 3) squared errors of the misalignment over time on each of the runs, see `convergence`.
     """
 
     by_set: tuple[RunOutcome, ...]
     each: tuple[RunOutcome, ...]
     single_heading: tuple[RunOutcome, ...]
     pull: Array
+    baselines: Array
+    convergence: Array
 
 
 def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
@@ -87,13 +92,23 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         return SensorData(procedure.runs[name], measured[name], references(procedure.runs[name], seed))
 
     def outcome(stretch: SensorData, windows: Sequence[float | None], own_window: float | None) -> RunOutcome:
-        others = Moments.stack([each for name, each in moments.items() if name != stretch.run.name])
+        others = _others(moments, stretch.run.name)
         ends = [stretch.run.first(window) for window in windows]
         return _calibrate(stretch, ends, windows.index(own_window), others, procedure)
 
     by_set = tuple(outcome(data(each.calibration_run), protocol.WINDOWS_S, each.window_s) for each in procedure.sets)
+    baselines = np.array(
+        [
+            [
+                float(vrmse(_others(moments, each.calibration_run), matrices).mean())
+                for matrices in _baselines(data(each.calibration_run), each.window_s)
+            ]
+            for each in procedure.sets
+        ]
+    )
     if not procedure.studies:
-        return SeedOutcome(by_set, (), (), np.empty((0, len(NOISE_STUDY_STD), 0)))
+        none = np.empty((0, len(curve_keys(procedure.models)), len(TIMES_S), 3))
+        return SeedOutcome(by_set, (), (), np.empty((0, len(NOISE_STUDY_STD), 0)), baselines, none)
     with_attitude = runs_with_attitude(procedure.runs)
     legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
     return SeedOutcome(
@@ -101,7 +116,33 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         each=tuple(outcome(data(name), [None], None) for name in with_attitude),
         single_heading=tuple(outcome(_part(data(name), start, end), [None], None) for name, start, end in legs),
         pull=_noise_study(procedure, data(noise_study_run(procedure).name), seed),
+        baselines=baselines,
+        convergence=np.stack(
+            [
+                squared_errors(
+                    procedure.runs[name],
+                    measured[name],
+                    {std: references(procedure.runs[name], seed, std) for std in REFERENCE_STD},
+                    procedure.models,
+                    procedure.parameters,
+                )
+                for name in with_attitude
+            ]
+            or [np.full((len(curve_keys(procedure.models)), len(TIMES_S), 3), np.nan)]
+        ),
     )
+
+
+def _others(moments: Mapping[str, Moments], name: str) -> Moments:
+    return Moments.stack([each for other, each in moments.items() if other != name])
+
+
+def _baselines(data: SensorData, window_s: float | None) -> list[Array]:
+    """Corrections (B, 3, 3) by each of the baselines."""
+    end = data.run.first(window_s)
+    return [
+        align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for align in BASELINES.values()
+    ]
 
 
 def sensor_data(run: Trajectory, seed: int) -> SensorData:

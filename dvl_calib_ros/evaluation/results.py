@@ -134,6 +134,33 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
+class Curve:
+    """One way to calibrate. name: model or baseline. gnss_std: noise of the reference, m/s, None without any.
+
+    rms: (T, 3) rad about the body's x, y, z at `convergence.TIMES_S`, over runs, combinations of errors and seeds.
+    """
+
+    name: str
+    gnss_std: float | None
+    rms: Array
+
+    @property
+    def angle_deg(self) -> Array:
+        """(T,) rms of the whole angle, degrees."""
+        return np.degrees(np.sqrt((self.rms**2).sum(axis=1)))
+
+    @property
+    def level_deg(self) -> Array:
+        """(T,) rms of pitch and yaw together, degrees: what turns a velocity ahead."""
+        return np.degrees(np.sqrt((self.rms[:, 1:] ** 2).sum(axis=1)))
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        return f"{self.name}, no reference" if self.gnss_std is None else f"{self.name}, {self.gnss_std:g} m/s"
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """The published procedure and the studies around it.
 
@@ -141,7 +168,8 @@ class Evaluation:
     published figures do not apply. notes: what the reader must know. columns: `UNCALIBRATED`, then the models.
     avg_vrmse: (S, C, Q). windows_s: (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column ->
     m/s. coverage: over the sets; coverage_of_all: over these and the runs of `each`. parameters: as used, plain
-    values. version: of the software.
+    values. baselines: (S,) Avg.VRMSE of what was done before, by name. convergence: the misalignment's error against
+    time. version: of the software.
     """
 
     source: str
@@ -164,6 +192,8 @@ class Evaluation:
     parameters: Mapping[str, Any]
     version: str
     held_out: tuple[HeldOut, ...] = ()
+    baselines: Mapping[str, Array] = field(default_factory=dict)
+    convergence: tuple[Curve, ...] = ()
     coverage_of_all: tuple[Coverage, ...] = ()
 
     @property

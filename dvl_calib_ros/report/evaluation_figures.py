@@ -83,6 +83,36 @@ def error_over_calibration_time(
     return figure
 
 
+def misalignment_over_time(
+    times_s: Sequence[float],
+    models: Sequence[str],
+    gnss_std: Sequence[float | None],
+    degrees: Sequence[Array],
+    published: tuple[float, float],
+) -> Figure:
+    """Error of the misalignment (T,) ° of several models against time. gnss_std: m/s, None without a reference.
+
+    published: s and ° of a published method.
+    """
+    figure, axes = new_figure(height=3.2)
+    for name, std, values in zip(models, gnss_std, degrees, strict=True):
+        dashes = ":" if std is None else "--" if std < 0.1 else "-"
+        with_what = "no reference" if std is None else f"{std:g} m/s"
+        axes.plot(
+            times_s, values, color=MODEL_STYLES[name].color, linestyle=dashes,
+            label=f"{name}, {with_what}",
+        )  # fmt: skip
+    axes.plot(*published, "*", color=INK, markersize=9.0)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    log_ticks(axes.xaxis)
+    log_ticks(axes.yaxis)
+    axes.set_xlabel("calibration time, s")
+    axes.set_ylabel("error, ° rms")
+    legend_above(axes)
+    return figure
+
+
 def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float]]) -> Figure:
     """Share of the errors inside the intervals that σ claims; claimed share -> one share per model, all in 0..1."""
     figure, axes = new_figure(height=1.1 + 0.28 * len(models))

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.models import MODELS
+from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
@@ -48,6 +49,8 @@ def _context(e: Evaluation) -> dict[str, Any]:
         "improvement": [_improvement(e)],
         "times": list(_calibration_times(e)),
         "has_published": bool(np.isfinite(_published(e)).any()),
+        "convergence": _convergence(e),
+        "baselines": _baselines(e) if e.baselines else None,
         "coverages": list(_coverages(e)),
         "errors_in_variables": None if e.errors_in_variables is None else _pull(e.errors_in_variables),
         "studies": [study for study in (_study(e, e.each, _EACH), _study(e, e.single_heading, _SINGLE)) if study],
@@ -194,6 +197,46 @@ def _calibration_times(e: Evaluation) -> Iterable[Picture]:
             figures.error_over_calibration_time, e.models, e.windows_s, float(e.seed_mean[i, base]),
             by_time[i][:, models], each.window_s, _published(e)[i, models],
         )  # fmt: skip
+
+
+def _convergence(e: Evaluation) -> list[Picture]:
+    shown = [each for each in e.convergence if each.name in MODELS]
+    if not shown:
+        return []
+    made = []
+    for title, values in (
+        ("Pitch and yaw", [each.level_deg for each in shown]), ("The whole angle", [each.angle_deg for each in shown]),
+    ):  # fmt: skip
+        told = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
+        made.append(
+            picture(
+                f"{title}, error against time",
+                f"{title} against time; after {TIMES_S[-1]:g} s {told}",
+                figures.misalignment_over_time,
+                TIMES_S,
+                [each.name for each in shown],
+                [each.gnss_std for each in shown],
+                values,
+                (PUBLISHED_S, PUBLISHED_DEG),
+                caption="rms over runs, combinations of errors and seeds. Star: published for a network.",
+            )
+        )
+    return made
+
+
+def _baselines(e: Evaluation) -> Table:
+    rows = [
+        (name, *(f"{value:.4f}" for value in values), f"{values.mean():.4f}") for name, values in e.baselines.items()
+    ]
+    return Table(
+        ("Avg.VRMSE, m/s", *(each.name for each in e.sets), "mean"),
+        rows,
+        notes=(
+            "The rotation alone by least squares on SO(3): of displacements (Kinsey and Whitcomb, 2007; here of the "
+            "integrated reference velocity, whose noise grows with time, where they had positions), and of velocities "
+            "(Troni and Whitcomb, 2010). They have neither scale nor prior.",
+        ),
+    )
 
 
 # ------------------------------------------------------------------ uncertainty

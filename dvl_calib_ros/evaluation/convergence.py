@@ -1,0 +1,103 @@
+"""How fast the misalignment is found: its error against the time of calibration, from ten seconds on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..calibration.frames import Array
+from ..calibration.kalman import GaussianState
+from ..calibration.parameters import Parameters
+from . import protocol
+from .baselines import BASELINES
+from .estimation import SensorData, estimate
+from .results import Curve
+from .trajectories import Trajectory
+
+TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
+# Noise of the reference, m/s per axis: that of the procedure, and that of a good receiver
+REFERENCE_STD = (protocol.GNSS_STD, 0.02)
+# What a published network that aligns a DVL reports: so many degrees after so many seconds
+PUBLISHED_DEG, PUBLISHED_S = 0.8, 25.0
+_AIDED, _FREE = ("G1", "M3"), ("A1", "F1", "M7")
+
+
+def curve_keys(models: Sequence[str]) -> list[tuple[str, float | None]]:
+    """Name and noise of the curves, of those of these models that are drawn."""
+    aided = [*(name for name in _AIDED if name in models), *BASELINES]
+    keys: list[tuple[str, float | None]] = [(name, std) for std in REFERENCE_STD for name in aided]
+    return keys + [(name, None) for name in _FREE if name in models]
+
+
+def squared_errors(
+    run: Trajectory, measured: Array, references: Mapping[float, Array], models: Sequence[str], parameters: Parameters
+) -> Array:
+    """Squared error of φ on one run (curves, T, 3) rad², mean over combinations; nan for what cannot run on it.
+
+    measured: (B, N, 3) m/s. references: by their noise (B, N, 3) m/s.
+    """
+    ends = [run.first(seconds) for seconds in TIMES_S]
+    cut = slice(0, ends[-1])
+    truth = protocol.truth()[:, :3]
+    by_key: dict[tuple[str, float | None], Array] = {}
+    for std, reference in references.items():
+        data = SensorData(run.part(0, ends[-1]), measured[:, cut], reference[:, cut])
+        aided = [name for name in _AIDED if name in models]
+        free = [name for name in _FREE if name in models] if std == REFERENCE_STD[0] else []
+        states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends)
+        for name, state in states.items():
+            by_key[name, None if name in free else std] = _of_states(state, truth)
+        for name, align in BASELINES.items():
+            rotations = [
+                align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for end in ends
+            ]
+            off = np.stack([_turns_off(each, truth) for each in rotations])
+            by_key[name, std] = (off**2).mean(axis=1)
+    missing = np.full((len(TIMES_S), 3), np.nan)
+    return np.stack([by_key.get(key, missing) for key in curve_keys(models)])
+
+
+def _of_states(state: GaussianState, truth: Array) -> Array:
+    return np.asarray(((state.x[..., :3] - truth) ** 2).mean(axis=1))
+
+
+def _turns_off(body_from_dvl: Array, misalignment: Array) -> Array:
+    """Axis times angle (B, 3) rad by which rotations (B, 3, 3) miss the one of a misalignment φ (B, 3)."""
+    norm = np.linalg.norm(misalignment, axis=-1, keepdims=True)
+    truth = Rotation.from_rotvec(misalignment / norm * np.arctan(norm))  # see `error_model.corrected_mounting`
+    found = Rotation.from_matrix(np.swapaxes(body_from_dvl, -1, -2))
+    return np.asarray((found * truth.inv()).as_rotvec())
+
+
+def curves(models: Sequence[str], squares: Array) -> tuple[Curve, ...]:
+    """squares: (..., curves, T, 3) rad², over seeds and runs; nan where a curve cannot run."""
+    known = np.isfinite(squares)
+    axes = tuple(range(squares.ndim - 3))
+    count = known.sum(axis=axes)
+    total = np.where(known, squares, 0.0).sum(axis=axes)
+    mean = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return tuple(
+        Curve(name, std, np.sqrt(each))
+        for (name, std), each in zip(curve_keys(models), mean, strict=True)
+        if np.isfinite(each).all()
+    )
+
+
+def curves_document(found: Sequence[Curve]) -> dict[str, Any]:
+    """Plain data, degrees."""
+    return {
+        "times_s": list(TIMES_S),
+        "published": {"seconds": PUBLISHED_S, "degrees": PUBLISHED_DEG},
+        "curves": [
+            {
+                "name": each.name,
+                "gnss_std": each.gnss_std,
+                "angle_deg": each.angle_deg.tolist(),
+                "pitch_and_yaw_deg": each.level_deg.tolist(),
+            }
+            for each in found
+        ],
+    }
