@@ -68,8 +68,8 @@ class Navigation:
         Part of the drift that noise of reference and DVL, as the data show it, may be, m per km.
     on_a_map
         Whether headings are known, so that a track can be drawn: then east and north, else ahead and to port.
-    distances
-        (P,) m along the track, of the points kept.
+    stamps_ns, distances
+        (P,) time, and m along the track, of the points kept.
     reference, track_before, track_after
         (P, 2) m from the start.
     """
@@ -82,6 +82,7 @@ class Navigation:
     after: Drift
     noise_per_km: float
     on_a_map: bool
+    stamps_ns: NDArray[np.int64]
     distances: Array
     reference: Array
     track_before: Array
@@ -99,15 +100,16 @@ def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) ->
     except np.linalg.LinAlgError:
         return None
     stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-    return dead_reckoned(recording, folds_of(stamps_ns, parameters), terms, parameters)
+    return dead_reckoned(recording, folds_of(stamps_ns, parameters), terms, parameters, epoch_ns)
 
 
 def dead_reckoned(
-    recording: Recording, folds: NDArray[np.int64], terms: Sequence[Terms], parameters: Parameters
+    recording: Recording, folds: NDArray[np.int64], terms: Sequence[Terms], parameters: Parameters, epoch_ns: int = 0
 ) -> Navigation | None:
     """The track by the DVL as mounted, and corrected.
 
-    folds: (N,) of each DVL sample, which of `terms` corrects it. None without reference, or with hardly any motion.
+    folds: (N,) of each DVL sample, which of `terms` corrects it. epoch_ns: what the recording's times count from. None
+    without reference, or with hardly any motion.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -137,6 +139,7 @@ def dead_reckoned(
         after=_drift(astray[1], along, ends),
         noise_per_km=_noise(errors[1], step_s, along, ends),
         on_a_map=on_a_map,
+        stamps_ns=np.round(recording.dvl.times[use[kept]] * 1e9).astype(np.int64) + epoch_ns,
         distances=along[kept],
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],

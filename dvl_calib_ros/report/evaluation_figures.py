@@ -176,7 +176,7 @@ def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected
     axes.plot(time_s, corrected, color="#1f6fb2", linewidth=0.9, label="DVL corrected")
     axes.plot(time_s, truth, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), label="truth")
     axes.set_xlabel("time, s")
-    mark_time(axes)
+    mark_time(axes, f"{time_s[0]} .. {time_s[-1]}")
     axes.set_ylabel(label)
     axes.margins(x=0.01)
     legend_above(axes)
@@ -196,7 +196,7 @@ def error_of_trace(time_s: Array, uncorrected: Array, corrected: Mapping[str, Ar
     axes.set_yscale("log")
     log_ticks(axes.yaxis)
     axes.set_xlabel("time, s")
-    mark_time(axes)
+    mark_time(axes, f"{time_s[0]} .. {time_s[-1]}")
     axes.set_ylabel("velocity error, m/s rms")
     axes.margins(x=0.01)
     return figure

@@ -1,5 +1,7 @@
 """Figures over time as data, from which the script of the page draws them anew: with a cursor and a zoom for all.
 
+On a map the cursor is a point on each track.
+
 The figure stays the one description of what is shown: its lines, sleeves and limits are read back from matplotlib.
 """
 
@@ -8,7 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from ..calibration.frames import Array
@@ -26,14 +29,27 @@ POINTS = 1500
 TIME_MARK, BREAK_MARK = "time", "cut out"
 
 
-def mark_time(axes: Axes, run: object = "") -> None:
-    """Say that the x axis is the time of a run: figures of one run and equal limits share cursor and zoom."""
+def mark_time(axes: Axes, run: str) -> None:
+    """Say that the x axis is the time of a run: figures of one run share cursor and zoom."""
     axes.set_gid(f"{TIME_MARK} {run}")
 
 
+class Track(Line2D):
+    """A line on a map, once more and unseen, with the time of each of its points on the axis of the run's figures."""
+
+    def __init__(self, line: Line2D, run: str, times: Array) -> None:
+        """line: as it was drawn, of P points. times: (P,)."""
+        super().__init__(*line.get_data(), color=line.get_color(), alpha=0.0)
+        self.run = f"{TIME_MARK} {run}"
+        self.times = times
+
+
 def explorable(figure: Figure) -> str:
-    """A figure over time as base64 of deflated JSON; "" for any other figure."""
+    """A drawn figure over time, or a map with tracks, as base64 of deflated JSON; "" for any other figure."""
     axes = figure.axes[0]
+    tracks = [line for line in axes.get_lines() if isinstance(line, Track)]
+    if tracks:
+        return _packed(_map(figure, axes, tracks))
     mark = axes.get_gid() or ""
     if not mark.startswith(TIME_MARK):
         return ""
@@ -42,7 +58,7 @@ def explorable(figure: Figure) -> str:
     if not lines:
         return ""
     plot: dict[str, Any] = {
-        "run": f"{mark} {axes.get_xlim()}",
+        "run": mark,
         "x_label": axes.get_xlabel(),
         "y_label": axes.get_ylabel(),
         "x_limits": _numbers(axes.get_xlim(), 9),
@@ -68,7 +84,21 @@ def explorable(figure: Figure) -> str:
         ],
         "sleeves": [_sleeve(each) for each in sleeves],
     }
+    return _packed(plot)
+
+
+def _packed(plot: dict[str, Any]) -> str:
     return base64.b64encode(zlib.compress(json.dumps(plot, separators=(",", ":")).encode(), 9)).decode()
+
+
+def _map(figure: Figure, axes: Axes, tracks: Sequence[Track]) -> dict[str, Any]:
+    """Where the points of tracks are in the picture, per cent from its left and upper edge."""
+    shown = []
+    for track in tracks:
+        at = figure.transFigure.inverted().transform(axes.transData.transform(np.column_stack(track.get_data())))
+        x, y = 100.0 * at[:, 0], 100.0 * (1.0 - at[:, 1])
+        shown.append({"color": to_hex(track.get_color()), "x": _numbers(x), "y": _numbers(y)})
+    return {"run": tracks[0].run, "times": _numbers(tracks[0].times, 9), "tracks": shown}
 
 
 def _sleeve(area: PolyCollection) -> dict[str, Any]:

@@ -10,50 +10,57 @@ from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
 from ..replay.navigation import Navigation, in_words
+from .exploring import Track
 from .replay_figures import AFTER, BAD
 from .style import INK, WIDTH, Picture, legend_above, new_figure, picture
+from .time_axis import TimeAxis
 
 # A map is as high as it is wide at most, and never a strip, inches
 HIGHEST, LOWEST = WIDTH, 2.2
 _OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
 
 
-def navigation_section(navigation: Navigation | None) -> dict[str, Any] | None:
-    """What a page shows of it; None without."""
+def navigation_section(navigation: Navigation | None, time: TimeAxis) -> dict[str, Any] | None:
+    """What a page shows of it, time: of its other figures; None without."""
     if navigation is None:
         return None
-    return {"sentences": in_words(navigation), "pictures": navigation_pictures(navigation, {"": navigation})}
+    return {"sentences": in_words(navigation), "pictures": navigation_pictures(navigation, {"": navigation}, time=time)}
 
 
-def navigation_pictures(one: Navigation, corrected: Mapping[str, Navigation], where: str = "") -> Sequence[Picture]:
+def navigation_pictures(
+    one: Navigation, corrected: Mapping[str, Navigation], where: str = "", time: TimeAxis | None = None
+) -> Sequence[Picture]:
     """Map, if headings are known, and error along the track.
 
     one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone; the first
-    four are drawn.
+    four are drawn. time: of figures whose cursor the map follows.
     """
     told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
     alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
     figures = []
     if one.on_a_map:
         figures.append(
-            picture(f"Track{where}", f"Map of the track {alt}", track_map, one, corrected,
+            picture(f"Track{where}", f"Map of the track {alt}", track_map, one, corrected, time,
                     caption="From the same start; the corrected track by estimates that had not seen the data.")
         )  # fmt: skip
     figures.append(picture(f"Error of position{where}", f"Error of dead reckoning {alt}", error_along, one, corrected))
     return figures
 
 
-def track_map(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
-    """East and north, m, the same scale along both."""
+def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAxis | None = None) -> Figure:
+    """East and north, m, the same scale along both. time: of the figures whose cursor is followed."""
     drawn = [one.reference, one.track_before, *(each.track_after for each in corrected.values())]
     every = np.concatenate(drawn)
     east, north = np.ptp(every, axis=0)
     height = float(np.clip(0.85 * WIDTH * north / max(east, 1e-9) + 0.9, LOWEST, HIGHEST))
     figure, axes = new_figure(height=height)
-    axes.plot(*one.reference.T, color=INK, linewidth=2.6, alpha=0.35, label="reference")
-    axes.plot(*one.track_before.T, color=BAD, linewidth=1.2, label="as mounted")
+    lines = axes.plot(*one.reference.T, color=INK, linewidth=2.6, alpha=0.35, label="reference")
+    lines += axes.plot(*one.track_before.T, color=BAD, linewidth=1.2, label="as mounted")
     for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
-        axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
+        lines += axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
+    if time is not None:
+        for line in lines:
+            axes.add_line(Track(line, time.run, time(one.stamps_ns)))
     axes.plot(*one.reference[0], "o", color=INK, markersize=4.0)
     for track, colour in zip(drawn[1:], (BAD, *_OTHERS), strict=False):
         axes.plot(*track[-1], "s", color=colour, markersize=3.5)

@@ -82,7 +82,7 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
         "static_transform": document["mounting"]["static_transform_publisher"],
         "warnings": replayed.notes,
         "held_out": _held_out(result, shown),
-        "navigation": navigation_section(replayed.navigation),
+        "navigation": navigation_section(replayed.navigation, time),
         "estimates": _estimate_table(result, shown),
         "families": list(_families(result, history, time, shown)),
         "selected": result.selected,

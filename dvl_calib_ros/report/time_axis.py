@@ -23,7 +23,8 @@ def fitting_unit(seconds: float) -> tuple[float, str]:
 class TimeAxis:
     """Turns stamps into what is plotted.
 
-    breaks: (B, 2) from and to where time was cut out, in the unit of the axis. label: with the unit.
+    breaks: (B, 2) from and to where time was cut out, in the unit of the axis. label: with the unit. run: its name to
+    figures that share a cursor.
     """
 
     def __init__(self, stamps_ns: ArrayLike) -> None:
@@ -38,6 +39,7 @@ class TimeAxis:
         unit_s, unit = fitting_unit(float(shown[-1]))
         self._shown = shown / unit_s
         self.breaks = np.column_stack([self._shown[:-1][cut], self._shown[1:][cut]])
+        self.run = f"{self._first_ns} .. {stamps[-1]}"
         self.label = f"time from the start, {unit}" + (" (gaps cut out)" if cut.any() else "")
 
     def __call__(self, stamps_ns: ArrayLike) -> Array:
@@ -47,7 +49,7 @@ class TimeAxis:
 
     def dress(self, axes: Axes) -> None:
         """Label the axis and mark what was cut out."""
-        mark_time(axes, self._first_ns)
+        mark_time(axes, self.run)
         axes.set_xlabel(self.label)
         axes.set_xlim(self._shown[0], max(self._shown[-1], 1e-3))
         for start, end in self.breaks:

@@ -138,6 +138,21 @@ def test_a_zoom_is_shared_and_escape_or_the_button_shows_the_whole_run_again(bro
     page.close()
 
 
+def test_the_cursor_moves_a_point_along_each_track_of_the_map(browser, reports):
+    page, _ = opened(browser, reports["replay"], (DESKTOP[0], 12_000))  # all on one screen: to scroll takes the mouse off
+    points = page.locator(".map span")
+    assert points.count() == 3 and not any(point.is_visible() for point in points.all())
+    seen = []
+    for share in (0.2, 0.7):
+        hover(page, page.locator("figure.explorable").first, share)
+        assert all(point.is_visible() for point in points.all())
+        boxes, frame = [point.bounding_box() for point in points.all()], page.locator(".map").bounding_box()
+        assert all(frame["x"] < box["x"] < frame["x"] + frame["width"] for box in boxes)
+        seen.append([(box["x"], box["y"]) for box in boxes])
+    assert all(first != second for first, second in zip(*seen, strict=True))
+    page.close()
+
+
 def hover(page, figure, share: float) -> None:
     """Put the mouse over a chart, at this share of its width."""
     area = figure.locator(".u-over")

@@ -3,7 +3,7 @@
 // data of the picture; the picture stays for print and wherever this script does not run.
 (async () => {
   const HEIGHT = 250, SOFT = "#5b6670", GRID = "#e3e7ea";
-  const runs = new Map();  // charts by run
+  const runs = new Map(), maps = new Map();  // charts and maps by run
   let moving = false, zoomed = null;
 
   async function unpacked(text) {
@@ -103,9 +103,12 @@
                 bind: { dblclick: () => () => { whole(plot.run); return null; } } },
       hooks: {
         drawClear: [background(plot)],
-        setCursor: [u => together(u, other => other.setCursor(
-          u.cursor.left < 0 ? { left: -10, top: -10 }
-                            : { left: other.valToPos(u.posToVal(u.cursor.left, "x"), "x"), top: 10 }))],
+        setCursor: [u => {
+          const at = u.cursor.left < 0 ? null : u.posToVal(u.cursor.left, "x");
+          for (const show of maps.get(plot.run) ?? []) show(at);
+          together(u, other => other.setCursor(
+            at == null ? { left: -10, top: -10 } : { left: other.valToPos(at, "x"), top: 10 }));
+        }],
         setScale: [(u, key) => {
           if (key !== "x" || !runs.has(plot.run)) return;
           const { min, max } = u.scales.x;
@@ -121,6 +124,33 @@
       if (place.clientWidth && place.clientWidth !== chart.width) chart.setSize({ width: place.clientWidth, height: HEIGHT });
     }).observe(place);
     return chart;
+  }
+
+  // a point on each track of a map, where the vehicle was at the cursor
+  function mapped(figure, plot) {
+    const image = figure.querySelector("img"), place = document.createElement("div");
+    place.className = "map";
+    image.replaceWith(place);
+    place.append(image);
+    const points = plot.tracks.map(track => {
+      const point = document.createElement("span");
+      point.style.background = track.color;
+      point.hidden = true;
+      place.append(point);
+      return point;
+    });
+    return at => {
+      let low = 0, high = plot.times.length - 1;
+      while (low < high) {
+        const middle = (low + high) >> 1;
+        if (plot.times[middle] < at) low = middle + 1; else high = middle;
+      }
+      points.forEach((point, i) => {
+        point.hidden = at == null;
+        point.style.left = `${plot.tracks[i].x[low]}%`;
+        point.style.top = `${plot.tracks[i].y[low]}%`;
+      });
+    };
   }
 
   // ---------------------------------------------------------------- what is shown, and the way back
@@ -165,8 +195,8 @@
   for (const figure of document.querySelectorAll("figure[data-plot]")) {
     try {
       const plot = await unpacked(figure.dataset.plot);
-      const chart = drawn(figure, plot);
-      runs.set(plot.run, [...(runs.get(plot.run) ?? []), chart]);
+      const [kept, one] = plot.tracks ? [maps, mapped(figure, plot)] : [runs, drawn(figure, plot)];
+      kept.set(plot.run, [...(kept.get(plot.run) ?? []), one]);
     } catch (error) {
       console.warn(error);  // an old browser: the picture is there
       figure.classList.remove("explorable");

@@ -23,10 +23,10 @@ from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.report import write_evaluation_report
-from dvl_calib_ros.report.exploring import explorable
+from dvl_calib_ros.report.exploring import Track, explorable
 from dvl_calib_ros.report.replay_figures import Line, estimate_over_time, held_out_errors
 from dvl_calib_ros.report.replay_report import write_replay_report
-from dvl_calib_ros.report.style import MODEL_STYLES
+from dvl_calib_ros.report.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.report.time_axis import TimeAxis
 
 SECOND = 1_000_000_000
@@ -177,6 +177,20 @@ def test_the_data_of_an_explorable_figure_is_what_the_figure_draws():
     expected = np.interp(60.0 * np.array(line["x"]), seconds, np.sin(seconds / 300.0))
     np.testing.assert_allclose(np.array(line["y"], dtype=float), expected, atol=1e-3)
     np.testing.assert_allclose(np.subtract(sleeve["high"], sleeve["low"]), 1.0, atol=1e-3)
+
+
+def test_the_points_of_a_track_lie_where_the_map_shows_them():
+    figure, axes = new_figure()
+    (line,) = axes.plot([0.0, 4.0, 8.0], [0.0, 2.0, 2.0], color="#1f6fb2")
+    axes.add_line(Track(line, "a run", np.array([0.0, 1.0, 2.0])))
+    axes.set_xlim(0.0, 8.0)
+    axes.set_ylim(0.0, 4.0)
+    plot = json.loads(zlib.decompress(base64.b64decode(explorable(figure))))
+    box = axes.get_position()
+    assert plot["times"] == [0.0, 1.0, 2.0] and plot["run"] == "time a run"
+    (track,) = plot["tracks"]
+    np.testing.assert_allclose(track["x"], 100.0 * (box.x0 + box.width * np.array([0.0, 0.5, 1.0])), rtol=1e-3)
+    np.testing.assert_allclose(track["y"], 100.0 * (1.0 - box.y0 - box.height * np.array([0.0, 0.5, 0.5])), rtol=1e-3)
 
 
 def test_a_figure_that_is_not_over_time_has_no_data_for_the_script():
