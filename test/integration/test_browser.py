@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from io_fixtures import run
 from report_fixtures import diagnosis, evaluation, replay_page
 
 from dvl_calib_ros.report import write_diagnosis_report, write_evaluation_report
@@ -138,8 +139,10 @@ def test_a_zoom_is_shared_and_escape_or_the_button_shows_the_whole_run_again(bro
     page.close()
 
 
-def test_the_cursor_moves_a_point_along_each_track_of_the_map(browser, reports):
-    page, _ = opened(browser, reports["replay"], (DESKTOP[0], 12_000))  # all on one screen: to scroll takes the mouse off
+def test_the_cursor_moves_a_point_along_each_track_of_the_map(browser, tmp_path):
+    report, replayed = replay_page(tmp_path, run(150.0))
+    assert replayed.navigation is not None and replayed.navigation.on_a_map
+    page, _ = opened(browser, report, (DESKTOP[0], 12_000))  # all on one screen: to scroll takes the mouse off
     points = page.locator(".map span")
     assert points.count() == 3 and not any(point.is_visible() for point in points.all())
     seen = []
