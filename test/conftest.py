@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `cli.main` does, before numpy is imported
@@ -17,6 +18,11 @@ settings.register_profile("patient", deadline=None, max_examples=40, suppress_he
 settings.register_profile("ci", settings.get_profile("patient"), max_examples=200)
 settings.load_profile("patient")
 ROOT = Path(__file__).resolve().parents[1]
+# What nohup and a shell's & make ignored, the processes that tests end by a signal would ignore as well.
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def searched(examples: int, *unchecked: HealthCheck) -> settings:
