@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `cli.main` does, before numpy is imported
 
@@ -29,6 +32,27 @@ def searched(examples: int, *unchecked: HealthCheck) -> settings:
     """Settings of a search that takes another number of examples than 100: so many, as the profile scales them."""
     scaled = max(5, round(examples * settings.default.max_examples / 100))
     return settings(max_examples=scaled, suppress_health_check=[HealthCheck.too_slow, *unchecked])
+
+
+def made_once(path: Path, make: Callable[[Path], Any]) -> Path:
+    """A file or folder that several processes of one run of the suite share, made by the first that asks."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{path}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            making = path.with_name(f"{path.name}.making")
+            make(making)
+            making.rename(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """For `made_once`: one folder of all processes of this run."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from conftest import made_once
 from scipy.spatial.transform import Rotation
 from stacks import A50, LEVER_ARM, STACKS, TWIST, YAW_45, Stack, Told, true_mounting
 
@@ -25,19 +26,19 @@ UNPLACED = "lever_arm:="
 
 
 class Bags(dict[str, Path]):
-    """Each written when a test asks for it."""
+    """Each written once, by the first process whose test asks for it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def __missing__(self, name: str) -> Path:
-        self[name] = STACKS[name].write(self._folder / name)
+        self[name] = made_once(self._folder / name, STACKS[name].write)
         return self[name]
 
 
 @pytest.fixture(scope="module")
-def bags(tmp_path_factory) -> Bags:
-    return Bags(tmp_path_factory.mktemp("stacks"))
+def bags(shared_folder) -> Bags:
+    return Bags(shared_folder)
 
 
 def answered(bag: Path, given: Given | None = None, **parameters) -> tuple[Discovery, Replayed]:
