@@ -26,6 +26,8 @@ _OF_THE_REFERENCE = (ActsOn.REFERENCE, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_C
 # A diagnosis has some ten thousand bytes; what is much larger is none, and is not read to find out
 LARGEST_FILE = 1 << 24
 RESULT, PARAMETERS = "result", "parameters"
+# Name of what is left of a diagnosis whose verdict is `unknown`
+NOT_EXPLAINED = "not_explained"
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,8 @@ def _others(
         )
         for name, values in systematic.items()
     ]
-    others.sort(key=lambda each: -(each.size or 0.0))
+    if document.get("verdict") == "unknown":
+        others.append(Other(NOT_EXPLAINED, {}, float(document["gap"]["not_explained_mps"])))
     noise = [Other(each["name"], _values(each["parameters"])) for each in document.get("noise", [])]
     return (
         *others,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .description import DvlDescription
+from .description import NOT_EXPLAINED, DvlDescription
 
 # Noise of one axis that is off by less is not worth telling, as a share of the noise of all
 SAME_NOISE = 0.2
@@ -108,6 +108,8 @@ def _missing(title: str, settings: Settings, description: DvlDescription) -> lis
             reason = "it is in the reference or attitude, not in the DVL"
         elif other.of_another_day:
             reason = "it is of another recording than the first, as which the settings are"
+        elif other.name == NOT_EXPLAINED:
+            reason = "no effect of the library explains it"
         elif "factor" in other.parameters:
             reason = "noise is set as it is; that messages claim less is no setting"
         found.append(Missing(other.name, f"{values_said}; {reason}".lstrip("; "), other.size))

@@ -9,12 +9,12 @@ from ..effects.base import AnyEffect
 from ..effects.composition import Injection
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
-from ..export.description import DvlDescription, Other
+from ..export.description import NOT_EXPLAINED, DvlDescription, Other
 from .scenario import Scenario
 from .sensors import JANUS_FROM_VERTICAL, DvlErrors
 
 # Findings that are no effect with a size: noise_std holds the one already, of the other nobody knows how much
-_NOT_TAKEN = ("noise_inflation", "coloured_reference_noise")
+_NOT_TAKEN = ("noise_inflation", "coloured_reference_noise", NOT_EXPLAINED)
 
 
 def with_dvl(scenario: Scenario, description: DvlDescription) -> tuple[Scenario, tuple[str, ...]]:

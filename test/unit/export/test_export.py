@@ -180,6 +180,15 @@ def test_the_command_writes_settings_and_beside_them_what_is_missing(name, diagn
         np.testing.assert_allclose(dvl.lever_arm, [-1.85, 0.0, 0.1], atol=1e-8)
 
 
+def test_what_no_effect_explains_is_said_to_stay(tmp_path, capsys):
+    unknown = document(verdict="unknown", gap={"not_explained_mps": 0.0124})
+    (tmp_path / "d.json").write_text(json.dumps(unknown))
+    out, _ = succeed(capsys, "export", "stonefish", tmp_path / "d.json", "-o", tmp_path / "dvl.xml")
+    assert "not_explained" in out and "12.4" in out
+    _, errors = succeed(capsys, "simulate", tmp_path / "bag", "--duration", "10", "--diagnosis", tmp_path / "d.json")
+    assert "not_explained" in errors
+
+
 def test_a_file_before_is_kept_as_a_backup(diagnosis, tmp_path, capsys):
     (tmp_path / "dvl.sdf").write_text("mine")
     succeed(capsys, "export", "gazebo", diagnosis, "-o", tmp_path / "dvl.sdf")
