@@ -39,7 +39,8 @@ def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
     """
     dvl, reference, attitude = recording.dvl, recording.reference, recording.attitude
     body = Curve(dvl.time, dvl.values @ rotation_dvl_from_body)
-    late, is_far = lag(_speed(body), body.time[0], _speed(reference), reference.time[0])
+    known = reference.covers(_steps(reference)).astype(float)  # across an outage the curve is anything
+    late, is_far = lag(_speed(body), body.time[0], _speed(reference), reference.time[0], known)
     if is_far:
         raise InputError(_refused(recording.name, "the DVL's", "the reference's", late))
     if attitude is None or recording.frame is VelocityFrame.BODY:
@@ -50,7 +51,7 @@ def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
     course: Series = (reference(at)[:, :2] @ [1.0, 1j]) * np.conj(body(at + late)[:, :2] @ [1.0, 1j])
     turned = np.arange(attitude.time[0], attitude.time[-1], STEP_S)
     ahead: Series = recording.rotation_enu_from_body(turned)[:, :2, 0] @ [1.0, 1j]
-    moving = (np.abs(course) > MOVING_MPS**2).astype(float)
+    moving = ((np.abs(course) > MOVING_MPS**2) & reference.covers(at)).astype(float)
     late, is_far = lag(_unit(ahead), attitude.time[0], _unit(course), at[0], moving)
     if is_far:
         raise InputError(_refused(recording.name, "the IMU's", "those of DVL and reference", late))
@@ -69,9 +70,13 @@ def _refused(name: str, whose: str, others: str, late: float) -> str:
     )
 
 
+def _steps(curve: Curve) -> Array:
+    return np.arange(curve.time[0], curve.time[-1], STEP_S)
+
+
 def _speed(curve: Curve) -> Series:
     """(N,) horizontal speed, m/s, every STEP_S from the curve's first sample on."""
-    values = curve(np.arange(curve.time[0], curve.time[-1], STEP_S))
+    values = curve(_steps(curve))
     return np.asarray(np.hypot(values[:, 0], values[:, 1]), dtype=complex)
 
 
