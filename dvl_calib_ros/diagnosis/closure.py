@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 from .composed import Hypothesis, Problem
-from .fitting import Fitter
+from .fitting import Fit, Fitter
 from .selection import Selection
 from .settings import SETTINGS
 
@@ -49,13 +49,15 @@ class Gap:
 @dataclass(frozen=True)
 class HeldOutResiduals:
     """before, after: errors (F, 3) m/s of calibrations without and with the effects that have not seen them.
-    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling.
+    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling. hypotheses: those two, by
+    fold; of several recordings by recording, and of that one alone.
     """
 
     before: Array
     after: Array
     floor: Array
     block: Integers
+    hypotheses: tuple[tuple[Hypothesis, Hypothesis], ...] = ()
 
     def squares(self) -> tuple[Array, Array, Array]:
         """Squares of before, after and floor summed over each block (B,), (m/s)²."""
@@ -76,22 +78,31 @@ def held_out(selection: Selection) -> HeldOutResiduals:
     before, after = np.zeros((len(problem.bin_of), 3)), np.zeros((len(problem.bin_of), 3))
     hypotheses = selection.base.hypothesis, fit.hypothesis
     fold_of = folds_of(problem)
+    of_fold: list[list[Hypothesis]] = [[*hypotheses] for _ in range(int(fold_of.max(initial=-1)) + 1)]
     for fold in np.unique(fold_of):
         held = fold_of == fold
         at = held[problem.bin_of]
         train = fitter.without(held)
-        for hypothesis, into in zip(hypotheses, (before, after), strict=True):
+        for which, (hypothesis, into) in enumerate(zip(hypotheses, (before, after), strict=True)):
             fitted = train.fit(hypothesis, fit.noise, FOLD_STEPS).hypothesis
             if len(problem.recordings) > 1:
-                into[at] = _with_its_own_day(selection, fitted, int(fold))
+                of_day = _with_its_own_day(selection, fitted, int(fold))
+                fitted, into[at] = of_day.hypothesis, only(problem, int(fold)).errors(of_day.seen)
             else:
                 into[at] = problem.errors(problem.all_seen(fitted))[at]
+            of_fold[fold][which] = fitted
     block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
-    return HeldOutResiduals(before, after, noise_floor(selection), np.asarray(block, dtype=np.intp))
+    return HeldOutResiduals(
+        before,
+        after,
+        noise_floor(selection),
+        np.asarray(block, dtype=np.intp),
+        tuple((without, with_effects) for without, with_effects in of_fold),
+    )
 
 
-def _with_its_own_day(selection: Selection, hypothesis: Hypothesis, recording: int) -> Array:
-    """Errors of one recording with the vehicle as others tell it and the day as it tells itself."""
+def _with_its_own_day(selection: Selection, hypothesis: Hypothesis, recording: int) -> Fit:
+    """Fit to one recording with the vehicle as others tell it and the day as it tells itself."""
     problem, noise = selection.fitter.problem, selection.fit.noise
     alone = only(problem, recording)
     of_it = problem.recording_of == recording
@@ -101,8 +112,7 @@ def _with_its_own_day(selection: Selection, hypothesis: Hypothesis, recording: i
     outliers = selection.fitter.outliers
     fitter = Fitter(alone, outliers[of_it] if isinstance(outliers, np.ndarray) else outliers)
     values = {name: (per[recording],) for name, per in hypothesis.values.items()}
-    fitted = fitter.fit(replace(hypothesis, values=values), part, only_of_the_day=True)
-    return alone.errors(fitted.seen)
+    return fitter.fit(replace(hypothesis, values=values), part, only_of_the_day=True)
 
 
 def only(problem: Problem, recording: int) -> Problem:

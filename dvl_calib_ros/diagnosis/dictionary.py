@@ -59,7 +59,7 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         rate = motion.angular_velocity
         turning = rate[:, 2]
         found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
-        faded = [_faded(motion.time, turning, seconds) for seconds in FADES_S]
+        faded = [faded(motion.time, turning, seconds) for seconds in FADES_S]
         found["turns before"] = np.column_stack([*faded, _side_of_last_turn(turning)])
         found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
     return {name: grid.averaged(values) for name, values in found.items()}
@@ -75,7 +75,7 @@ def _steps(time: Array, count: int) -> Array:
     return (time[:, None] >= at).astype(float)
 
 
-def _faded(time: Array, values: Array, seconds: float) -> Array:
+def faded(time: Array, values: Array, seconds: float) -> Array:
     """(N,) what values (N,) were, fading with a time constant."""
     steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
     decay = np.exp(-steps / seconds)

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 from .closure import HeldOutResiduals
+from .followed import Followed, what_it_follows
 from .noise import segments_of
 from .selection import Selection
+from .twin import HeldOutTwin, held_out_twins
 from .unexplained import Unexplained
 from .where import regimes
 
@@ -24,7 +26,8 @@ class DiagnosisSeries:
     without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool.
     traces: by effect (F, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
     the calibration beside the effects, DVL frame; calibration_std: (6,) of both. rest: what is left after them.
-    measured: (3,) axes that the reference measures.
+    measured: (3,) axes that the reference measures. twins: recorded against simulated, by recording. followed: what is
+    left beside what it follows most.
     """
 
     recordings: tuple[str, ...]
@@ -39,6 +42,8 @@ class DiagnosisSeries:
     calibration_std: Array
     rest: Unexplained
     measured: tuple[bool, bool, bool] = (True, True, True)
+    twins: tuple[HeldOutTwin, ...] = ()
+    followed: Followed | None = None
 
 
 def collect_series(
@@ -69,4 +74,6 @@ def collect_series(
         calibration_std=np.sqrt(np.diag(covariance)[:6]),
         rest=rest,
         measured=problem.measured,
+        twins=held_out_twins(selection, residuals),
+        followed=what_it_follows(problem, fit, rest.about),
     )

@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
+from scipy.stats import norm
 
 from ..calibration.frames import Array
+from ..diagnosis.followed import Followed
 from .replay_figures import AFTER, BAD
 from .series import running_mean
 from .style import FAINT, INK, legend_above, new_figure, plain_log_ticks
@@ -18,6 +20,8 @@ from .time_axis import TimeAxis
 LINE_POINTS = 300
 # Groups of equally many samples in which the measured is compared with the effect
 GROUPS = 12
+# Bins of a histogram, points of a line of quantiles, dots of a scatter
+BINS, QUANTILES, SCATTER_POINTS = 40, 200, 2000
 MM = 1e3
 MEASURED_COLOUR = "#555b61"
 _STYLES = {
@@ -25,6 +29,10 @@ _STYLES = {
     "after": (AFTER, 1.3),
     "measured": (MEASURED_COLOUR, 1.1),
     "residual": (MEASURED_COLOUR, 1.3),
+    "without": (BAD, 1.1),
+    "with": (AFTER, 1.3),
+    "twin": (AFTER, 1.3),
+    "noise": (FAINT, 2.0),
 }
 
 
@@ -86,6 +94,89 @@ def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
     axes.set_xlabel("gap beyond the noise, mm/s rms (95 %)")
     axes.grid(False, axis="y")
     legend_above(axes)
+    return figure
+
+
+def error_bars(names: Sequence[str], errors: Mapping[str, Array], noise: float) -> Figure:
+    """Error in each regime of motion (R,) m/s rms, by name, and the noise that is in all."""
+    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    height = 0.8 / len(errors)
+    for i, ((name, values), (colour, _)) in enumerate(zip(errors.items(), _lines(list(errors)), strict=True)):
+        rows = np.arange(len(names)) + (i - 0.5 * (len(errors) - 1)) * height
+        axes.barh(rows, MM * values, height=0.9 * height, color=colour, alpha=0.85, label=name)
+    axes.axvline(MM * noise, color=INK, linewidth=1.0, linestyle=":", label="noise")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("recorded − twin, mm/s rms")
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
+    """Densities of values (K,) m/s, by name, and of normal noise with standard deviations (A,) m/s, equally often.
+
+    As far as the last of them reaches; what is beyond is in the last bins.
+    """
+    figure, axes = new_figure()
+    last = list(values.values())[-1]
+    reach = MM * float(max(np.quantile(np.abs(last), 0.995), 4.0 * np.max(noise)))
+    edges = np.linspace(-reach, reach, BINS + 1)
+    for (name, each), (colour, width) in zip(values.items(), _lines(list(values)), strict=True):
+        counts, _ = np.histogram(np.clip(MM * each, -reach, reach), edges)
+        axes.stairs(counts / len(each) / np.diff(edges), edges, color=colour, linewidth=width, label=name)
+    at = np.linspace(-reach, reach, 20 * BINS)
+    std = MM * np.maximum(noise, 1e-9)[:, None]
+    density = (np.exp(-0.5 * (at / std) ** 2) / (std * np.sqrt(2.0 * np.pi))).mean(axis=0)
+    axes.plot(at, density, color=FAINT, linewidth=2.0, label="noise", zorder=1)
+    axes.set_xlabel("recorded − twin, mm/s")
+    axes.set_ylabel("density, 1/(mm/s)")
+    axes.set_ylim(bottom=0.0)
+    legend_above(axes)
+    return figure
+
+
+def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
+    """Quantiles of values (K,) m/s, by name, against those of normal noise with standard deviations (A,) m/s.
+
+    As far as the last of them reaches.
+    """
+    figure, axes = new_figure(height=3.2)
+    k = max(len(each) for each in values.values())
+    end = float(norm.ppf(1.0 - 0.5 / k))
+    shares = norm.cdf(np.linspace(-end, end, QUANTILES))
+    std = MM * np.maximum(noise, 1e-9)
+    grid = np.linspace(-6.0, 6.0, 4001) * std.max()
+    of_noise = np.interp(shares, norm.cdf(grid[:, None] / std).mean(axis=1), grid)
+    axes.plot(of_noise[[0, -1]], of_noise[[0, -1]], color=FAINT, linewidth=2.0, label="noise", zorder=1)
+    for (name, each), (colour, _) in zip(values.items(), _lines(list(values)), strict=True):
+        axes.plot(of_noise, MM * np.quantile(each, shares), ".", color=colour, markersize=3.5, label=name)
+    axes.set_xlabel("quantiles of normal noise, mm/s")
+    axes.set_ylabel("of recorded − twin, mm/s")
+    reach = 1.3 * max(float(of_noise[-1]), MM * float(np.abs(list(values.values())[-1]).max()))
+    axes.set_ylim(-reach, reach)
+    legend_above(axes, markerscale=2.0)
+    return figure
+
+
+def against_what_it_follows(followed: Followed, label: str) -> Figure:
+    """What is left against what it follows: samples, means of groups with twice their error, and their scatter."""
+    figure, axes = new_figure(height=3.2)
+    at, mean, std, error = followed.groups()
+    shown = slice(None, None, max(1, len(followed.at) // SCATTER_POINTS))
+    axes.plot(
+        followed.at[shown], MM * followed.left[shown], ".", color=FAINT, markersize=2.5, label="left", zorder=1,
+        rasterized=True,
+    )  # fmt: skip
+    axes.fill_between(at, MM * (mean - std), MM * (mean + std), color=AFTER, alpha=0.15, linewidth=0.0, label="σ")
+    axes.errorbar(at, MM * mean, 2.0 * MM * error, fmt="o", markersize=4.0, color=AFTER, linewidth=1.2, label="mean")
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    reach = 1.2 * MM * float(np.nanmax([np.quantile(np.abs(followed.left), 0.98), *np.abs(mean) + std]))
+    axes.set_ylim(-reach, reach)
+    axes.set_xlabel(followed.label)
+    axes.set_ylabel(label)
+    legend_above(axes, markerscale=2.0)
     return figure
 
 

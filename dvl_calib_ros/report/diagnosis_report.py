@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import welch
 
 from ..calibration.frames import Array
 from ..diagnosis.results import Diagnosis, FoundEffect, Verdict
@@ -24,6 +23,7 @@ from .page import Cell, Table, signed, write_page
 from .series import running_mean
 from .style import Picture, picture
 from .time_axis import CUT_FROM_S, TimeAxis
+from .twin_section import followed_picture, twin_context
 
 BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
 # Class of the style sheet for each verdict
@@ -44,8 +44,6 @@ NOISE_MEANING = {
 WINDOW_SHARE, WINDOW_S = 1.0 / 50.0, 5.0
 # An axis of an effect's trace is drawn if it holds this share of its energy
 AXIS_SHARE = 0.1
-# Points of a spectrum in each decade of frequency
-SPECTRUM_STEPS = 10
 RESAMPLES = 500
 MAX_PLACES = 12
 
@@ -58,7 +56,9 @@ def write_diagnosis_report(path: Path, diagnosis: Diagnosis) -> None:
 def _context(d: Diagnosis) -> dict[str, Any]:
     series = d.series
     pictures = (
-        {"regimes": [], "traces": [], "residuals": [], "residual_note": ""} if series is None else _pictures(d, series)
+        {"regimes": [], "traces": [], "twins": [], "twin_table": None, "followed": []}
+        if series is None
+        else _pictures(d, series)
     )
     return {
         "title": "Sim-to-real gap of the DVL",
@@ -270,7 +270,6 @@ def _pictures(d: Diagnosis, series: DiagnosisSeries) -> dict[str, Any]:
     stamps_ns = _stamps(series)
     time = TimeAxis(stamps_ns)
     points = _window(series)
-    seconds = points * float(np.median(np.diff(series.time)))
     before, after = series.held_out.before, series.held_out.after
     residuals = {"before": before, "after": after} if d.effects else {"residual": before}
     return {
@@ -280,11 +279,8 @@ def _pictures(d: Diagnosis, series: DiagnosisSeries) -> dict[str, Any]:
             for effect in d.effects
             if series.traces[effect.name].any()
         ],
-        "residuals": list(_residuals(residuals, series, time, stamps_ns, points)),
-        "residual_note": (
-            "DVL velocity, calibrated, minus the reference, in the body frame, on held-out data. "
-            f"Lines over time are means over {seconds:.0f} s, which still hold noise of the reference."
-        ),
+        **twin_context(series.twins, _axes(series), bool(d.effects)),
+        "followed": [] if series.followed is None else [followed_picture(series.followed, _axes(series))],
     }
 
 
@@ -298,40 +294,6 @@ def _window(series: DiagnosisSeries) -> int:
     """Samples in a running mean."""
     interval = float(np.median(np.diff(series.time)))
     return max(3, round(WINDOW_S / interval), round(WINDOW_SHARE * len(series.time)))
-
-
-def _residuals(
-    residuals: Mapping[str, Array], series: DiagnosisSeries, time: TimeAxis, stamps_ns: Array, points: int
-) -> Iterable[Picture]:
-    """Of each axis over time and by frequency."""
-    for name_of_axis, where in _axes(series).items():
-        axis = "xyz".index(name_of_axis)
-        lines = {name: values[:, axis] for name, values in residuals.items()}
-        yield picture(
-            f"Residual {where} over time", f"Held-out residual {where}, {' and '.join(lines)}, running mean in mm/s",
-            figures.over_time, time, stamps_ns, lines, points, f"DVL − reference {where}, mm/s",
-        )  # fmt: skip
-        found = {name: _spectrum(series, values) for name, values in lines.items()}
-        frequency = next(iter(found.values()))[0]
-        yield picture(
-            f"Residual {where} by frequency", f"Amplitude spectral density of the held-out residual {where}",
-            figures.spectra, frequency, {name: density for name, (_, density) in found.items()}, f"{where}, mm/s/√Hz",
-        )  # fmt: skip
-
-
-def _spectrum(series: DiagnosisSeries, values: Array) -> tuple[Array, Array]:
-    """Frequency (F,) Hz and amplitude spectral density (F,) of values (M,), means over even steps of log frequency.
-
-    Of the longest stretch without a gap.
-    """
-    longest = max(series.segments, key=lambda part: part.stop - part.start)
-    count = longest.stop - longest.start
-    interval = float(np.median(np.diff(series.time[longest]))) if count > 1 else 1.0
-    frequency, power = welch(values[longest], 1.0 / interval, nperseg=min(count, max(16, count // 3)), detrend=False)
-    frequency, power = frequency[1:], power[1:]
-    step = np.floor(SPECTRUM_STEPS * np.log10(frequency / frequency[0])).astype(int)
-    _, group, n = np.unique(step, return_inverse=True, return_counts=True)
-    return np.bincount(group, frequency) / n, np.sqrt(np.bincount(group, power) / n)
 
 
 def _regimes(series: DiagnosisSeries, residuals: Mapping[str, Array]) -> Picture:

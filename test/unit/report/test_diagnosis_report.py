@@ -14,10 +14,15 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.diagnose import diagnose
+from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
 from dvl_calib_ros.report import diagnosis_report, write_diagnosis_report
+from dvl_calib_ros.report.twin_section import rms, spectrum
 
 pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each
+
+
+TWIN_RMS = rms(diagnosis().series.twins[0].without)
 
 
 def page_of(folder, found: Diagnosis) -> Page:
@@ -42,7 +47,7 @@ def test_the_answer_comes_first_then_where_which_what_is_left_and_what_to_fly(pa
     found = diagnosis()
     order = positions(
         page.text, "ambiguous", found.sentence, "x_m 0.300 (0.250 to 0.350) m", "42.1 mm/s", "Where the gap lies",
-        "Which effects", "Residual before and after", "What is left", found.next_manoeuvre, "The noise",
+        "Which effects", "Recorded against the simulated twin", "What is left", found.next_manoeuvre, "The noise",
     )  # fmt: skip
     assert order == sorted(order)
 
@@ -92,7 +97,9 @@ def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_pat
         gap=Gap(0.001, 0.001, 0.03, float("nan"), (float("nan"), float("nan"))),
     )  # fmt: skip
     page = page_of(tmp_path, nothing)
-    assert len(page.images()) == 7  # the regimes, and three axes over time and by frequency
+    # the regimes; of two recordings three axes over time, and four more; and what is left
+    assert len(page.images()) == 1 + 2 * 7 + 1
+    assert page.row("first")[1:4] == ["all of the run", "100 %", f"{TWIN_RMS:.4f}"]
     for absent in ("before", "Which effects", "Closed", "Where the gap lies", "nan"):
         assert absent not in page.text
 
@@ -137,14 +144,23 @@ def test_the_gap_of_a_regime_is_what_lies_there_beyond_the_noise():
 
 
 def test_the_spectrum_of_white_noise_is_flat_at_its_density():
-    series = diagnosis().series
+    twin = diagnosis().series.twins[0]
     rng = np.random.default_rng(0)
     n = 20_000
-    long = replace(series, time=0.2 * np.arange(n), segments=(slice(0, n),))
-    frequency, density = diagnosis_report._spectrum(long, rng.normal(0.0, 0.1, n))
-    expected = 0.1 * np.sqrt(2.0 * 0.2)  # the variance, spread evenly from 0 to 2.5 Hz
+    long = replace(twin, time=0.2 * np.arange(n), segments=(slice(0, n),))
+    frequency, density = spectrum(long, rng.normal(0.0, 0.1, (n, 2)))
+    expected = 0.1 * np.sqrt(2.0 * 2.0 * 0.2)  # the variance of two axes, spread evenly from 0 to 2.5 Hz
     above = frequency > 0.01
     assert frequency[-1] <= 2.5 and np.abs(density[above] / expected - 1.0).max() < 0.3
+
+
+def test_what_is_left_is_shown_against_what_it_follows_with_means_and_their_errors(page):
+    assert "What is left to port, against turn rate" in page.text
+    at = np.linspace(-1.0, 1.0, 3000)
+    left = 0.01 * at + np.random.default_rng(1).normal(0.0, 0.02, 3000)
+    where, mean, std, error = Followed("turn rate, °/s", "x", at, left).groups()
+    assert np.abs(mean - 0.01 * where).max() < 4.0 * error.max()
+    assert std == pytest.approx(0.02, rel=0.2) and error == pytest.approx(0.02 / np.sqrt(200.0), rel=0.2)
 
 
 # ------------------------------------------------------------------ from a bag
@@ -161,6 +177,13 @@ def test_the_series_are_those_that_the_gap_was_measured_on(tmp_path):
     assert set(found.series.traces) == {effect.name for effect in found.effects} == {"lever_arm"}
     page = page_of(tmp_path, found)
     assert page.row("lever_arm") and "lever_arm, to port" in page.text
+
+    (twin,) = found.series.twins
+    without, with_effects = (rms(each) for each in (twin.without, twin.with_effects))
+    assert with_effects == pytest.approx(found.gap.after, rel=0.1) and without > 1.08 * with_effects
+    assert rms(twin.without[twin.regimes["turning"]]) > 1.1 * rms(twin.without[twin.regimes["straight"]])
+    assert sum(mask.mean() for name, mask in twin.regimes.items() if name.endswith("m/s")) == pytest.approx(1, abs=0.2)
+    assert np.sqrt((twin.noise**2).sum()) == pytest.approx(found.gap.noise_floor, rel=0.2)
 
 
 def test_the_command_writes_the_report_and_collects_series_only_for_it(tmp_path, capsys, monkeypatch):

@@ -1,0 +1,142 @@
+"""The part of a diagnosis' report that shows recorded against simulated twin, and what is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.signal import welch
+
+from ..calibration.frames import Array
+from ..diagnosis.followed import Followed
+from ..diagnosis.twin import HeldOutTwin
+from . import diagnosis_figures as figures
+from .page import Table
+from .style import Picture, picture
+from .time_axis import TimeAxis
+
+# Points of a spectrum in each decade of frequency
+SPECTRUM_STEPS = 10
+# Lines over time are means over this share of the run, and over so many seconds at least
+WINDOW_SHARE, WINDOW_S = 1.0 / 100.0, 3.0
+ALL = "all of the run"
+WITHOUT, WITH, ALONE = "without", "with", "twin"
+
+
+def differences(twin: HeldOutTwin, has_effects: bool) -> dict[str, Array]:
+    """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
+    return {WITHOUT: twin.without, WITH: twin.with_effects} if has_effects else {ALONE: twin.without}
+
+
+def twin_context(twins: Sequence[HeldOutTwin], axes: Mapping[str, str], has_effects: bool) -> dict[str, Any]:
+    """What the template needs. axes: those that are measured, x, y, z, with what they are called."""
+    return {
+        "twin_table": twin_table(twins, has_effects),
+        "twins": [{"name": t.name, "pictures": list(twin_pictures(t, axes, has_effects))} for t in twins],
+    }
+
+
+def rms(values: Array) -> float:
+    """m/s of the vector, of values (N, 3)."""
+    return float(np.sqrt((values**2).sum(axis=1).mean())) if len(values) else float("nan")
+
+
+def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table | None:
+    """Error of every recording in every regime of motion, m/s."""
+    if not twins:
+        return None
+    rows = []
+    for twin in twins:
+        noise = float(np.sqrt((twin.noise**2).sum()))
+        for regime, mask in {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}.items():
+            errors = [f"{rms(values[mask]):.4f}" for values in differences(twin, has_effects).values()]
+            rows.append(
+                (twin.name if regime == ALL else "", regime, f"{100.0 * mask.mean():.0f} %", *errors, f"{noise:.4f}")
+            )
+    heads = ("without, m/s", "with, m/s") if has_effects else ("recorded less twin, m/s",)
+    return Table(
+        ("recording", "regime", "share", *heads, "noise, m/s"),
+        rows,
+        notes=(
+            "Rms of the vector in what the DVL measures, noise of DVL and reference included; the error at the top is "
+            "that after calibration. The twin moves as the reference says, and its parameters had not seen "
+            "the samples that it is compared with.",
+        ),
+    )
+
+
+def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool) -> Iterable[Picture]:
+    """Over time along each axis, by frequency, distribution, and by regime."""
+    found = differences(twin, has_effects)
+    stamps_ns = np.asarray(1e9 * twin.time, dtype=np.int64)
+    time = TimeAxis(stamps_ns)
+    interval = float(np.median(np.diff(twin.time)))
+    points = max(3, round(WINDOW_S / interval), round(WINDOW_SHARE * len(twin.time)))
+    names = " and ".join(found)
+    for letter, where in axes.items():
+        lines = {name: values[:, "xyz".index(letter)] for name, values in found.items()}
+        yield picture(
+            f"{twin.name}: recorded less twin {where}", f"Recorded less twin {where} over time, {names}, in mm/s",
+            figures.over_time, time, stamps_ns, lines, points, f"recorded − twin {where}, mm/s",
+            caption=f"Means over {points * interval:.0f} s.",
+        )  # fmt: skip
+    measured = ["xyz".index(letter) for letter in axes]
+    spectra = {name: spectrum(twin, values[:, measured]) for name, values in found.items()}
+    frequency = next(iter(spectra.values()))[0]
+    noise = float(np.sqrt(2.0 * interval * (twin.noise**2).sum()))
+    densities = {name: density for name, (_, density) in spectra.items()} | {"noise": np.full(len(frequency), noise)}
+    yield picture(
+        f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, beside the noise",
+        figures.spectra, frequency, densities, "recorded − twin, mm/s/√Hz",
+    )  # fmt: skip
+    pooled = {name: values[:, measured].ravel() for name, values in found.items()}
+    yield picture(
+        f"{twin.name}: distribution", f"Histogram of recorded less twin, {names}, beside that of the noise",
+        figures.histogram, pooled, twin.noise[measured],
+        caption="All axes together; what lies beyond the ends is in the last bins.",
+    )  # fmt: skip
+    yield picture(
+        f"{twin.name}: against normal noise", f"Quantiles of recorded less twin, {names}, against those of the noise",
+        figures.quantiles, pooled, twin.noise[measured],
+        caption="On the line, it is distributed as the noise is; what is far off runs out of the picture.",
+    )  # fmt: skip
+    masks = {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}
+    errors = {name: np.array([rms(values[mask]) for mask in masks.values()]) for name, values in found.items()}
+    alt = "; ".join(
+        f"{regime}: " + ", ".join(f"{name} {1e3 * errors[name][i]:.1f} mm/s" for name in errors)
+        for i, regime in enumerate(masks)
+    )
+    yield picture(
+        f"{twin.name}: error by regime", alt,
+        figures.error_bars, list(masks), errors, float(np.sqrt((twin.noise**2).sum())),
+    )  # fmt: skip
+
+
+def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:
+    """Frequency (F,) Hz and amplitude spectral density (F,) of vectors (N, A), means over even steps of log frequency.
+
+    Of the longest stretch without a gap.
+    """
+    longest = max(twin.segments, key=lambda part: part.stop - part.start)
+    count = longest.stop - longest.start
+    interval = float(np.median(np.diff(twin.time[longest]))) if count > 1 else 1.0
+    per_segment = min(count, max(16, count // 3))
+    frequency, power = welch(values[longest], 1.0 / interval, nperseg=per_segment, detrend=False, axis=0)
+    frequency, power = frequency[1:], power[1:].sum(axis=1)
+    step = np.floor(SPECTRUM_STEPS * np.log10(frequency / frequency[0])).astype(int)
+    _, group, n = np.unique(step, return_inverse=True, return_counts=True)
+    return np.bincount(group, frequency) / n, np.sqrt(np.bincount(group, power) / n)
+
+
+def followed_picture(followed: Followed, axes: Mapping[str, str]) -> Picture:
+    """What is left against what it follows most."""
+    where = axes[followed.axis]
+    label = followed.label.partition(",")[0]
+    return picture(
+        f"What is left {where}, against {label}",
+        f"What the fit leaves {where} against {followed.label}, with means of groups and their standard deviations",
+        figures.against_what_it_follows, followed, f"left {where}, mm/s",
+        caption="Dots: what is left, averaged over two samples of the slower stream. Band: standard deviation of a "
+        "group about its mean; bars: of the mean, twice.",
+    )  # fmt: skip
