@@ -59,8 +59,8 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         rate = motion.angular_velocity
         turning = rate[:, 2]
         found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
-        faded = [faded(motion.time, turning, seconds) for seconds in FADES_S]
-        found["turns before"] = np.column_stack([*faded, _side_of_last_turn(turning)])
+        fading = [faded(motion.time, turning, seconds) for seconds in FADES_S]
+        found["turns before"] = np.column_stack([*fading, _side_of_last_turn(turning)])
         found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
     return {name: grid.averaged(values) for name, values in found.items()}
 
