@@ -11,8 +11,8 @@ import numpy as np
 from ..calibration.frames import Array
 from ..effects.base import EffectInput
 from .composed import Problem
-from .fitting import Fit
 from .dictionary import FADES_S, faded
+from .fitting import Fit
 
 # Groups of equally many samples in which the mean is told
 GROUPS = 15
