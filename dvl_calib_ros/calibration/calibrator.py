@@ -447,7 +447,14 @@ class Calibrator:
             last_ns=self.last_ns,
             parameters=self.parameters.as_dict(),
             verifications={name: self.verification(name) for name in MODELS} if self._verified else {},
+            suggestion=self.suggestion,
         )
+
+    @property
+    def suggestion(self) -> str:
+        """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
+        found = self._delay.coarse.suggestion()
+        return "" if found is None else found.says
 
 
 def _own(block: AlignedBlock) -> AlignedBlock:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rpy_from_rotation
+from .frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, skew
 from .samples import VelocityFrame
 
 # A configuration is wrong from here on: what is left of the motion, as a share of its square, is that of 10 degrees.
@@ -23,6 +23,11 @@ WRONG_FROM = math.sin(math.radians(10.0)) ** 2
 FITS_BELOW, BETTER_BY = 0.05, 0.25
 # A rotation this near another is that one, rad: what is left is misalignment, for the calibration to find.
 SAME_WITHIN = math.radians(12.0)
+# Mountings are drawn with multiples of such an angle, rad, and one that is the same but for a misalignment is named.
+DRAWN = math.pi / 4.0
+# Axes turned round are the right ones if they leave so much less than those given with any lever arm: in chi-square,
+# were all samples independent; of blocks of ten that are alike it is a tenth.
+CLEARLY = 40.0
 # Of the sum of squares that the nominal mounting is given: turns about the direction of travel do not show, and stay.
 NOMINAL_SHARE = 1e-3
 # Fewer samples fit anything.
@@ -49,14 +54,22 @@ class CoarseFits:
         self._vv = np.zeros(len(_FRAMES))
         self._count = np.zeros(len(_FRAMES), dtype=np.int64)
         self._declared = np.zeros(len(_FRAMES), dtype=np.int64)
+        # of the axes given with a lever arm, and of those turned round without one
+        self._fits = _AxesFit(self._nominal, True), _AxesFit(self._nominal @ FLU_FROM_FRD, False)
 
     def add(
-        self, declared: VelocityFrame, reference: Array, rotation_enu_from_body: Array | None, velocity: Array
+        self,
+        declared: VelocityFrame,
+        reference: Array,
+        rotation_enu_from_body: Array | None,
+        velocity: Array,
+        rates: Array | None = None,
     ) -> None:
         """Add N samples of one frame.
 
         reference: (N, 3) m/s as the messages have it, said to be in the frame `declared`. rotation_enu_from_body:
-        (N, 3, 3), None where there is no attitude. velocity: (N, 3) m/s at the same times, DVL frame.
+        (N, 3, 3), None where there is no attitude. velocity: (N, 3) m/s at the same times, DVL frame. rates: (N, 3)
+        rad/s, body frame; None where they are not known.
         """
         self._declared[_FRAMES.index(declared)] += len(reference)
         for index, frame in enumerate(_FRAMES):
@@ -66,6 +79,9 @@ class CoarseFits:
                     continue
                 enu = reference @ ENU_FROM_NED.T if frame is VelocityFrame.NED else reference
                 g = np.einsum("nji,nj->ni", rotation_enu_from_body, enu)
+            if frame is declared and rates is not None:
+                for fit in self._fits:
+                    fit.add(g, velocity, rates)
             self._gv[index] += g.T @ velocity
             self._gg[index] += np.sum(g * g)
             self._vv[index] += np.sum(velocity * velocity)
@@ -78,7 +94,7 @@ class CoarseFits:
             return None
         given = self._misfit(declared, self._nominal)
         if given < WRONG_FROM:
-            return None
+            return self._flipped(given)
         rotations = [self._rotation(index) for index in range(len(_FRAMES))]
         misfits = [
             self._misfit(index, rotation) if self._count[index] >= ENOUGH else math.inf
@@ -90,6 +106,18 @@ class CoarseFits:
         if misfit > FITS_BELOW or misfit > BETTER_BY * given:
             return None
         return self._named(declared, best, rotations[best], misfit)
+
+    def _flipped(self, misfit: float) -> Suggestion | None:
+        """Whether y and z turned round explain more than the axes given do with any lever arm.
+
+        A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small
+        beside its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm.
+        """
+        as_given, turned = (fit.left() for fit in self._fits)
+        samples = self._fits[0].samples
+        if samples < ENOUGH or 3.0 * samples * math.log(as_given / turned) < CLEARLY:
+            return None
+        return Suggestion("the DVL's axes look forward-right-down (dvl_axes: frd)", {"dvl_axes": "frd"}, misfit)
 
     def _rotation(self, index: int) -> Array:
         """``rotation_body_from_dvl`` (3, 3) that fits best."""
@@ -109,19 +137,54 @@ class CoarseFits:
         about = [] if same_frame else [f"the reference looks like {frame.upper() if best else 'the body frame'}"]
         parameters: dict[str, object] = {} if same_frame else {"gnss_frame": frame}
         earth = best != 0 and declared != 0
-        if _angle(rotation, self._nominal) < SAME_WITHIN:
-            pass  # the frame explains it
+        otherwise = ""
+        if _angle(rotation, self._nominal) < SAME_WITHIN:  # the frame explains it
+            if earth and not same_frame and self._misfit(best, FLU_FROM_FRD @ self._nominal) < FITS_BELOW:
+                otherwise = ", or the IMU's orientation looks like NED (imu_frame: ned): only sway tells these apart"
         elif not same_frame and earth and _angle(rotation, FLU_FROM_FRD @ self._nominal) < SAME_WITHIN:
             about, parameters = ["the IMU's orientation looks like NED, forward-right-down"], {"imu_frame": "ned"}
         elif _angle(rotation, self._nominal @ FLU_FROM_FRD) < SAME_WITHIN:
             about.append("the DVL's axes look forward-right-down")
             parameters["dvl_axes"] = "frd"
         else:
-            rpy = [round(float(angle), 3) + 0.0 for angle in rpy_from_rotation(rotation)]
-            about.append(f"the data fit mounting_rpy {' '.join(f'{angle:g}' for angle in rpy)}")
+            rpy = [round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(_as_drawn(rotation))]
+            about.append(f"the data fit mounting_rpy {' '.join(f'{angle:.3g}' for angle in rpy)}")
             parameters["mounting_rpy"] = rpy
         remedy = ", ".join(f"{name}: {value}" for name, value in parameters.items())
-        return Suggestion(f"{' and '.join(about)} ({remedy})", parameters, misfit)
+        return Suggestion(f"{' and '.join(about)} ({remedy}){otherwise}", parameters, misfit)
+
+
+class _AxesFit:
+    """Least squares of a small turn, a scale and, if wanted, a lever arm, about a mounting taken for granted."""
+
+    def __init__(self, rotation_body_from_dvl: Array, with_lever_arm: bool) -> None:
+        self._rotation = rotation_body_from_dvl
+        n = 7 if with_lever_arm else 4
+        self._normal, self._vector, self._square = np.zeros((n, n)), np.zeros(n), 0.0
+        self.samples = 0
+
+    def add(self, reference: Array, velocity: Array, rates: Array) -> None:
+        """Add N samples: reference (N, 3) m/s and rates (N, 3) rad/s in the body, velocity (N, 3) m/s of the DVL."""
+        known = np.isfinite(rates).all(axis=1)
+        in_body = velocity[known] @ self._rotation.T
+        rest = reference[known] - in_body
+        columns = [skew(in_body), in_body[:, :, None], skew(rates[known])]
+        h = np.concatenate(columns[: 3 if len(self._vector) == 7 else 2], axis=2)
+        self._normal += np.einsum("nia,nib->ab", h, h)
+        self._vector += np.einsum("nia,ni->a", h, rest)
+        self._square += float(np.sum(rest**2))
+        self.samples += int(known.sum())
+
+    def left(self) -> float:
+        """Sum of squares (m/s)² that is left."""
+        explained = float(self._vector @ np.linalg.lstsq(self._normal, self._vector, rcond=1e-9)[0])
+        return max(self._square - explained, 1e-12 * max(self._square, 1e-12))
+
+
+def _as_drawn(rotation: Array) -> Array:
+    """The rotation by multiples of `DRAWN` that a mounting (3, 3) is the same as; itself if it is of none."""
+    drawn = rotation_from_rpy(np.round(rpy_from_rotation(rotation) / DRAWN) * DRAWN)
+    return drawn if _angle(rotation, drawn) < SAME_WITHIN else rotation
 
 
 def _angle(a: Array, b: Array) -> float:

@@ -348,6 +348,14 @@ _KINDS = (
         "check mounting_rpy and the frames before believing it: does the vehicle drive ahead in the DVL's x?",
     ),
     FindingKind(
+        "CONFIGURATION_WRONG",
+        "{says}, not the configuration given",
+        "The reference is not in the frame, or the DVL not mounted, as the parameters say: another frame or a rotation "
+        "by a large angle fits the samples, gated ones with them, much better.",
+        "stop, set it, and begin anew",
+        Severity.ERROR,
+    ),
+    FindingKind(
         "INNOVATIONS_LARGE",
         "{model}: innovations are larger than R and P allow (mean NIS {nis:.1f}, at most {limit:.1f}), σ is too small",
         "Noise above what is assumed, or an effect that the model does not have.",

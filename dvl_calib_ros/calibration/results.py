@@ -91,7 +91,8 @@ class Result:
 
     first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
     `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values.
-    verifications: by model, empty if the calibrator was not to verify.
+    verifications: by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit,
+    where the one given is grossly wrong, else ''.
     """
 
     selected: str
@@ -103,6 +104,7 @@ class Result:
     last_ns: int | None
     parameters: Mapping[str, Any]
     verifications: Mapping[str, Verification]
+    suggestion: str = ""
 
     @property
     def estimate(self) -> Estimate:

@@ -143,7 +143,7 @@ def verify(
 
     """
     findings = [
-        *_use_findings(used_and_gated),
+        *use_findings(used_and_gated),
         *([(Word.REJECT, f"{suggestion.says}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
@@ -158,7 +158,8 @@ Finding = tuple[Word, str]
 _SEVERITY = (Word.REJECT, Word.MARGINAL, Word.ACCEPT)
 
 
-def _use_findings(used_and_gated: tuple[int, int] | None) -> list[Finding]:
+def use_findings(used_and_gated: tuple[int, int] | None) -> list[Finding]:
+    """What it says of an estimate how many samples it used, and threw out."""
     if used_and_gated is None:
         return []
     used, gated = used_and_gated

@@ -22,7 +22,7 @@ from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
-from ..calibration.verification import Word
+from ..calibration.verification import Word, use_findings
 from ..errors import InputError
 from .parameter_edit import as_yaml, new_file, with_parameters
 from .parameter_files import NODE_NAME, changed_parameters, load_parameters
@@ -112,6 +112,8 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         turned = content["mounting"].get("dvl_data_axes") == FRD
         convergence = Convergence(content["models"][model.name]["convergence"])
         objections, doubts = _judged(content.get("verification"), convergence)
+        if "verification" not in content:
+            objections += _unverified(content, model)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     except ParameterError as error:
@@ -156,6 +158,14 @@ def _judged(
     elif verdict is Word.MARGINAL:
         doubts.append(f"its verdict is marginal: {reason}")
     return tuple(objections), tuple(doubts)
+
+
+def _unverified(content: Mapping[str, Any], model: Model) -> tuple[str, ...]:
+    """Objections to what the node saved, which it cannot verify but knows to be of a wrong configuration."""
+    objections = [f"{content['suggestion']}, not the configuration given"] if content.get("suggestion") else []
+    used_and_gated = (int(content["used"]), int(content["gated"]))
+    objections += [sentence for _, sentence in use_findings(used_and_gated)] if model.aided else []
+    return tuple(objections)
 
 
 def _unseen(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:

@@ -72,6 +72,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         **estimate_document(estimate),
         "std": _std_in_words(estimate),
         **({} if verification is None else {"verification": verification_document(verification)}),
+        **({"suggestion": result.suggestion} if result.suggestion else {}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
         "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],
         "mounting": {

@@ -124,6 +124,8 @@ def diagnose(
     found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
     found += message_advice(grown) + data_advice(grown) + dvl_type.advice(grown["dvl"])
     found += gate_advice(estimate) + consistency_advice(estimate)
+    if calibrator.suggestion:
+        found.append(finding("CONFIGURATION_WRONG", says=calibrator.suggestion))
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
     status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"

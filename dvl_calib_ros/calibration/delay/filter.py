@@ -295,6 +295,9 @@ class DelayFilter:
             return
         velocity = np.column_stack([np.interp(times, dvl.times, column) for column in dvl.velocity.T])
         rotation, oriented = attitude_at(imu, times, self._parameters.imu_timeout)
+        rates = None
+        if len(imu.times) > 1:
+            rates = np.column_stack([np.interp(times, imu.times, column) for column in imu.angular_velocity.T])
         inside = (times >= dvl.times[0]) & (times <= dvl.times[-1])
         moving = inside & ((velocity**2).sum(axis=1) >= self._parameters.min_speed**2)
         unmeasured = track.unmeasured[at] != 0
@@ -302,7 +305,10 @@ class DelayFilter:
             for has_attitude in (True, False):
                 use = moving & (track.frames[at] == code) & (oriented == has_attitude) & ~unmeasured
                 if use.any():
-                    self.coarse.add(FRAMES[code], raw[use], rotation[use] if has_attitude else None, velocity[use])
+                    attitude = rotation[use] if has_attitude else None
+                    self.coarse.add(
+                        FRAMES[code], raw[use], attitude, velocity[use], None if rates is None else rates[use]
+                    )
 
     def _dvl_columns(self, from_ns: int, to_ns: int) -> tuple[DvlColumns, Array]:
         """DVL samples between two stamps, and their mean covariance (3, 3)."""

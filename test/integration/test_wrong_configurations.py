@@ -1,0 +1,139 @@
+"""Each grossly wrong configuration, as a bag: it is rejected, what fits is named, and apply refuses it."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+from io_fixtures import write_bag
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.verification import Word
+from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.files.result_file import result_document, result_text
+from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+SMALL = DvlErrors((0.01, -0.015, 0.02), (0.003,) * 3, beam_std=0.005)
+BODY, ENU, NED = VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED
+
+
+@cache
+def run(mounting_rpy=(0.0, 0.0, 0.0), trajectory="figure8", frame=ENU, gnss_std=0.05):
+    samples = simulate(
+        Scenario(
+            trajectory, 120.0, imu_rate=10, errors=SMALL, gnss_std=gnss_std, mounting_rpy=mounting_rpy, gnss_frame=frame
+        )
+    )
+    return tuple(heapq.merge(samples.imu, samples.gnss, samples.dvl, key=lambda sample: sample.stamp_ns))
+
+
+def references(samples, change):
+    return [change(sample) if isinstance(sample, ReferenceSample) else sample for sample in samples]
+
+
+def in_ned(sample):
+    """A reference in ENU as a driver gives it that says ENU and means NED."""
+    return sample._replace(velocity=tuple((ENU_FROM_NED.T @ sample.velocity).tolist()))
+
+
+def attitude_in_ned(sample):
+    if not isinstance(sample, ImuSample):
+        return sample
+    rotation = ENU_FROM_NED @ Rotation.from_quat(sample.orientation).as_matrix() @ FLU_FROM_FRD
+    return sample._replace(orientation=tuple(Rotation.from_matrix(rotation).as_quat().tolist()))
+
+
+def of_the_dvl(samples):
+    """A reference that is made from the DVL's own samples, with a claim of GNSS's noise."""
+    rng = np.random.default_rng(1)
+    made = []
+    for sample in samples:
+        if isinstance(sample, ReferenceSample):
+            continue
+        made.append(sample)
+        if isinstance(sample, DvlSample):
+            velocity = tuple((np.array(sample.velocity) + rng.normal(0.0, 0.002, 3)).tolist())
+            made.append(ReferenceSample(sample.stamp_ns, velocity, np.eye(3) * 0.05**2, BODY))
+    return made
+
+
+def swinging(samples):
+    """A reference that says 0.01 m/s and is off by 0.3 m/s, slowly: some effect that no model has."""
+    first = samples[0].stamp_ns
+
+    def change(sample):
+        seconds = 1e-9 * (sample.stamp_ns - first)
+        off = (0.3 * math.sin(seconds / 9.0), 0.3 * math.cos(seconds / 14.0), 0.0)
+        covariance = np.eye(3) * 0.01**2
+        return sample._replace(velocity=tuple(np.add(sample.velocity, off).tolist()), covariance=covariance)
+
+    return references(samples, change)
+
+
+YAW = {deg: (0.0, 0.0, math.radians(deg)) for deg in (45, 90, 180)}
+WRONG = {
+    "yaw off by 45 degrees": (lambda: run(YAW[45]), {}, "the data fit mounting_rpy 0 0 0.785"),
+    "yaw off by 90 degrees": (lambda: run(YAW[90]), {}, "the data fit mounting_rpy 0 0 1.57"),
+    "yaw off by 180 degrees": (lambda: run(YAW[180]), {}, "the data fit mounting_rpy 0 0 "),
+    "z flipped": (lambda: run((math.pi, 0.0, 0.0)), {}, "the DVL's axes look forward-right-down (dvl_axes: frd)"),
+    "x and y swapped": (lambda: run((math.pi, 0.0, math.pi / 2)), {}, "the data fit mounting_rpy"),
+    "ENU, body claimed": (run, {"gnss_frame": "body"}, "the reference looks like ENU (gnss_frame: enu)"),
+    "ENU, NED claimed": (run, {"gnss_frame": "ned"}, "the reference looks like ENU (gnss_frame: enu)"),
+    "NED, ENU claimed": (lambda: references(run(), in_ned), {}, "the reference looks like NED (gnss_frame: ned)"),
+    "NED, body claimed": (
+        lambda: references(run(), in_ned), {"gnss_frame": "body"}, "the reference looks like NED (gnss_frame: ned)",
+    ),
+    "body, ENU claimed": (lambda: run(frame=BODY), {"gnss_frame": "enu"}, "the reference looks like the body frame"),
+    "attitude in NED": (lambda: [attitude_in_ned(s) for s in run()], {}, "the IMU's orientation looks like NED"),
+    "a reference with the DVL in it": (lambda: of_the_dvl(run()), {}, "Was the DVL fused into the reference?"),
+    "an effect beyond the model": (lambda: swinging(run(gnss_std=0.01)), {}, "contradict it and were gated"),
+    "a vehicle that stands": (
+        lambda: [s._replace(velocity=(0.0, 0.0, 0.0)) if not isinstance(s, ImuSample) else s for s in run()], {},
+        "no sample was used",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_refuses_it(wrong, tmp_path, capsys):
+    samples, given, sentence = WRONG[wrong]
+    result = replay([write_bag(tmp_path / "bag", samples())], Parameters(**given)).result
+    verification = result.verifications[result.selected]
+    assert verification.verdict is Word.REJECT, verification.reasons
+    assert any(sentence in reason for reason in verification.reasons), verification.reasons
+    saved, urdf = tmp_path / "result.yaml", tmp_path / "robot.urdf"
+    saved.write_text(result_text(result_document(result)))
+    links = '<parent link="base_link"/><child link="dvl_link"/>'
+    urdf.write_text(f'<robot><joint name="j" type="fixed">{links}</joint></robot>')
+    assert main(["apply", str(saved), "--urdf", str(urdf)]) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "samples", [run, lambda: run(frame=BODY), lambda: run(trajectory="box")], ids=["figure8", "body", "box"]
+)
+def test_a_right_configuration_is_not_rejected_and_nothing_else_is_said_to_fit(samples, tmp_path):
+    result = replay([write_bag(tmp_path / "bag", samples())], Parameters()).result
+    verification = result.verifications[result.selected]
+    assert verification.verdict is Word.ACCEPT, verification.reasons
+    assert result.suggestion == ""
+
+
+def test_what_the_node_saves_of_a_wrong_configuration_is_refused_too_though_it_cannot_verify(tmp_path, capsys):
+    result = replay([write_bag(tmp_path / "bag", run(YAW[45]))], Parameters()).result
+    document = result_document(result)
+    del document["verification"]
+    saved, launch = tmp_path / "result.yaml", tmp_path / "tf.launch.xml"
+    saved.write_text(yaml.safe_dump(document))
+    assert main(["apply", str(saved), "--launch", str(launch)]) == 2
+    error = capsys.readouterr().err
+    assert "the data fit mounting_rpy 0 0 0.785" in error and not launch.exists()
