@@ -1,7 +1,7 @@
 """Calibrate a Doppler velocity log before a dive: live on ROS 2 Jazzy and over recorded bags.
 
-The public interface, which is `api`: replay, doctor, diagnose, simulate, evaluate, and what they take and give. It is
-imported when it is asked for, since the command line must not wait for NumPy to print its help.
+The public interface, which is `api`: replay, compare, doctor, diagnose, simulate, evaluate, and what they take and
+give. It is imported when it is asked for, since the command line must not wait for NumPy to print its help.
 """
 
 import sys as _sys
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         ParameterError,
         Parameters,
         Scenario,
+        compare,
         diagnose,
         doctor,
         evaluate,
@@ -30,6 +31,7 @@ __all__ = [
     "ParameterError",
     "Parameters",
     "Scenario",
+    "compare",
     "diagnose",
     "doctor",
     "evaluate",

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
+    from .calibration.comparison import Comparison
     from .evaluation.bags import CrossCheck
     from .evaluation.results import Evaluation
 
@@ -47,6 +48,7 @@ __all__ = [
     "ParameterError",
     "Parameters",
     "Scenario",
+    "compare",
     "diagnose",
     "doctor",
     "evaluate",
@@ -251,6 +253,41 @@ def replay(
     discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
     replayed = checked_replay(paths, discovery.parameters, discovery.topics, merge=merge, with_history=history)
     return Calibration(replayed, discovery, tuple(paths))
+
+
+def compare(*results: StrPath | Calibration) -> Comparison:
+    """Compare calibrations of one DVL, as ``dvl-calib compare``: has the mounting moved?
+
+    Parameters
+    ----------
+    *results
+        Result files, or what `replay` gave; two or more.
+
+    Returns
+    -------
+    Comparison
+        ``same_mounting``, and everything beside it; `sentences` of it are in `calibration.comparison`.
+
+    Raises
+    ------
+    InputError
+        For what is no result file, holds no sample, or has nothing in common with the others.
+    """
+    from .calibration.comparison import compare as run
+    from .files.extrinsics import load_extrinsics
+    from .replay.replay import extrinsics_of_replay
+
+    found = []
+    for each in results:
+        if not isinstance(each, Calibration):
+            found.append(load_extrinsics(Path(each), str(each)))
+            continue
+        name = ", ".join(map(str, each.bags))
+        extrinsics = extrinsics_of_replay(each.replayed, name)
+        if extrinsics is None:
+            raise InputError(f"{name}: no sample of it could be used to calibrate; leave it out")
+        found.append(extrinsics)
+    return run(found)
 
 
 def doctor(

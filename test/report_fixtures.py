@@ -12,6 +12,8 @@ from matplotlib.category import StrCategoryLocator
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
+from dvl_calib_ros.calibration.comparison import Comparison, compare
+from dvl_calib_ros.calibration.extrinsics import Extrinsics, rotation_of
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
@@ -22,6 +24,7 @@ from dvl_calib_ros.diagnosis.series import DiagnosisSeries
 from dvl_calib_ros.diagnosis.twin import HeldOutTwin
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
 from dvl_calib_ros.diagnosis.where import Place
+from dvl_calib_ros.evaluation.bags import CrossCheck
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,
     CalibrationRun,
@@ -33,6 +36,7 @@ from dvl_calib_ros.evaluation.results import (
     HeldOut,
     Trace,
 )
+from dvl_calib_ros.replay.navigation import Drift, Navigation
 from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.report.replay_report import write_replay_report
 
@@ -212,3 +216,35 @@ def diagnosis(**changes: Any) -> Diagnosis:
         "series": series,
     }  # fmt: skip
     return Diagnosis(**{**values, **changes})
+
+
+def comparison(name: str) -> Comparison:
+    """Three calibrations, of which the last has moved. name: of one of them."""
+    std = np.array([0.001, 0.001, 0.001, 0.02, 0.02, 0.02, 0.001, 0.01])
+    return compare(
+        [
+            Extrinsics(
+                name=each, model="G2", first_ns=day * 86_400_000_000_000, last_ns=(day * 86_400 + 600) * 1_000_000_000,
+                rotation_body_from_dvl=rotation_of((0.0, 0.0, yaw)), lever_arm=np.zeros(3), scale=0.0, time_offset=0.0,
+                covariance=np.diag(std**2), shown=np.ones(8, dtype=bool), used=100, remarks=("as it is",),
+            )
+            for day, (each, yaw) in enumerate(((name, 0.0), ("tuesday.yaml", 0.0), ("wednesday.yaml", 0.012)))
+        ]
+    )  # fmt: skip
+
+
+def cross_checked(name: str) -> CrossCheck:
+    """Two bags that corrected each other. name: of one of them."""
+    along = np.linspace(0.0, 100.0, 50)
+    track = np.column_stack([along, 10.0 * np.sin(along / 20.0)])
+    found = Navigation(
+        distance_m=110.0, seconds=60.0, stretch_m=110.0, stretches=1, before=Drift(20.0, 2.2), after=Drift(2.0, 0.2),
+        noise_per_km=1.0, on_a_map=True, distances=along, reference=track, track_before=1.02 * track,
+        track_after=1.002 * track,
+    )  # fmt: skip
+    other = "tuesday"
+    return CrossCheck(
+        bags=(name, other), models=("G1",), n_paired=(10, 10), uncorrected=np.array([0.1, 0.1]),
+        corrected=np.array([[[np.nan, 0.02]], [[0.02, np.nan]]]), notes=(), parameters=Parameters().as_dict(),
+        selected=("G1", "G1"), navigation={(name, other): found, (other, name): found},
+    )  # fmt: skip

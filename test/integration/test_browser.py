@@ -8,9 +8,14 @@ from pathlib import Path
 
 import pytest
 from io_fixtures import run
-from report_fixtures import diagnosis, evaluation, replay_page
+from report_fixtures import comparison, cross_checked, diagnosis, evaluation, replay_page
 
-from dvl_calib_ros.report import write_diagnosis_report, write_evaluation_report
+from dvl_calib_ros.report import (
+    write_comparison_report,
+    write_cross_check_report,
+    write_diagnosis_report,
+    write_evaluation_report,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -38,12 +43,15 @@ def reports(tmp_path_factory) -> dict[str, Path]:
     hostile.mkdir()
     made = {"replay": replay_page(hostile)[0]}
     made |= {name: folder / f"{name}.html" for name in ("evaluation", "diagnosis")}
+    made |= {name: folder / f"{name}.html" for name in ("comparison", "cross_check")}
+    write_comparison_report(made["comparison"], comparison(hostile.name))
+    write_cross_check_report(made["cross_check"], cross_checked(hostile.name))
     write_evaluation_report(made["evaluation"], evaluation())
     write_diagnosis_report(made["diagnosis"], diagnosis())
     return made
 
 
-@pytest.fixture(params=["replay", "evaluation", "diagnosis"])
+@pytest.fixture(params=["replay", "evaluation", "diagnosis", "comparison", "cross_check"])
 def report(request, reports) -> Path:
     return reports[request.param]
 

@@ -9,6 +9,7 @@ import pytest
 import yaml
 from command_line import fail
 
+import dvl_calib_ros as dc
 from dvl_calib_ros.cli.main import main
 
 SHORT = ("--trajectory", "box", "--duration", "120", "--gnss-std", "0.05")
@@ -104,3 +105,11 @@ def test_one_alone_twice_the_same_and_a_file_that_is_not_there_are_one_line(plac
     assert "named twice" in fail(capsys, "compare", a, a)
     assert "no such" in fail(capsys, "compare", a, tmp_path / "nothing.yaml")
     assert "a.yaml" in fail(capsys, "compare", a, place / "b.yaml", "--json", a)
+
+
+def test_in_python_result_files_and_replays_are_compared_alike(place):
+    found = dc.compare(place / "a.yaml", dc.replay(place / "b", history=False))
+    assert found.same_mounting
+    assert not dc.compare(place / "a.yaml", place / "b.yaml", str(place / "c.yaml")).same_mounting
+    with pytest.raises(dc.InputError, match="no such result file"):
+        dc.compare(place / "a.yaml", place / "nothing.yaml")
