@@ -239,8 +239,8 @@ def cross_checked(name: str) -> CrossCheck:
     track = np.column_stack([along, 10.0 * np.sin(along / 20.0)])
     found = Navigation(
         distance_m=110.0, seconds=60.0, stretch_m=110.0, stretches=1, before=Drift(20.0, 2.2), after=Drift(2.0, 0.2),
-        noise_per_km=1.0, on_a_map=True, distances=along, reference=track, track_before=1.02 * track,
-        track_after=1.002 * track,
+        noise_per_km=1.0, on_a_map=True, stamps_ns=np.arange(50) * 1_000_000_000, distances=along,
+        reference=track, track_before=1.02 * track, track_after=1.002 * track,
     )  # fmt: skip
     other = "tuesday"
     return CrossCheck(
