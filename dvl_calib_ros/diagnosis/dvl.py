@@ -17,7 +17,7 @@ from ..effects.registry import EFFECTS
 from .composed import Hypothesis, Problem, Values
 from .recordings import Curve, Recording
 from .selection import Selection
-from .twin import simulated
+from .twin import simulated, with_quiet_reference
 
 Three = tuple[float, float, float]
 # Values of an effect: what was known of it before, to which is added what was found
@@ -115,12 +115,12 @@ def _rms(difference: Array) -> float:
 def _noise(recordings: Sequence[Recording], selection: Selection) -> Array:
     """(3,) m/s: the lesser of what neighbours do not tell of the DVL's own samples, and of their residual.
 
-    The first holds motion that is too quick for the DVL's rate, the second the noise of the reference.
+    The first holds motion that is too quick for the DVL's rate, the second what is left of the reference's noise.
     """
-    problem, hypothesis = selection.fitter.problem, selection.fit.hypothesis
+    problem = with_quiet_reference(selection.fitter.problem)
     variances = []
     for index, recording in enumerate(recordings):
-        rest = recording.dvl.values - simulated(problem, hypothesis, index)
+        rest = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         own = recording.dvl.roughness
         variances.append(np.minimum(own, Curve(recording.dvl.time, rest).roughness) ** 2)
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))

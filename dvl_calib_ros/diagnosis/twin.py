@@ -126,6 +126,12 @@ def _regimes(recording: Recording, at: Array, speed: Array) -> dict[str, NDArray
     return {name: mask for name, mask in found.items() if mask.any()}
 
 
+def with_quiet_reference(problem: Problem) -> Problem:
+    """The problem with the noise of every reference taken off where there is no motion in it."""
+    quiet = tuple(replace(one, reference=one.reference.quiet, _kept={}) for one in problem.recordings)
+    return replace(problem, recordings=quiet, _kept={})
+
+
 def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     """(N, 3) m/s: the composed model forwards, from the reference's motion to what the DVL measures."""
     recording, injections = problem.recordings[index], hypothesis.injections(index)

@@ -10,12 +10,11 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
-from ..diagnosis.composed import Problem
 from ..diagnosis.diagnose import diagnose_recordings
 from ..diagnosis.recordings import Curve, Recording, load_recordings
 from ..diagnosis.results import Diagnosis
 from ..diagnosis.selection import Selection
-from ..diagnosis.twin import simulated
+from ..diagnosis.twin import simulated, with_quiet_reference
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..replay.replay import Topics
@@ -91,12 +90,6 @@ def dvl_residuals(selection: Selection) -> tuple[Array, ...]:
         recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         for index, recording in enumerate(problem.recordings)
     )
-
-
-def with_quiet_reference(problem: Problem) -> Problem:
-    """The problem with the noise of every reference taken off where there is no motion in it."""
-    quiet = tuple(replace(one, reference=one.reference.quiet, _kept={}) for one in problem.recordings)
-    return replace(problem, recordings=quiet, _kept={})
 
 
 def _is_copied(recordings: Sequence[Recording], residuals: Sequence[Array]) -> bool:
