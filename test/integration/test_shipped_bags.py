@@ -55,10 +55,16 @@ def test_the_estimates_of_a_shipped_bag_are_the_committed_ones(golden, tmp_path,
     for name, model in then["models"].items():
         for key in ("state", "covariance"):
             np.testing.assert_allclose(now["models"][name].pop(key), model.pop(key), rtol=1e-9, atol=1e-12)
-    for name, verification in then["verification"].items():
-        errors, expected = now["verification"][name].pop("held_out"), verification.pop("held_out")
-        assert errors == pytest.approx(expected, rel=1e-9)
-    assert now == then
+    assert rounded(now) == rounded(then)
+
+
+def rounded(document):
+    """A document whose numbers have nine digits: another build of NumPy may give another last bit."""
+    if isinstance(document, dict):
+        return {key: rounded(value) for key, value in document.items()}
+    if isinstance(document, list):
+        return [rounded(value) for value in document]
+    return float(f"{document:.9g}") if isinstance(document, float) else document
 
 
 def test_the_demo_bag_holds_the_truth_within_four_standard_deviations():
