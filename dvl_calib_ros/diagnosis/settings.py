@@ -57,7 +57,7 @@ class DiagnosisSettings:
     folds: int = 5
     noise_tolerance: float = 3.0
     unexplained_energy: float = 20.0
-    unexplained_held_out: float = 10.0
+    unexplained_held_out: float = 15.0
     instead_of: float = 1500.0
     instead_share: float = 0.15
     prior_angle: float = 0.1

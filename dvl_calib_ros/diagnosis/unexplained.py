@@ -62,15 +62,18 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     problem, noise = fitter.problem, fit.noise
     looks, white, raw = _looked(fitter, fit, problem, fit.seen, fit.residual)
     followed = lines(problem, white.reshape(-1, problem.axes))
-    recoloured: list[tuple[float, float, str]] = []
+    recoloured: list[Look] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
-        recoloured = [
-            (*_recoloured(noise, fit.columns, columns, fit.residual), name)
-            for name, columns in raw.items()
-            if name != "time"
-        ]
+        for name, columns in raw.items():
+            if name != "time":
+                drop, rank, _ = _recoloured(noise, fit.columns, columns, fit.residual)
+                recoloured.append(Look(name, np.arange(columns.shape[2]), True, drop, rank))
     looked_at = float(np.log(len(looks) + len(followed) + len(recoloured)))
-    nominal = [*(look.log_p() for look in looks), *(line.log_p for line in followed), *(each[0] for each in recoloured)]
+    nominal = [
+        *(look.log_p() for look in looks),
+        *(line.log_p for line in followed),
+        *(each.log_p() for each in recoloured),
+    ]
     nothing = raw["time"][:, :, :0]
     if min(nominal) + looked_at > np.log(LEVEL):
         return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
@@ -80,13 +83,18 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     tests += [
         (line.log_p, f"a period of {line.period_s:.0f} s", _along_axes(line.waves, problem.axes)) for line in followed
     ]
-    others = [(log_p / of_group[name], name, raw[name]) for log_p, _, name in recoloured]
+    recoloured = [replace(each, energy=each.energy / of_group[each.name]) for each in recoloured]
+    others: list[tuple[float, str, Array]] = []
+    for number, each in enumerate(recoloured):
+        if each.log_p() + looked_at < np.log(LEVEL):
+            recoloured[number] = each = replace(each, energy=each.energy / _chance(fit, raw[each.name]))
+        others.append((each.log_p(), each.name, raw[each.name]))
     best = min(tests, key=_first)
     if best[0] + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
         best = min([*tests, *others], key=_first)
     log_p = min(best[0], *(each[0] for each in others), 0.0) + looked_at
     whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
-    energy = max(*(each - dof for each, dof in whole), *(each / of_group[name] for _, each, name in recoloured), 0.0)
+    energy = max(*(each - dof for each, dof in whole), *(each.energy - each.dof for each in recoloured), 0.0)
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
@@ -195,13 +203,15 @@ def holds_out(fit: Fit, rest: Unexplained, fold: NDArray[np.intp]) -> float:
     One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
     what is there tells of itself elsewhere.
     """
-    raw = rest.clearest
+    raw, noise = rest.clearest, fit.noise
+    if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
+        noise = _recoloured(noise, fit.columns, raw, fit.residual)[2]
     size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
     known = fit.columns / np.maximum(np.sqrt((fit.columns**2).mean(axis=(0, 1))), 1e-12)
-    white = fit.noise.whiten(np.concatenate([known, raw / size], axis=2))
-    series = fit.noise.whiten(fit.residual)
-    # what is left is no larger than the residual: without that, stretches without a turn would be told of any size
-    likely = float(np.sqrt(np.mean(fit.residual**2)))
+    white = noise.whiten(np.concatenate([known, raw / size], axis=2))
+    series = noise.whiten(fit.residual)
+    # all together are no larger than the residual: else stretches without a turn would be told of any size
+    likely = float(np.sqrt(np.mean(fit.residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
     std = np.concatenate([np.full(known.shape[2], WIDE), np.full(raw.shape[2], likely)])
     rows = np.repeat(fold, fit.residual.shape[1])
     gain = 0.0
@@ -218,8 +228,24 @@ def _solved(white: Array, series: Array, std: Array) -> Array:
     return WhitenedLeastSquares.of(white, series, std, np.zeros_like(std)).solution()
 
 
-def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, float]:
-    """As `explained`, with the noise estimated anew from what the columns (M, A, c) leave: else it has their colour."""
+def _chance(fit: Fit, raw: Array) -> float:
+    """By what factor columns (M, A, c) lower the deviance more than chi-square of noise of the fit's colour, as the
+    noise that is estimated anew bends to them; at least 1.
+    """
+    rng = np.random.default_rng(0)
+    lowered, dof = PRIOR_DOF, PRIOR_DOF
+    for _ in range(MADE_UP // 2):
+        drop, rank, _ = _recoloured(
+            fit.noise, fit.columns, raw, fit.noise.unwhiten(rng.standard_normal(raw[..., 0].size))
+        )
+        lowered, dof = lowered + drop, dof + rank
+    return max(1.0, lowered / dof)
+
+
+def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, int, Noise]:
+    """By what columns (M, A, c) lower the deviance, their rank beside those known, and the noise, estimated anew from
+    what they leave: else it has their colour.
+    """
     joined = np.concatenate([known, raw], axis=2)
     joined = joined / np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
     left, colour = residual, noise.white
@@ -229,7 +255,7 @@ def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tupl
         colour = noise.like(left)
     rank = _orthonormal(white).shape[1] - known.shape[2]
     drop = noise.deviance(residual) - colour.deviance(left)
-    return float(chi2.logsf(max(drop, 0.0), max(rank, 1))), drop - rank
+    return max(drop, 0.0), max(rank, 1), colour
 
 
 def _along_axes(functions: Array, axes: int) -> Array:
