@@ -100,8 +100,8 @@ class ComparedNoise:
 @dataclass(frozen=True)
 class Rung:
     """One model of the vehicle's DVL. name: the simulator as it is, or with what added. error_mps: rms of recorded less
-    simulated without noise, on held-out stretches. distance: energy distance of windows of both, with noise, in units
-    of their spread; null95: what it stays below 19 times in 20 if both are alike; p.
+    simulated without noise, outliers drawn in, on held-out stretches. distance: energy distance of windows of both,
+    with noise, in units of their spread; null95: what it stays below 19 times in 20 if both are alike; p.
     """
 
     name: str
@@ -206,5 +206,5 @@ def _parameters(parameters: Mapping[str, Triple]) -> dict[str, Any]:
 
 
 def _value(each: Triple) -> dict[str, Any]:
-    value, low, high = each
+    value, low, high = map(float, each)
     return {"value": value, "ci95": [low, high]}

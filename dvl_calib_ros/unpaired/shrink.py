@@ -31,6 +31,8 @@ from .sizes import Size
 WINDOW_S, PERMUTATIONS = 10.0, 500
 # Noise is drawn from stretches of so many residuals, so that its colour is in it
 STRETCH = 8
+# Errors count no more than so many standard deviations: an outlier is noise, of which there is a figure
+FAR = 5.0
 AS_IT_IS, ALL, NOISE = "as it is", "all effects", "all effects, and the vehicle's noise"
 
 
@@ -120,17 +122,25 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[Model], seed: int = 0)
         distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
         errors[model.name] = off
         rungs.append(Rung(model.name, _rms(off[known]), distance, null95, p))
-    return Shrunk(tuple(rungs), _floor(vehicle), errors, time, recording_of)
+    return Shrunk(tuple(rungs), _floor(errors[ladder[-1].name], recording_of), errors, time, recording_of)
 
 
 def _rms(values: Array) -> float:
-    """Of the vectors' lengths, outliers drawn in to five standard deviations of the rest."""
-    scale = 5.0 * np.maximum(median_abs_deviation(values, axis=0, scale="normal"), 1e-9)
-    return float(np.sqrt((np.clip(values, -scale, scale) ** 2).sum(axis=1).mean()))
+    """Of the vectors' lengths, outliers drawn in."""
+    return float(np.sqrt((_drawn_in(values) ** 2).sum(axis=1).mean()))
 
 
-def _floor(vehicle: Log) -> float:
-    return vehicle.diagnosis.gap.noise_floor
+def _drawn_in(values: Array) -> Array:
+    """Values (N, 3), no farther out than FAR standard deviations of most of them."""
+    far = FAR * np.maximum(median_abs_deviation(values, axis=0, scale="normal"), 1e-9)
+    return np.clip(values, -far, far)
+
+
+def _floor(values: Array, recording_of: NDArray[np.intp]) -> float:
+    """The same of what values (N, 3) show from sample to sample: noise, which no simulator can take off."""
+    parts = [values[recording_of == index] for index in np.unique(recording_of)]
+    second = np.concatenate([part[2:] - 2.0 * part[1:-1] + part[:-2] for part in parts])
+    return _rms(second[np.isfinite(second).all(axis=1)]) / float(np.sqrt(6.0))
 
 
 def _held_out(selection: Selection, model: Model) -> list[Array]:

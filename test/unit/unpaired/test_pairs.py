@@ -68,4 +68,5 @@ def test_a_short_part_of_the_trial_names_what_is_missing_and_claims_nothing_else
     assert [score.first for score in scores] == [True, True, None, None, None]
     assert not any(score.wrong or score.noise_wrong or score.failed for score in scores)
     assert np.mean([score.held / max(score.intervals, 1) for score in scores[:3]]) > 0.8
-    assert run_pairs(tmp_path, seed=1, numbers=(3,))[0][1] == found[0][1]  # what is there is not done again
+    again = run_pairs(tmp_path, seed=1, numbers=(3,))
+    assert again[0][1]["cpu_s"] == found[0][1]["cpu_s"]  # what is there is not done again
