@@ -13,8 +13,8 @@ from ..diagnosis.results import Verdict as Explained
 from ..diagnosis.selection import Selection
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
-from . import noise as noises
 from .logs import Log, Source, read_log
+from .noise import compare_noise, levels_by_regime
 from .results import ComparedEffect, ComparedNoise, Rung, Status, UnpairedComparison, Verdict
 from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .sizes import (
@@ -30,6 +30,8 @@ from .sizes import (
     trace_of,
     union,
 )
+from .streams import compare_streams
+from .two_sides import Candidate
 
 # Family-wise, of all that is claimed to differ
 LEVEL = 0.01
@@ -56,11 +58,12 @@ def compare(
 
 def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
     """`compare`, of sides that are read and explained already."""
-    if vehicle.selection is None or simulator.selection is None:
+    selections = vehicle.selection, simulator.selection
+    if selections[0] is None or selections[1] is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
-    candidates = noises.compare_noise(vehicle, simulator)
+    candidates = [*compare_noise(vehicle, simulator), *compare_streams(vehicle, simulator)]
     names = common_names(vehicle, simulator)
-    compared = _Compared.of(vehicle, simulator, names, union(*names), effects)
+    compared = _Compared((vehicle, simulator), (selections[0], selections[1]), names, union(*names), effects)
     p = holm([*compared.p.values(), *(each.p for each in candidates)])
     found = [compared.effect(name, float(p[i])) for i, name in enumerate(compared.p)]
     found += [compared.untested(name) for name in compared.names if name not in compared.p]
@@ -71,7 +74,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     both = {name: (*compared.sizes[name], status[name]) for name in compared.p}
     own = [effects[name] for name in names[0].values() if name in compared.sizes]
     shrunk = shrink(vehicle, simulator, models(both, own))
-    levels = [noises.levels_by_regime(log) for log in (vehicle, simulator)]
+    levels = [levels_by_regime(log) for log in (vehicle, simulator)]
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(
         verdict=verdict,
@@ -115,15 +118,14 @@ class _Compared:
 
     def __init__(
         self,
-        vehicle: Log,
-        simulator: Log,
+        logs: tuple[Log, Log],
+        selections: tuple[Selection, Selection],
         renamed: tuple[Mapping[str, str], Mapping[str, str]],
         names: Sequence[str],
-        selections: tuple[Selection, Selection],
         effects: Mapping[str, Effect],
     ) -> None:
         self.names, self._effects = names, effects
-        self._selections, self._logs, self._renamed = selections, (vehicle, simulator), renamed
+        self._selections, self._logs, self._renamed = selections, logs, renamed
         self._fits = tuple(fitted(selection, names, effects) for selection in selections)
         per_side = [
             sizes(selection, fit, list(own.values()))
@@ -134,20 +136,6 @@ class _Compared:
             name: (per_side[0][name], per_side[1][name]) for name in names if all(name in side for side in per_side)
         }
         self.p = {name: p_alike(*both) for name, both in self.sizes.items()}
-
-    @classmethod
-    def of(
-        cls,
-        vehicle: Log,
-        simulator: Log,
-        renamed: tuple[Mapping[str, str], Mapping[str, str]],
-        names: Sequence[str],
-        effects: Mapping[str, Effect],
-    ) -> _Compared:
-        assert_both = (vehicle.selection, simulator.selection)
-        if assert_both[0] is None or assert_both[1] is None:
-            raise ValueError("nothing was fitted")
-        return cls(vehicle, simulator, renamed, names, (assert_both[0], assert_both[1]), effects)
 
     def effect(self, name: str, p: float) -> ComparedEffect:
         """One that both sides were tested for. p: adjusted."""
@@ -203,7 +191,7 @@ def _status(there: tuple[bool, bool], differ: bool) -> Status:
     return Status.MISSING if there[0] else Status.ONLY_SIMULATOR
 
 
-def _noise(candidate: noises.Candidate, p: float) -> ComparedNoise:
+def _noise(candidate: Candidate, p: float) -> ComparedNoise:
     differ = p < LEVEL and candidate.matters
     status = _status(candidate.there, differ) if any(candidate.there) else Status.ALIKE
     if status is Status.CANNOT_TELL:

@@ -18,7 +18,7 @@ from ..diagnosis.twin import simulated, with_quiet_reference
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..replay.replay import Topics
-from .stream import StreamFacts, stream_facts
+from .stream_facts import StreamFacts, stream_facts
 
 # No DVL is so quiet (m/s): its resolution is 1 mm/s. One that is, is the simulator's truth
 NOISE_FREE_MPS = 2e-4
@@ -73,7 +73,7 @@ def read_log(
     diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, effects, with_series)
     on_progress(1.0)
     residuals = () if diagnosis.selection is None else dvl_residuals(diagnosis.selection)
-    return Log(diagnosis, recordings, facts, residuals, exact, not exact and _is_copied(recordings, residuals))
+    return Log(diagnosis, recordings, facts, residuals, exact, not exact and is_copied(recordings, residuals))
 
 
 def dithered(recording: Recording) -> Recording:
@@ -92,7 +92,8 @@ def dvl_residuals(selection: Selection) -> tuple[Array, ...]:
     )
 
 
-def _is_copied(recordings: Sequence[Recording], residuals: Sequence[Array]) -> bool:
+def is_copied(recordings: Sequence[Recording], residuals: Sequence[Array]) -> bool:
+    """Whether what is left of the DVL has much less noise than the DVL itself: it has that of its reference."""
     if not residuals:
         return False
     left = [

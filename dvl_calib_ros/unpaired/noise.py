@@ -1,37 +1,34 @@
-"""The noise of both sides: level per axis, growth, tails, outliers, dropouts, repeats, rate, jitter, latency, colour.
+"""The noise of both sides: level per axis, what it grows with, tails, colour.
 
 The level of a DVL that is fast enough is what its samples show against their own neighbours, to which motion and
 reference are nothing; that of a slow one is of its residual, in which the reference's noise is too. Levels are compared
 over blocks of as many samples on both sides, so whatever the noise's distribution is, it is in the scatter of blocks.
-(Long, because each kind of noise has its own estimate.)
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
-from scipy.stats import fisher_exact, median_abs_deviation, norm, t
+from scipy.stats import median_abs_deviation, norm
 
 from ..calibration.frames import Array
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.recordings import FAST_ENOUGH_S
 from ..diagnosis.where import regimes
 from ..effects.base import EffectInput
-from .logs import DITHER_MPS, Log
+from .logs import Log
 from .results import Triple
+from .streams import OUTLIER
+from .two_sides import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
 
-# Samples of a block, and blocks that a level needs
-BLOCK, FEWEST_BLOCKS = 40, 4
 # Levels that are closer than this do not matter
 WORTH_TELLING = 1.15
-# Outliers: beyond so many standard deviations; tails: beyond so many, and no outlier
-OUTLIER, TAIL = 7.0, 3.7
-# Rates that differ by less, relative; jitter and latency that do, s
-RATE_SHARE, JITTER_S, LATENCY_S = 0.03, 0.002, 0.01
+# Tails: beyond so many standard deviations, and no outlier
+TAIL = 3.7
 # A vehicle that goes astern so often shows what its noise does then
 ASTERN_SHARE, ASTERN_MPS = 0.05, 0.1
 # Growth of the noise is of the logarithm: these are compared where one side shows them at this level
@@ -39,29 +36,15 @@ GROWS = 1e-4
 # Standard deviations of speed, m/s, turn rate, rad/s, and speed astern, m/s, over which a growth can be seen
 SPREAD = {"speed": 0.1, "turn_rate": 0.01, "astern": 0.05}
 
-
-@dataclass(frozen=True)
-class Candidate:
-    """A property on both sides, with the p of both being alike, not adjusted yet. claims: whether it may be claimed.
-
-    there: whether vehicle and simulator have any of it; of a level, both.
-    """
-
-    name: str
-    unit: str
-    vehicle: Triple
-    simulator: Triple
-    p: float
-    there: tuple[bool, bool] = (True, True)
-    matters: bool = True
-    note: str = ""
+Slopes = dict[str, tuple[float, float]]
+"""Growth of the logarithm and its standard deviation, by what it grows with."""
 
 
 @dataclass(frozen=True)
 class Scatter:
     """Samples of one recording's noise. values: (N, 3) m/s, white if the DVL's noise is, of its standard deviation.
 
-    speed, turn_rate, ahead: (N,) of the motion at the samples. thin: every so many are independent.
+    motion: at the samples. thin: every so many are independent. of_reference: m/s, of it the reference's at most.
     """
 
     values: Array
@@ -72,15 +55,15 @@ class Scatter:
 
 def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
     """All properties that both sides show."""
-    found: list[Candidate | None] = [_exact(vehicle, simulator)]
+    found: list[Candidate | None] = []
     both = [scatter(log) for log in (vehicle, simulator)]
     if all(both) and not (vehicle.exact or simulator.exact):
-        found += [_level(both[0], both[1], axis) for axis in range(3)]
-        found += _growth(both[0], both[1])
-        found += [_tails(both[0], both[1])]
-    found += [_outliers(vehicle, simulator), _colour(vehicle, simulator)]
-    found += [_dropouts(vehicle, simulator), _zeros(vehicle, simulator), _repeats(vehicle, simulator)]
-    found += [_rate(vehicle, simulator), _jitter(vehicle, simulator), _latency(vehicle, simulator)]
+        slopes = [slopes_of(side) for side in both]
+        even = at_one_motion(both, slopes)
+        found += [_level(even[0], even[1], axis) for axis in range(3)]
+        found += _growth(slopes)
+        found += [_tails(even[0], even[1])]
+    found.append(_colour(vehicle, simulator))
     return [each for each in found if each is not None]
 
 
@@ -140,7 +123,7 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     of_reference = [max(each.of_reference for each in side) for side in (vehicle, simulator)]
     intervals = []
     for levels, reference in zip(blocks, of_reference, strict=True):
-        value, low, high = np.exp(_mean(levels))
+        value, low, high = np.exp(mean_of(levels))
         intervals.append((float(value), float(np.sqrt(max(low**2 - reference**2, 0.0))), float(high)))
     larger = 0 if intervals[0][0] >= intervals[1][0] else 1
     own_levels = [np.asarray(each) for each in blocks]
@@ -150,24 +133,9 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     ratio = float(np.exp(own_levels[larger].mean() - own_levels[1 - larger].mean()))
     note = "DVL and reference together" if max(of_reference) > 0.0 else ""
     return Candidate(
-        f"level_{'xyz'[axis]}", "m/s", intervals[0], intervals[1], _welch(own_levels[0], own_levels[1]),
+        f"level_{'xyz'[axis]}", "m/s", intervals[0], intervals[1], welch(own_levels[0], own_levels[1]),
         matters=ratio > WORTH_TELLING, note=note,
     )  # fmt: skip
-
-
-def _mean(values: Array) -> Array:
-    """(3,) mean and its 95 per cent interval."""
-    reach = t.ppf(0.975, max(len(values) - 1, 1)) * float(values.std(ddof=1)) / np.sqrt(len(values))
-    return np.array([values.mean(), values.mean() - reach, values.mean() + reach])
-
-
-def _welch(one: Array, other: Array) -> float:
-    """p of two samples having one mean, whatever their scatter."""
-    a, b = (float(each.var(ddof=1)) / len(each) for each in (one, other))
-    if a + b <= 0.0:
-        return 1.0 if one.mean() == other.mean() else 0.0
-    dof = (a + b) ** 2 / (a**2 / (len(one) - 1) + b**2 / (len(other) - 1))
-    return float(2.0 * t.sf(abs(one.mean() - other.mean()) / np.sqrt(a + b), dof))
 
 
 def levels_by_regime(log: Log) -> dict[str, float]:
@@ -194,19 +162,17 @@ def levels_by_regime(log: Log) -> dict[str, float]:
 # ------------------------------------------------------------------ growth
 
 
-def _growth(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> list[Candidate | None]:
+def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
     """Slopes of the log level with speed, turn rate, and speed astern: the level that a simulator's σ, in which speed
     stands with its sign, has astern is below that ahead.
     """
-    slopes = [_slopes(side) for side in (vehicle, simulator)]
     units = {"speed": "1/(m/s)", "turn_rate": "1/(rad/s)", "astern": "1/(m/s)"}
     found: list[Candidate | None] = []
     for name, unit in units.items():
         if not all(name in each for each in slopes):
             continue
         (a, std_a), (b, std_b) = (each[name] for each in slopes)
-        p_of = [2.0 * norm.sf(abs(value) / std) for value, std in slopes_of(slopes, name)]
-        there = tuple(bool(p < GROWS) for p in p_of)
+        there = tuple(_grows(each, name) for each in slopes)
         p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
         found.append(
             Candidate(
@@ -222,23 +188,49 @@ def _growth(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> list[Ca
     return found
 
 
-def slopes_of(slopes: Sequence[Mapping[str, tuple[float, float]]], name: str) -> list[tuple[float, float]]:
-    """Value and standard deviation on each side."""
-    return [each[name] for each in slopes]
+def _grows(slopes: Slopes, name: str) -> bool:
+    """Whether a slope is sure."""
+    value, std = slopes[name]
+    return bool(2.0 * norm.sf(abs(value) / std) < GROWS)
+
+
+def at_one_motion(both: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
+    """The noise as loud as it would be if both sides moved alike, by the growth that is sure."""
+    columns = [[_covariates(each) for each in side] for side in both]
+    names = [name for name in SPREAD if any(name in of and _grows(of, name) for of in slopes)]
+    even = [list(side) for side in both]
+    for name in names:
+        if not all(name in each for side in columns for each in side):
+            continue
+        usual = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
+        for side, of, own in zip(even, slopes, columns, strict=True):
+            if name in of and _grows(of, name):
+                for index, each in enumerate(side):
+                    quieter = np.exp(-of[name][0] * (own[index][name] - usual))
+                    side[index] = replace(each, values=each.values * quieter[:, None])
+    return even
+
+
+def _covariates(scattered: Scatter) -> dict[str, Array]:
+    """(N,) each: speed m/s, turn rate rad/s where it is known, speed astern m/s."""
+    motion = scattered.motion
+    found = {"speed": motion.speed}
+    if motion.angular_velocity is not None:
+        found["turn_rate"] = np.abs(motion.turn_rate[:, 2])
+    return found | {"astern": np.maximum(-motion.velocity_body[:, 0], 0.0)}
 
 
 def _around(value: float, std: float) -> Triple:
     return value, value - 1.96 * std, value + 1.96 * std
 
 
-def _slopes(scattered: Sequence[Scatter]) -> dict[str, tuple[float, float]]:
+def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
     """Slope and standard deviation by covariate, of log squares, with the scatter of blocks (a sandwich)."""
-    columns: dict[str, Array] = {"speed": np.concatenate([each.motion.speed for each in scattered])}
-    ahead = np.concatenate([each.motion.velocity_body[:, 0] for each in scattered])
-    if all(each.motion.angular_velocity is not None for each in scattered):
-        columns["turn_rate"] = np.concatenate([np.abs(each.motion.turn_rate[:, 2]) for each in scattered])
-    if np.mean(ahead < -ASTERN_MPS) > ASTERN_SHARE:
-        columns["astern"] = np.maximum(-ahead, 0.0)
+    each = [_covariates(one) for one in scattered]
+    names = [name for name in SPREAD if all(name in one for one in each)]
+    columns = {name: np.concatenate([one[name] for one in each]) for name in names}
+    if np.mean(columns["astern"] > ASTERN_MPS) <= ASTERN_SHARE:
+        del columns["astern"]
     columns = {name: column for name, column in columns.items() if np.std(column) > SPREAD[name]}
     if not columns:
         return {}
@@ -270,51 +262,7 @@ def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidat
             far += int(((size > TAIL) & (size < OUTLIER)).sum())
             n += size.size
         counts.append((far, n))
-    return _shares("heavy_tails", counts[0], counts[1])
-
-
-def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
-    counts = []
-    for log in (vehicle, simulator):
-        far = n = 0
-        for facts, recording, residual in zip(log.facts, log.recordings, log.residuals, strict=False):
-            if recording.dvl.interval <= FAST_ENOUGH_S:
-                far, n = far + _spikes(facts.values), n + len(facts.values)
-            else:
-                size = np.abs(residual) / np.maximum(median_abs_deviation(residual, axis=0, scale="normal"), 1e-9)
-                far, n = far + int((size > 2.0 * OUTLIER).any(axis=1).sum()), n + len(residual)
-        counts.append((far, n))
-    return _shares("outliers", counts[0], counts[1])
-
-
-def _spikes(values: Array) -> int:
-    """Samples far from where four neighbours tell them to be, and farther than these."""
-    if len(values) < 10:
-        return 0
-    off = np.zeros_like(values)
-    x = values
-    off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
-    scale = np.maximum(median_abs_deviation(off, axis=0, scale="normal"), DITHER_MPS)
-    size = (np.abs(off) / scale).max(axis=1)
-    beside = np.maximum(np.append(size[1:], 0.0), np.append(0.0, size[:-1]))
-    return int(np.count_nonzero((size > OUTLIER) & (size > beside)))
-
-
-def _shares(name: str, vehicle: tuple[int, int], simulator: tuple[int, int]) -> Candidate | None:
-    """Counts of events among samples on both sides."""
-    if not vehicle[1] or not simulator[1] or vehicle[0] + simulator[0] == 0:
-        return None
-    table = [[k, max(n - k, 0)] for k, n in (vehicle, simulator)]
-    p = float(fisher_exact(table)[1])
-    shares = [_share(*counts) for counts in (vehicle, simulator)]
-    # one or two are no habit
-    return Candidate(name, "share", shares[0], shares[1], p, (vehicle[0] > 2, simulator[0] > 2))
-
-
-def _share(count: int, n: int) -> Triple:
-    value = count / n
-    half = 1.96 * np.sqrt(max(value * (1.0 - value), 0.25 / n) / n)
-    return value, max(0.0, value - half), min(1.0, value + half)
+    return shares_of("heavy_tails", counts[0], counts[1])
 
 
 def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -348,84 +296,3 @@ def _slow(log: Log) -> Array:
         level = median_abs_deviation(np.diff(residual, axis=0), axis=0, scale="normal") / np.sqrt(2.0)
         means.append((np.median(blocks, axis=1) / np.maximum(level, 1e-9) * np.sqrt(size / 1.57)).ravel())
     return np.concatenate(means) if means else np.zeros(0)
-
-
-# ------------------------------------------------------------------ the stream
-
-
-def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Ground truth that leaks through: a DVL without noise, or one that has the noise of its reference."""
-    leaks = [log.exact or log.copied for log in (vehicle, simulator)]
-    if not any(leaks):
-        return None
-    how = "without any noise" if simulator.exact or vehicle.exact else "with the noise of its own reference"
-    who = "the simulator's" if leaks[1] else "the vehicle's"
-    shown: list[Triple] = [(float(leak),) * 3 for leak in leaks]
-    p = 0.0 if leaks[0] != leaks[1] else 1.0
-    return Candidate("truth_leaks", "yes", shown[0], shown[1], p, (leaks[0], leaks[1]), note=f"{who} DVL is {how}")
-
-
-def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
-    counts = [
-        (sum(f.missing + f.refused for f in log.facts), sum(f.received for f in log.facts))
-        for log in (vehicle, simulator)
-    ]
-    return _shares("dropouts", counts[0], counts[1])
-
-
-def _zeros(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Dropouts sent as a velocity of zero."""
-    counts = [(sum(f.zero for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
-    return _shares("zeros_on_dropout", counts[0], counts[1])
-
-
-def _repeats(vehicle: Log, simulator: Log) -> Candidate | None:
-    if vehicle.exact or simulator.exact:
-        return None  # at a constant velocity the truth repeats itself
-    counts = [(sum(f.repeats for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
-    return _shares("repeats", counts[0], counts[1])
-
-
-def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
-    rates = [1.0 / float(np.median([f.interval for f in log.facts])) for log in (vehicle, simulator)]
-    if not np.isfinite(rates).all():
-        return None
-    apart = abs(rates[0] / rates[1] - 1.0)
-    shown: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
-    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if apart > RATE_SHARE else 1.0, matters=apart > RATE_SHARE)
-
-
-def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
-    def of(log: Log) -> Array:
-        return np.concatenate([_blocks(_usual(f.steps), lambda b: np.std(b, axis=1)) for f in log.facts])
-
-    return _times("jitter", of(vehicle), of(simulator), JITTER_S)
-
-
-def _usual(steps: Array) -> Array:
-    """Steps between stamps that are no gap."""
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    return steps[steps < 1.6 * usual]
-
-
-def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
-    def of(log: Log) -> Array:
-        return np.concatenate([_blocks(f.latency, lambda b: np.median(b, axis=1)) for f in log.facts])
-
-    return _times("latency", of(vehicle), of(simulator), LATENCY_S)
-
-
-def _blocks(values: Array, of: Callable[[Array], Array]) -> Array:
-    blocks = values[: len(values) // BLOCK * BLOCK].reshape(-1, BLOCK)
-    return of(blocks) if len(blocks) else np.zeros(0)
-
-
-def _times(name: str, vehicle: Array, simulator: Array, worth: float) -> Candidate | None:
-    if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
-        return None
-    shown: list[Triple] = [tuple(_mean(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
-    there = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
-    apart = abs(float(vehicle.mean() - simulator.mean()))
-    return Candidate(
-        name, "s", shown[0], shown[1], _welch(vehicle, simulator), (there[0], there[1]), matters=apart > worth
-    )

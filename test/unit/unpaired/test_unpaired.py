@@ -13,17 +13,20 @@ from report_fixtures import Page
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import Stream, sample_block
+from dvl_calib_ros.diagnosis.recordings import make_recording, zeros_while_moving
+from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.replay.replay import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.unpaired.compare import compare
-from dvl_calib_ros.unpaired.logs import Source
+from dvl_calib_ros.unpaired.logs import Source, is_copied
+from dvl_calib_ros.unpaired.noise import Scatter, at_one_motion, block_levels, slopes_of
 from dvl_calib_ros.unpaired.results import Status, Verdict, unpaired_document
 from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, two_samples
 from dvl_calib_ros.unpaired.sizes import Size, is_there, p_alike
-from dvl_calib_ros.unpaired.stream import facts_of
+from dvl_calib_ros.unpaired.stream_facts import facts_of
 
 SECOND_NS = 1_000_000_000
 
@@ -208,3 +211,42 @@ def test_log_times_of_another_clock_say_no_latency():
     stamps, values, reference = stream()
     facts = facts_of(sample_block(Stream.DVL, stamps, values), reference, stamps + 10**18)
     assert not len(facts.latency)
+
+
+def scattered(rng: np.random.Generator, speed: np.ndarray, per_speed: float) -> Scatter:
+    """Noise of 0.01 m/s at rest that grows with speed."""
+    motion = EffectInput(np.arange(len(speed)) / 5.0, np.outer(speed, [1.0, 0.0, 0.0]), np.eye(3))
+    std = 0.01 * np.exp(per_speed * speed)
+    return Scatter(std[:, None] * rng.standard_normal((len(speed), 3)), motion, 1, 0.0)
+
+
+def test_one_noise_at_two_speeds_is_one_noise():
+    """A law of noise that both sides share is no difference of level, though one of them was faster."""
+    rng = np.random.default_rng(3)
+    both = [[scattered(rng, rng.uniform(low, low + 1.5, 3000), 0.6)] for low in (0.2, 1.0)]
+    even = at_one_motion(both, [slopes_of(side) for side in both])
+    plain, put_right = (
+        [np.mean([np.exp(block_levels(side, axis)).mean() for axis in range(3)]) for side in sides]
+        for sides in (both, even)
+    )
+    assert plain[1] > 1.4 * plain[0]
+    assert put_right[1] == pytest.approx(put_right[0], rel=0.08)
+
+
+def test_a_dvl_that_copies_its_reference_is_noticed():
+    rng = np.random.default_rng(4)
+    t = np.arange(0.0, 60.0, 0.2)
+    values = np.column_stack([np.sin(0.1 * t), 0.0 * t, 0.0 * t]) + rng.normal(0.0, 0.01, (len(t), 3))
+    one = make_recording("one", (t, values), (t, values))
+    assert is_copied([one], [rng.normal(0.0, 1e-5, values.shape)])
+    assert not is_copied([one], [rng.normal(0.0, 0.01, values.shape)])
+
+
+def test_velocities_of_zero_under_way_are_dropouts_and_at_rest_are_velocities():
+    stamps, values, reference = stream()
+    still = reference.values * (np.arange(len(stamps)) < 100)[:, None]
+    stopped = sample_block(Stream.REFERENCE, stamps, still)
+    zeros = values.copy()
+    zeros[[50, 150]] = 0.0
+    found = np.flatnonzero(zeros_while_moving(sample_block(Stream.DVL, stamps, zeros), stopped))
+    assert found.tolist() == [50]
