@@ -174,7 +174,7 @@ def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequ
     axes.vlines(null95, rows - 0.38, rows + 0.38, color=INK, linewidth=1.6)
     axes.set_yticks(rows, names)
     axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set_xlabel("energy distance, in spreads of the windows")
+    axes.set_xlabel("energy distance")
     axes.grid(False, axis="y")
     return figure
 
