@@ -117,8 +117,8 @@ class Group:
         standing = None if ends is None else self._standing_at(after, ends)
         n_used = after.used.sum(axis=1)
         self._used += n_used
-        self._gated += (data.usable & ~after.used).sum(axis=1)
-        self._nis_sum += np.where(after.used, after.nis, 0.0).sum(axis=1)
+        self._gated += data.usable.sum(axis=1) - n_used
+        self._nis_sum += np.einsum("kn,kn->k", after.used, after.nis)
         if seen.unmeasured is None:
             self._rows_sum += n_used * data.z.shape[2]
         else:

@@ -12,6 +12,8 @@ import numpy as np
 
 from .frames import Array, skew
 
+_IDENTITY: Array = np.eye(3)
+
 
 def distort(velocity_body: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
     """What a DVL with these errors measures of a body velocity: (..., 3) m/s -> (..., 3) m/s in the DVL frame."""
@@ -24,8 +26,11 @@ def correction_matrix(misalignment: Array, scale: Array, rotation_dvl_from_body:
 
     (..., 3) rad, (..., 3) -> (..., 3, 3).
     """
-    unturned = rotation_dvl_from_body.T @ np.linalg.inv(np.eye(3) + skew(misalignment))
-    matrix: Array = unturned / (1.0 + np.asarray(scale))[..., None, :]
+    phi = np.asarray(misalignment, dtype=float)
+    # (I + [φ×])⁻¹ = (I - [φ×] + φφᵀ) / (1 + ‖φ‖²)
+    inverse = _IDENTITY - skew(phi) + phi[..., :, None] * phi[..., None, :]
+    inverse /= 1.0 + (phi * phi).sum(axis=-1)[..., None, None]
+    matrix: Array = rotation_dvl_from_body.T @ inverse / (1.0 + np.asarray(scale))[..., None, :]
     return matrix
 
 

@@ -107,12 +107,11 @@ def recursion(
     not positive definite, or numbers are not finite.
     """
     # each model by itself: live there is one, and products of single matrices cost a third of those of stacks
-    return Updated.joined(
-        [
-            _recursion_of_one(x[k], p[k], data.model(k), None if process is None else process[:, k], ends)
-            for k in range(len(x))
-        ]
-    )
+    models = [
+        _recursion_of_one(x[k], p[k], data.model(k), None if process is None else process[:, k], ends)
+        for k in range(len(x))
+    ]
+    return models[0] if len(models) == 1 else Updated.joined(models)
 
 
 def _recursion_of_one(
@@ -276,7 +275,7 @@ def _whitened(data: Measurements) -> tuple[Array, Array]:
     """H (m, n, K, N) and z (m, K, N) of rows that are turned and scaled so that their noise is 1."""
     h, z = np.moveaxis(data.h, (2, 3), (0, 1)), np.moveaxis(data.z, 2, 0)
     low, inverse_diagonal = _cholesky([[data.r[..., i, j] for j in range(i + 1)] for i in range(len(z))])
-    return np.stack(_forward(low, inverse_diagonal, h)), np.stack(_forward(low, inverse_diagonal, z))
+    return np.stack(_forward(low, inverse_diagonal, [*h])), np.stack(_forward(low, inverse_diagonal, [*z]))
 
 
 def _gain(a: Array, b: Array, room: tuple[int, int]) -> Array:

@@ -61,7 +61,7 @@ from .transforms import Transforms
 QUEUE = 5000
 # The selected model is updated as its samples come, because its estimate is published; the others when they are asked
 # for, or when so many samples have come together.
-BLOCK_SIZE = 64
+BLOCK_SIZE = 512
 
 
 class CalibrationNode(Node):

@@ -25,6 +25,15 @@ errors_at_5_degrees = st.lists(st.floats(-0.09, 0.09), min_size=5, max_size=5).m
 # ---------------------------------------------------------------- correction parameters
 
 
+def test_many_corrections_at_once_give_what_each_gives_alone(rng):
+    corrections = rng.normal(0.0, 0.2, (50, 5))
+    together = errors_from_correction(corrections)
+    for index, correction in enumerate(corrections):
+        alone = errors_from_correction(correction)
+        np.testing.assert_allclose(together.errors[index], alone.errors, atol=1e-14)
+        np.testing.assert_allclose(together.jacobian[index], alone.jacobian, atol=1e-14)
+
+
 @given(errors_at_5_degrees)
 def test_correction_parameters_and_errors_are_each_others_inverse(errors):
     correction = correction_from_errors(errors)
