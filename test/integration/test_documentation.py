@@ -31,6 +31,7 @@ def workplace(tmp_path_factory) -> Path:
     for name in ("my_bag", "recorded_bag"):
         shutil.copytree(ROOT / "bags" / "harbour_box", place / name)
     assert main(["simulate", str(place / "monday"), *short]) == 0
+    assert main(["simulate", str(place / "simulator_bag"), *short, "--trajectory", "lawnmower"]) == 0
     shutil.copy(next((ROOT / "bags" / "harbour_box").glob("*.mcap")), place / "tuesday.mcap")
     shutil.copy(next((ROOT / "bags" / "straight_leg").glob("*.db3")), place / "wednesday.db3")
     (place / "cut_off_bag").mkdir()
