@@ -156,8 +156,9 @@ def document(bag, tmp_path_factory) -> dict:
 def test_replay_json_has_the_documented_structure(document, bag):
     assert set(document) == {
         "models", "verification", "selected", "counts", "parameters", "version", "dvl", "findings",
-        "discovery",
+        "discovery", "recordings", "navigation",
     }  # fmt: skip
+    assert document["recordings"] is None  # of one there is nothing to compare
     assert document["dvl"] == {"type": TWIST_TYPE, "turned_from_frd": False}
     assert set(document["verification"]) == set(MODELS)
     assert list(document["models"]) == list(MODELS)
