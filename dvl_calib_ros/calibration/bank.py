@@ -24,8 +24,11 @@ from .models import Model, Needs
 from .observations import Observations
 from .parameters import Parameters
 from .samples import Index, Mask, Stamps
+from .time_blocks import BlockScatter
 
 Ends = Index
+# Blocks by whose scatter σ is checked, s: as long as the noise of a vehicle's motion lasts.
+BLOCK_S = 10.0
 
 # From here on the vectorised batch is faster than the recursion.
 BATCH_FROM = 24
@@ -85,6 +88,8 @@ class Group:
         self.moments = Moments()
         self.index = {model.name: k for k, model in enumerate(models)}
         self._x, self._p = self._assembler.start
+        still = self._assembler.process_rate is None
+        self._scatter = BlockScatter(self._x, self._p, BLOCK_S) if still else None
         self._states: dict[str, GaussianState] = {}
         self._sound: dict[str, GaussianState] = {}  # the last that could be published
         self._last_stamp_ns: int | None = None
@@ -106,7 +111,13 @@ class Group:
         self.n_given += n_samples
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
-        after = self._after(data, process, ends)
+        cuts = np.zeros(0, dtype=np.intp) if self._scatter is None else self._scatter.cuts(stamps_ns)
+        every = ends if not len(cuts) else np.union1d(cuts, [] if ends is None else ends).astype(np.intp)
+        after = self._after(data, process, every)
+        if self._scatter is not None and len(cuts):
+            assert every is not None and after.at is not None
+            at = np.searchsorted(every, cuts)
+            self._scatter.add(after.at.x[at], after.at.p[at])
         self._x, self._p = after.x, after.p
         self._states.clear()
         if self._folds is not None:
@@ -114,7 +125,7 @@ class Group:
             self._folds.add(folds, data, after.used)
             if self.needs is Needs.REFERENCE:
                 self.moments.add(folds, seen)
-        standing = None if ends is None else self._standing_at(after, ends)
+        standing = None if ends is None or every is None else self._standing_at(after, ends, every)
         n_used = after.used.sum(axis=1)
         self._used += n_used
         self._gated += data.usable.sum(axis=1) - n_used
@@ -149,11 +160,13 @@ class Group:
         at = None if ends is None else GaussianState(np.stack([x] * len(ends)), np.stack([p] * len(ends)))
         return kalman.Updated(x, p, nothing, nothing.astype(float), at)
 
-    def _standing_at(self, after: kalman.Updated, ends: Ends) -> Standing:
+    def _standing_at(self, after: kalman.Updated, ends: Ends, every: Ends) -> Standing:
+        """After `ends` samples; `every`: after which numbers of samples the states are known."""
         assert after.at is not None
+        at = np.searchsorted(every, ends)
         used = np.cumsum(np.pad(after.used, ((0, 0), (1, 0))), axis=1)[:, ends].T
         nis = np.cumsum(np.pad(np.where(after.used, after.nis, 0.0), ((0, 0), (1, 0))), axis=1)[:, ends].T
-        return Standing(after.at.x, after.at.p, self._used + used, self._nis_sum + nis)
+        return Standing(after.at.x[at], after.at.p[at], self._used + used, self._nis_sum + nis)
 
     def standing(self, n: int) -> Standing:
         """The states as they are now, n times."""
@@ -166,6 +179,14 @@ class Group:
         before_ns = stamps_ns[0] if self._last_stamp_ns is None else self._last_stamp_ns
         self._last_stamp_ns = int(stamps_ns[-1])
         return np.diff(stamps_ns, prepend=before_ns)[:, None, None, None] * 1e-9 * rate
+
+    def inflation(self, name: str) -> Array:
+        """By how much blocks of time show σ of each state (n,) of one model to be larger than the filter's, at least 1.
+
+        That is 1 under a random walk, with which what one block told is forgotten by and by.
+        """
+        index = self.index[name]
+        return np.ones(self._x.shape[1]) if self._scatter is None else self._scatter.inflation(index)
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model; not to be written to."""

@@ -355,6 +355,25 @@ class Calibrator:
         self._update(group)
         return group.state(name)
 
+    def inflation(self, name: str) -> Array:
+        """By how much blocks of time raise σ of each state (n,) of one model above the filter's own."""
+        model = MODELS[name]
+        source = self._source(model)
+        if source is None:
+            return self._delay.inflation
+        factor = np.ones(model.n_state)
+        own = self._group_of[source].inflation(source)
+        factor[: len(own)] = own
+        return factor
+
+    def published(self, name: str) -> GaussianState:
+        """As `state`, with σ worth believing: the larger of what the filter claims and what blocks of time show."""
+        state = self.state(name)
+        if self._source(MODELS[name]) is None:  # its own has been raised
+            return state
+        factor = self.inflation(name)
+        return GaussianState(state.x, state.p * factor[:, None] * factor)
+
     def _source(self, model: Model) -> str | None:
         """The linear model whose estimate a model's is; None for a model of its own that claims more."""
         if model.extends is None:
@@ -384,12 +403,13 @@ class Calibrator:
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
         model = MODELS[name or self.selected]
-        state, covariance = self.state(model.name)
+        state, covariance = self.published(model.name)
         used, gated, mean_nis, rows, _ = self._counts(model)
         return Estimate(
             model=model.name,
             state=state,
             covariance=covariance,
+            filter_std=np.sqrt(np.diag(covariance)) / self.inflation(model.name),
             used=used,
             gated=gated,
             mean_nis=mean_nis,

@@ -18,7 +18,8 @@ from .verification import Verification
 
 @dataclass(frozen=True)
 class Estimate:
-    """State of one model.
+    """State of one model. filter_std (n,): standard deviations that its filter claims; those of covariance are what
+    blocks of time show, where that is more.
 
     state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n). used, gated:
     samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
@@ -27,6 +28,7 @@ class Estimate:
     model: str
     state: Array
     covariance: Array
+    filter_std: Array
     used: int
     gated: int
     mean_nis: float

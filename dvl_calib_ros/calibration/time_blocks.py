@@ -10,6 +10,7 @@ estimation of misspecified models", 1982).
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from .frames import Array
@@ -74,6 +75,53 @@ class TimeBlocks:
                 m -= 1
             scores = scores[0::2][: m // 2] + scores[1::2][: m // 2]
         return factor
+
+
+class BlockScatter:
+    """`TimeBlocks` of K filters without process noise, told by their states where one block ends and the next begins.
+
+    What a block told is the difference of the information after and before it. The factors are those as of the end of
+    the last block, so they depend on stamps alone.
+    """
+
+    def __init__(self, x: Array, p: Array, seconds: float) -> None:
+        """Start from states x (K, n), P (K, n, n). seconds: length of a block."""
+        self._blocks = TimeBlocks()
+        self._length_ns = round(seconds * 1e9)
+        self._last: int | None = None
+        self._state = x, p
+        self._told = _information(x, p)
+        self._factors: dict[int, Array] = {}
+
+    def cuts(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Numbers of samples (E) of those with these stamps (N,) after which a new block begins."""
+        blocks = stamps_ns // self._length_ns
+        before = blocks[0] if self._last is None else self._last
+        self._last = int(blocks[-1])
+        return np.flatnonzero(np.diff(blocks, prepend=before))
+
+    def add(self, x: Array, p: Array) -> None:
+        """Take the states at the cuts, x (E, K, n), P (E, K, n, n)."""
+        for each in zip(x, p, strict=True):
+            try:
+                information, vector = _information(*each)
+            except np.linalg.LinAlgError:  # numbers that ran away: the filter goes on from before, and so do these
+                continue
+            self._blocks.add(information - self._told[0], vector - self._told[1], 1.0)
+            self._told, self._state = (information, vector), each
+        self._factors.clear()
+
+    def inflation(self, index: int) -> Array:
+        """By how much σ of each state (n,) of one filter has to grow, at least 1."""
+        if index not in self._factors:
+            x, p = self._state
+            self._factors[index] = self._blocks.inflation(index, x[index], p[index])
+        return self._factors[index]
+
+
+def _information(x: Array, p: Array) -> tuple[Array, Array]:
+    information = np.linalg.inv(p)
+    return information, (information @ x[..., None])[..., 0]
 
 
 def _joined(pair: tuple[tuple[Array, Array], tuple[Array, Array]]) -> tuple[Array, Array]:

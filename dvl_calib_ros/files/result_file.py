@@ -16,7 +16,7 @@ import numpy as np
 import yaml
 
 from .. import __version__
-from ..calibration.frames import FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import mounting_pose, scale_and_delay
@@ -70,7 +70,8 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "model": result.selected,
         **estimate_document(estimate),
-        "std": _std_in_words(estimate),
+        "std": _std_in_words(estimate, estimate.std),
+        "std_by_filter": _std_in_words(estimate, estimate.filter_std),
         **({} if verification is None else {"verification": verification_document(verification)}),
         **({"suggestion": result.suggestion} if result.suggestion else {}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
@@ -97,11 +98,11 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
     }
 
 
-def _std_in_words(estimate: Estimate) -> dict[str, str]:
+def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
     units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
     known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
     words = {}
-    for name, std in zip(estimate.state_names, estimate.std.tolist(), strict=True):
+    for name, std in zip(estimate.state_names, stds.tolist(), strict=True):
         factor, unit = known.get(name) or units[name.partition("_")[0]]
         words[name] = f"{factor * std:.4f} {unit}".rstrip()
     return words

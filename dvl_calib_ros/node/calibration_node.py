@@ -243,7 +243,7 @@ class CalibrationNode(Node):
         calibrator = self._calibrator
         model = MODELS[calibrator.selected]
         self._published = (model.name, calibrator.n_given(model.name))
-        state = calibrator.state(model.name)
+        state = calibrator.published(model.name)
         self._set_correction(model, state)
         terms, covariance = twist_terms(model, state)
         message = self._estimate
@@ -269,7 +269,7 @@ class CalibrationNode(Node):
         name = calibrator.selected
         correction = self._correction
         if correction is None or self._corrected_by != name:
-            correction = self._set_correction(MODELS[name], calibrator.state(name))
+            correction = self._set_correction(MODELS[name], calibrator.published(name))
         noise = self._unaided_noise if sample.covariance is None else sample.covariance
         velocity, covariance = correction.apply(np.array(sample.velocity), noise)
         if self._lever_arm is not None:
@@ -294,7 +294,7 @@ class CalibrationNode(Node):
         stamp = Time()
         _set_stamp(stamp, calibrator.last_ns)
         parameters, decoder = calibrator.parameters, self._feed.decoder
-        pose = mounting_pose(model, calibrator.state(model.name), parameters, decoder.turns_dvl)
+        pose = mounting_pose(model, calibrator.published(model.name), parameters, decoder.turns_dvl)
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
 
     def _publish_diagnostics(self) -> None:

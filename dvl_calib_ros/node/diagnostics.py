@@ -159,6 +159,7 @@ def _restart_advice(counts: Counts) -> list[Finding]:
 def _estimate_values(estimate: Estimate) -> dict[str, str]:
     values = {}
     model, std = MODELS[estimate.model], estimate.std
+    by_filter = dict(zip(estimate.state_names, estimate.filter_std.tolist(), strict=True))
     units = {each.name: each.unit for each in model.nuisance}
     for entry in estimate.observability:
         name = entry.name
@@ -168,6 +169,7 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
             factor, unit = 1.0, units[name]
         values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
         values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
+        values[f"filter std {name} [{unit}]"] = f"{factor * by_filter[name]:.4f}"
         values[f"progress {name} [%]"] = f"{100.0 * entry.progress:.1f}"
         values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"
     for index, nuisance in enumerate(model.nuisance, start=model.n_errors):

@@ -141,6 +141,14 @@ class DelayFilter:
         """Whether the data show anything of lever arm or delay."""
         return self.posterior is not None and bool(self.posterior.shown[BEYOND].any())
 
+    @property
+    def inflation(self) -> Array:
+        """By how much blocks of time have raised σ of each state (n,); 1 of what is not claimed."""
+        posterior = self.posterior
+        if posterior is None:
+            return np.ones(N_STATE)
+        return np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
+
     def state(self, base: GaussianState) -> GaussianState:
         """The state, given that of the model that this extends."""
         posterior = self.posterior
