@@ -120,8 +120,8 @@ def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys
 def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_said_so(bags, tmp_path):
     arm = "lever_arm:x_m=0.8,y_m=-0.3"
     made = bag(
-        tmp_path / "sim", (arm, "velocity_bias:x_mps=0.05"), trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0,
-        seed=3,
+        tmp_path / "sim", (arm, "velocity_bias:x_mps=0.05"), gnss_rate=10.0, gnss_std=0.0, seed=3,
+        errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.005),
     )  # fmt: skip
     found = {each.name: each.status for each in compare(source(bags["vehicle"]), source(made)).effects}
     assert found["lever_arm"] is Status.ALIKE
@@ -141,8 +141,9 @@ def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(bags, t
 
 
 @pytest.mark.slow
-def test_a_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags, tmp_path):
-    made = bag(tmp_path / "sim", trajectory="straight", gnss_rate=10.0, gnss_std=0.0)
+def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags, tmp_path):
+    loud = DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.5)
+    made = bag(tmp_path / "sim", trajectory="straight", gnss_rate=10.0, gnss_std=0.0, errors=loud)
     found = compare(source(bags["vehicle"]), source(made))
     arm = next(each for each in found.effects if each.name == "lever_arm")
     assert arm.status is Status.CANNOT_TELL and "with the simulator" in arm.needs
