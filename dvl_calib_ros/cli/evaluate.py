@@ -11,17 +11,17 @@ With several recorded bags instead, each is calibrated on, and every other one t
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
+from .cross_check import cell, print_cross_check, set_columns
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..evaluation.bags import CrossCheck
     from ..evaluation.results import Coverage, EachStudy, ErrorsInVariables, Evaluation
     from ..parallel import Workers
 
@@ -149,26 +149,20 @@ def _print(e: Evaluation) -> None:
         out.print(_noise_table(e.errors_in_variables))
 
 
-def _cell(value: float, digits: int = 4) -> str:
-    return f"{value:.{digits}f}" if value == value else "-"
-
-
 def _score_table(e: Evaluation) -> Table:
     from rich.table import Table
 
     table = Table(title="Avg.VRMSE m/s", title_justify="left")
-    _set_columns(table, ["set"], e.columns)
+    set_columns(table, ["set"], e.columns)
     for each, scores, ratios in zip(e.sets, e.seed_mean, e.ratio, strict=True):
         window = "all" if each.window_s is None else f"{each.window_s:g} s"
-        table.add_row(f"{each.name} ({each.calibration_run}, {window})", *map(_cell, scores))
+        table.add_row(f"{each.name} ({each.calibration_run}, {window})", *map(cell, scores))
         if not e.own_generator:
-            table.add_row(
-                "  × published", *(f"[dim]{_cell(ratio, 2)}[/]" if ratio == ratio else "" for ratio in ratios)
-            )
+            table.add_row("  × published", *(f"[dim]{cell(ratio, 2)}[/]" if ratio == ratio else "" for ratio in ratios))
     table.add_section()
-    table.add_row("mean", *map(_cell, e.set_mean))
+    table.add_row("mean", *map(cell, e.set_mean))
     if not e.own_generator:
-        table.add_row("published mean", *map(_cell, e.published_table.mean(axis=0)))
+        table.add_row("published mean", *map(cell, e.published_table.mean(axis=0)))
     return table
 
 
@@ -177,9 +171,9 @@ def _baseline_table(e: Evaluation) -> Table:
 
     caption = "rotation alone by least squares on SO(3), of displacements (2007) and of velocities (2010); no scale"
     table = Table(title="Avg.VRMSE m/s, before", title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["baseline"], [*(each.name for each in e.sets), "mean"])
+    set_columns(table, ["baseline"], [*(each.name for each in e.sets), "mean"])
     for name, values in e.baselines.items():
-        table.add_row(name, *map(_cell, values), _cell(float(values.mean())))
+        table.add_row(name, *map(cell, values), cell(float(values.mean())))
     return table
 
 
@@ -194,7 +188,7 @@ def _convergence_table(e: Evaluation) -> Table:
         f"{PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s"
     )
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["first"], [curve.label for curve in e.convergence])
+    set_columns(table, ["first"], [curve.label for curve in e.convergence])
     for index, seconds in enumerate(TIMES_S):
         cells = (f"{each.angle_deg[index]:.2f} / {each.level_deg[index]:.2f}" for each in e.convergence)
         table.add_row(f"{seconds:g} s", *cells)
@@ -226,12 +220,12 @@ def _held_out_table(e: Evaluation) -> Table:
         f"{math.degrees(e.parameters['reject_misalignment']):.3g}° rejected."
     )
     table = Table(title="Hold-out verification, m/s", title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["set", ""], e.models)
+    set_columns(table, ["set", ""], e.models)
     for each in e.sets:
         found = {one.model: one for one in e.held_out if one.set_name == each.name}
         for kind in ("uncorrected", "corrected", "predicted"):
             values = (getattr(found[name], kind) if name in found else math.nan for name in e.models)
-            table.add_row(each.name if kind == "uncorrected" else "", kind, *map(_cell, values))
+            table.add_row(each.name if kind == "uncorrected" else "", kind, *map(cell, values))
         counts = [found[name].verdicts if name in found else None for name in e.models]
         words = ("accept", "marginal", "reject")
         table.add_row("", "a / m / r", *("/".join(str(c.get(w, 0)) for w in words) if c else "-" for c in counts))
@@ -243,11 +237,11 @@ def _time_table(e: Evaluation) -> Table:
     from rich.table import Table
 
     table = Table(title="Avg.VRMSE m/s against calibration time", title_justify="left")
-    _set_columns(table, ["set", "first"], e.columns)
+    set_columns(table, ["set", "first"], e.columns)
     for each, rows in zip(e.sets, e.avg_vrmse_by_time.mean(axis=-1), strict=True):
         for window, row in zip(e.windows_s, rows, strict=True):
             name = each.name if window == e.windows_s[0] else ""
-            table.add_row(name, "all" if window is None else f"{window:g} s", *map(_cell, row))
+            table.add_row(name, "all" if window is None else f"{window:g} s", *map(cell, row))
         table.add_section()
     return table
 
@@ -261,16 +255,16 @@ def _each_table(e: Evaluation, study: EachStudy, title: str) -> Table:
 
     caption = "?: the model says that it has not seen yaw, in most of the combinations"
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["run", "heading spread"], e.columns)
+    set_columns(table, ["run", "heading spread"], e.columns)
     scores = study.avg_vrmse.mean(axis=-1)
     for run, row, observed in zip(study.runs, scores, study.yaw_observed, strict=True):
         marks = ["", *(" ?" if share < 0.5 else "" for share in observed)]
-        cells = [_cell(value) + mark for value, mark in zip(row, marks, strict=True)]
+        cells = [cell(value) + mark for value, mark in zip(row, marks, strict=True)]
         name = f"{run.trajectory}, {run.from_s:.0f} .. {run.to_s:.0f} s"
         table.add_row(name, f"{math.degrees(run.heading_spread):.0f}°", *cells)
     table.add_section()
-    table.add_row("median", "", *map(_cell, study.median()))
-    table.add_row(f"of {MANOEUVRING[0]} .. {MANOEUVRING[-1]}", "", *map(_cell, study.median(MANOEUVRING)))
+    table.add_row("median", "", *map(cell, study.median()))
+    table.add_row(f"of {MANOEUVRING[0]} .. {MANOEUVRING[-1]}", "", *map(cell, study.median(MANOEUVRING)))
     return table
 
 
@@ -280,7 +274,7 @@ def _coverage_table(coverage: Sequence[Coverage], title: str) -> Table:
     caption = "per cent of errors within the 68 % / 95 % interval; error / σ: rms, 1 for an honest σ"
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     states = ("φx", "φy", "φz", "δk", "δk y", "δk z")[: max((len(each.state_names) for each in coverage), default=3)]
-    _set_columns(table, ["model"], (*states, "pooled", "error / σ", "errors"))
+    set_columns(table, ["model"], (*states, "pooled", "error / σ", "errors"))
     for each in coverage:
         pairs = [f"{100 * a:.0f} / {100 * b:.0f}" for a, b in zip(each.within_68, each.within_95, strict=True)]
         pairs += ["-"] * (len(states) - len(pairs))
@@ -295,20 +289,13 @@ def _noise_table(study: ErrorsInVariables) -> Table:
     caption = "predicted / measured, per cent; predicted by " + study.formula
     title = "Errors in variables: pull of the scale by noise in the reference"
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["model", "noisy axes"], [f"{std:g} m/s" for std in study.gnss_std])
+    set_columns(table, ["model", "noisy axes"], [f"{std:g} m/s" for std in study.gnss_std])
     for name, axes, predicted, measured in zip(
         study.models, study.noisy_axes, study.predicted, study.measured, strict=True
     ):
         cells = [f"{100 * p:.2f} / {100 * m:.2f}" for p, m in zip(predicted, measured, strict=True)]
         table.add_row(name, f"{axes:g}", *cells)
     return table
-
-
-def _set_columns(table: Table, first: Iterable[str], rest: Iterable[str]) -> None:
-    for name in first:
-        table.add_column(name, no_wrap=True)
-    for name in rest:
-        table.add_column(name, justify="right", no_wrap=True)
 
 
 # ------------------------------------------------------------------ bags
@@ -329,46 +316,4 @@ def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Work
         common.write_json(arguments.json, cross_check_document(check))
     if write_report is not None:
         write_report(arguments.report, check)
-    _print_cross_check(check)
-
-
-def _print_cross_check(check: CrossCheck) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    common.print_warnings(check.notes)
-    caption = "with the noise of GNSS, which no calibration removes; -: nothing to calibrate with, or to check against"
-    title = "Difference of DVL and GNSS, rms m/s, on bags that were not calibrated on"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["calibrated on", "model"], [escape(bag) for bag in check.bags])
-    table.add_row("nothing", "uncalibrated", *map(_cell, check.uncorrected))
-    for bag, rows in zip(check.bags, check.corrected, strict=True):
-        table.add_section()
-        for model, row in zip(check.models, rows, strict=True):
-            table.add_row(escape(bag), model, *map(_cell, row))
-    out = common.console()
-    out.print(table)
-    if check.navigation:
-        out.print(_drift_table(check))
-
-
-def _drift_table(check: CrossCheck) -> Table:
-    """Dead reckoning of each bag by each other one."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    title = "Dead reckoning: drift in m per km, on bags that were not calibrated on"
-    caption = "with the lever arm of the bag calibrated on; the delay, which is the day's, is that of the bag itself"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    _set_columns(table, ["calibrated on", "model"], [escape(bag) for bag in check.bags])
-    nothing = [
-        next((each.before.per_km for (_, bag), each in check.navigation.items() if bag == verified), float("nan"))
-        for verified in check.bags
-    ]
-    table.add_row("nothing", "as mounted", *(_cell(value, 1) for value in nothing))
-    for calibrated, model in zip(check.bags, check.selected, strict=True):
-        found = [check.navigation.get((calibrated, verified)) for verified in check.bags]
-        table.add_row(
-            escape(calibrated), model, *("-" if each is None else _cell(each.after.per_km, 1) for each in found)
-        )
-    return table
+    print_cross_check(check)

@@ -20,6 +20,7 @@ def state_of(name: str, rng) -> GaussianState:
     return GaussianState(rng.normal(0.0, 0.02, n), root @ root.T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turned", [False, True])
 def test_the_covariance_is_that_of_poses_drawn_from_the_state(rng, turned):
     model, state = MODELS["G2"], state_of("G2", rng)

@@ -65,6 +65,7 @@ def compared(bags):
 # ------------------------------------------------------------------ the whole way
 
 
+@pytest.mark.slow
 def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_sides(compared):
     assert compared.verdict is Verdict.DIFFERENT
     assert [each.name for each in compared.missing] == ["lever_arm"]
