@@ -5,9 +5,6 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..effects.base import Effect
 from .composed import Problem
 from .fitting import Fit
@@ -52,5 +49,4 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
     """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
     if not rest.found or rest.energy < SETTINGS.unexplained_energy:
         return False
-    stretch: NDArray[np.intp] = np.floor(problem.time / SETTINGS.block).astype(np.intp) % SETTINGS.folds
-    return holds_out(fit, rest, stretch) > SETTINGS.unexplained_held_out
+    return holds_out(problem, fit, rest) > SETTINGS.unexplained_held_out

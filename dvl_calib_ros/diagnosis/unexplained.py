@@ -20,12 +20,15 @@ from .fitting import Fit, Fitter
 from .least_squares import WhitenedLeastSquares
 from .made_up import made_up
 from .noise import Noise
+from .settings import SETTINGS
 
 LEVEL = 0.001
 # Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
 # Standard deviation, m/s, of what nothing is known of
 WIDE = 10.0
+# Standard deviations that were taken off an outlier
+OUTLYING = 5.0
 # Made-up recordings that tell what is chance, and degrees of freedom of the belief that this is as it should be
 MADE_UP, PRIOR_DOF = 12, 4.0
 # Directions of the dictionary that hold less of their length than this beside the others are left out
@@ -140,13 +143,22 @@ def _looked(
     white = white / np.sqrt(float(white @ white) / (len(white) - q.shape[1]))
     looks: list[Look] = []
     raw: dict[str, Array] = {}
+    sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
-        raw[name] = _along_axes(functions, problem.axes)
+        raw[name] = _along_axes(functions * sound, problem.axes)
         whitened = noise.whiten(raw[name])
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
             energy, dof = _energy(q, whitened[:, at], white)
             looks.append(Look(name, at, number == 0, energy, dof))
     return looks, white, raw
+
+
+def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
+    """(M,) bins with an outlier in or beside them: it is in the motion as well that the error is held against."""
+    if not isinstance(fitter.outliers, np.ndarray):
+        return np.zeros(len(noise.level), dtype=bool)
+    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > OUTLYING
+    return np.asarray(far | np.append(far[1:], False) | np.append(False, far[:-1]))
 
 
 def _grown(fitter: Fitter, fit: Fit, looks: Sequence[Look]) -> list[float]:
@@ -197,23 +209,29 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
     return found
 
 
-def holds_out(fit: Fit, rest: Unexplained, fold: NDArray[np.intp]) -> float:
-    """Whitened squares that what the rest follows most clearly explains on folds (M,) that it was not fitted to.
+def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
+    """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
+    noise = fit.noise
+    if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
+        noise = _recoloured(noise, fit.columns, rest.clearest, fit.residual)[2]
+    return told_elsewhere(problem, noise, fit.columns, rest.clearest, fit.residual)
+
+
+def told_elsewhere(problem: Problem, noise: Noise, known: Array, raw: Array, residual: Array) -> float:
+    """Whitened squares of a residual (M, A) that columns raw (M, A, c), beside known ones, explain on stretches of time
+    that they were not fitted to.
 
     One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
     what is there tells of itself elsewhere.
     """
-    raw, noise = rest.clearest, fit.noise
-    if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
-        noise = _recoloured(noise, fit.columns, raw, fit.residual)[2]
-    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-    known = fit.columns / np.maximum(np.sqrt((fit.columns**2).mean(axis=(0, 1))), 1e-12)
-    white = noise.whiten(np.concatenate([known, raw / size], axis=2))
-    series = noise.whiten(fit.residual)
+    fold = np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds
+    sizes = [np.maximum(np.sqrt((each**2).mean(axis=(0, 1))), 1e-12) for each in (known, raw)]
+    white = noise.whiten(np.concatenate([known / sizes[0], raw / sizes[1]], axis=2))
+    series = noise.whiten(residual)
     # all together are no larger than the residual: else stretches without a turn would be told of any size
-    likely = float(np.sqrt(np.mean(fit.residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
+    likely = float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
     std = np.concatenate([np.full(known.shape[2], WIDE), np.full(raw.shape[2], likely)])
-    rows = np.repeat(fold, fit.residual.shape[1])
+    rows = np.repeat(fold, residual.shape[1])
     gain = 0.0
     for held in np.unique(fold):
         train, test = rows != held, rows == held
