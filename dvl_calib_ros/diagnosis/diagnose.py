@@ -23,7 +23,6 @@ from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
 from .far_clocks import check_clocks
 from .fitting import prior_std
-from .instead import matters, settled
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
 from .recordings import Recording, load_recordings
@@ -31,8 +30,9 @@ from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
 from .selection import Selected, Selection, blocks_of, select
 from .series import collect_series
 from .settings import SETTINGS
+from .standing import is_borne_out, matters, settled
 from .twin import twins
-from .unexplained import Unexplained, told_elsewhere, unexplained
+from .unexplained import Unexplained, unexplained
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -42,11 +42,6 @@ VISIBLE_TIMES_TYPICAL = 3.0
 # ... and a recording can only be cleared if that share of the effects could have been seen
 MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
-# p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
-WEAK = 1e-3
-# Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
-# not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
-FAINT, BORNE_OUT = 200.0, 0.25
 # What is left beyond the noise is told in the sentence from this share of the noise on
 WORTH_TELLING = 0.3
 Triple = tuple[float, float, float]
@@ -91,7 +86,7 @@ def diagnose_recordings(
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
-    if selection.selected and not _is_borne_out(selection, gap, len(testable)):
+    if selection.selected and not is_borne_out(selection, gap, len(testable)):
         selection = selection.withdrawn()
         rest = unexplained(selection.fitter, selection.fit)
         residuals = held_out(selection)
@@ -192,21 +187,6 @@ def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
         next_manoeuvre="straight legs on several headings and at several speeds, with turns to both sides",
         notes=tuple(notes),
     )
-
-
-def _is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
-    """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
-    fit = selection.fit
-    explained = selection.base.deviance - fit.deviance
-    if explained < FAINT:
-        columns, parameters = fit.columns[:, :, 6:], fit.hypothesis.parameters()
-        values = fit.hypothesis.vector()[6:] - np.array([each.spec.default for each in parameters])
-        without = fit.residual - columns @ values
-        told = told_elsewhere(selection.fitter.problem, fit.noise, fit.columns[:, :, :6], columns, without)
-        if told < BORNE_OUT * (explained - len(values)):
-            return False
-    p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
-    return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before
 
 
 def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
