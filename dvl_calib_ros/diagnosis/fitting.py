@@ -83,6 +83,7 @@ class Fit:
         """
         inverse = self.system.covariance()
         scores = self.scores(block)
+        scores = scores - scores.mean(axis=0)  # their mean is what the prior and the velocities' own noise make
         n = len(scores)
         sandwich = inverse @ (scores.T @ scores) @ inverse * n / max(n - 1, 1)
         grown = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
@@ -172,10 +173,39 @@ class Fitter:
             if np.abs(step / std).max() < STANDS_STILL or gained < GAINS_NOTHING:
                 break
         columns = self.columns(hypothesis, seen)
-        system = self._system(noise, columns, residual, hypothesis)
+        system = self._without_own_noise(
+            self._system(noise, columns, residual, hypothesis), hypothesis, noise, columns, residual
+        )
+        free = np.flatnonzero(~kept)
+        if len(free):
+            step = np.zeros(len(kept))
+            step[free] = system.part(free).solution()
+            hypothesis = hypothesis.moved(step)
+            seen, residual = self.evaluated(hypothesis)
+            misfit = self._misfit(noise, residual, hypothesis)
+            columns = self.columns(hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
         return Fit(hypothesis, seen, residual, noise, columns, system, deviance, own_noise)
+
+    def _without_own_noise(
+        self, system: WhitenedLeastSquares, hypothesis: Hypothesis, noise: Noise, columns: Array, residual: Array
+    ) -> WhitenedLeastSquares:
+        """A system less what the velocities' own noise makes in it, as made-up noise shows it.
+
+        The columns of scale and misalignment hold the noise of the very velocities that are in the residual, so each
+        would explain the other: scale for noise (errors in variables).
+        """
+        gram = system.gram
+        for shaken in self.problem.shaken:
+            seen = shaken.all_seen(hypothesis)
+            other = replace(self, problem=shaken, _fits={})
+            white = self._white(noise, other.columns(hypothesis, seen) - columns)
+            own = self._white(noise, shaken.residual(seen) - residual - self.outliers)
+            joined = np.column_stack([white, -own])
+            gram = gram - joined.T @ joined
+        found = replace(system, gram=gram)
+        return found if found.is_definite else system
 
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """(S n,) whitened, what made-up noise of the velocities makes in the residual (M, A) of a hypothesis."""

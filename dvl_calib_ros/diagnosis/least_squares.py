@@ -37,6 +37,12 @@ class WhitenedLeastSquares:
         normal: Array = self.gram[:-1, :-1] + np.diag(self.std**-2.0)
         return normal
 
+    @property
+    def is_definite(self) -> bool:
+        """Whether there is one solution, that of a minimum."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._normal), 1e-300))
+        return bool(np.linalg.eigvalsh(scale[:, None] * self._normal * scale)[0] > 1e-9)
+
     def solution(self) -> Array:
         """x (n,)."""
         right = self.gram[:-1, -1] + self.centre / self.std**2

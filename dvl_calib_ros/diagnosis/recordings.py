@@ -48,6 +48,8 @@ MOVING_MPS = 0.1
 SPIKE, SPIKE_PASSES = 12.0, 3
 # Streams slower than this show turns and waves barely; they have no frequencies to spare
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
+# However long a recording is, its streams are averaged to no less
+SLOWEST_AVERAGE_HZ = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,13 +280,15 @@ def make_recording(
 ) -> Recording:
     """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4). axes: as gnss_axes."""
     time, velocity = dvl
+    seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
+    rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
     repeats = int((np.diff(velocity, axis=0) == 0.0).all(axis=1).sum())
     spikes = len(time) - len(Curve(time, velocity).without_spikes().time) if len(time) > 1 else 0
 
     def curve(stream: tuple[Array, Array] | None, claimed: Array | None = None) -> Curve | None:
         if stream is None or len(stream[0]) < 2:
             return None
-        return Curve(*stream, claimed).without_spikes().averaged(SETTINGS.max_stream_rate)
+        return Curve(*stream, claimed).without_spikes().averaged(rate)
 
     if attitude is not None:
         attitude = attitude[0], _alike_in_sign(attitude[1])

@@ -139,6 +139,17 @@ def test_a_lever_arm_and_a_delay_a_hundred_times_the_noise_are_exact(seconds):
     assert diagnosis.gap.not_explained < 0.3 * diagnosis.gap.noise_floor
 
 
+def test_noise_of_the_dvl_takes_nothing_off_a_lever_arm_however_long_the_run():
+    """Sway that only a lever arm makes: its scale would explain the very noise that it holds, and bend the arm."""
+    diagnosis = diagnosed(
+        "free", [LEVER], seconds=900.0, seed=8, gnss_std=0.002, dvl_rate=10.0, gnss_rate=10.0, imu_rate=20.0,
+        errors=DvlErrors(beam_std=0.005),
+    )  # fmt: skip
+    x, low, high = diagnosis.effects[0].parameters["x_m"]
+    assert diagnosis.effects[0].name == "lever_arm" and low < -1.9 < high
+    assert x == pytest.approx(-1.9, abs=0.06)  # -1.80 with those columns as they are
+
+
 def test_a_large_and_a_small_effect_in_one_recording_are_both_found():
     diagnosis = diagnosed(effects=["lever_arm:x_m=-1.9", "velocity_bias:x_mps=0.03,y_mps=-0.03"], gnss_std=0.03)
     assert set(found(diagnosis)) == {"lever_arm", "velocity_bias"}
