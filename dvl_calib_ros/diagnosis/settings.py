@@ -16,7 +16,8 @@ class DiagnosisSettings:
 
     Comparing: the residual is averaged over bins_per_interval intervals of the slower stream, so that what is lost and
     gained near its Nyquist frequency by interpolation at one phase or another does not look like a delay; over
-    shortest_bin at least, and so that no more than max_bins are left. max_points: of a stream, to which a long recording is averaged.
+    shortest_bin at least, and so that no more than max_bins are left. max_points: of a stream, to which a long
+    recording is averaged.
 
     Finding: first_offset, first_step: delays that are tried, for the whole run. level: family-wise, of the claim that
     there is an effect. max_effects: named at most. ghost_share: of what is explained already that a further effect
