@@ -115,13 +115,14 @@ def _rms(difference: Array) -> float:
 def _noise(recordings: Sequence[Recording], selection: Selection) -> Array:
     """(3,) m/s: the lesser of what neighbours do not tell of the DVL's own samples, and of their residual.
 
-    The first holds motion that is too quick for the DVL's rate, the second what is left of the reference's noise.
+    The first holds motion that is too quick for the DVL's rate (of a slow one no more is believed than it claims), the
+    second what is left of the reference's noise.
     """
     problem = with_quiet_reference(selection.fitter.problem)
     variances = []
     for index, recording in enumerate(recordings):
         rest = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
-        own = recording.dvl.roughness
+        own = recording.dvl.noise
         variances.append(np.minimum(own, Curve(recording.dvl.time, rest).roughness) ** 2)
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
