@@ -72,8 +72,9 @@ class Assembler:
         """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
         heave were known at the sample; models that need them skip it where not."""
         k, n_samples = len(self.models), len(seen.velocity_dvl)
-        z = np.empty((k, n_samples, self._m))
-        h = np.zeros((k, n_samples, self._m, self._n))
+        # in memory each element's samples follow each other, as the batch works on them
+        z = np.empty((self._m, k, n_samples)).transpose(1, 2, 0)
+        h = np.zeros((self._m, self._n, k, n_samples)).transpose(2, 3, 0, 1)
         for index, model in enumerate(self.models):
             # a model that extends another has columns for what that has; the rest is not shown sample by sample
             z[index], own = model.linearise(seen)

@@ -93,7 +93,7 @@ class Model:
         """Number of states that are errors of the DVL: misalignment and scale."""
         return 3 + len(self.scale_axes)
 
-    @property
+    @cached_property
     def state_names(self) -> tuple[str, ...]:
         """Names of the states in order: misalignment (rad), scale-factor errors (dimensionless), nuisance states."""
         scales, nuisance = (name for name, _ in self.scale_axes), (each.name for each in self.nuisance)
