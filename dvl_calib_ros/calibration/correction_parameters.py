@@ -33,9 +33,15 @@ class Mapped(NamedTuple):
 
 
 def errors_from_correction(correction: Array) -> Mapped:
-    """ψ (3) and κ (2) as one vector (..., 5) -> φ, δk with their derivatives."""
+    """ψ (3) and κ (2) as one vector (..., 5) -> φ, δk with their derivatives.
+
+    Raises numpy.linalg.LinAlgError where there is no such B.
+    """
     if correction.ndim == 1:
-        return _errors_from_one_correction(correction)
+        try:
+            return _errors_from_one_correction(correction)
+        except ZeroDivisionError:
+            raise np.linalg.LinAlgError("a correction that has no inverse") from None
     b = np.linalg.inv(_IDENTITY - (correction @ _GENERATORS.reshape(_N, 9)).reshape(*correction.shape[:-1], 3, 3))
     db = b[..., None, :, :] @ _GENERATORS @ b[..., None, :, :]  # (..., 5, 3, 3), by each of ψ and κ
     scale, dscale = np.diagonal(b, axis1=-2, axis2=-1), np.diagonal(db, axis1=-2, axis2=-1)

@@ -25,6 +25,13 @@ errors_at_5_degrees = st.lists(st.floats(-0.09, 0.09), min_size=5, max_size=5).m
 # ---------------------------------------------------------------- correction parameters
 
 
+def test_a_correction_without_an_inverse_is_refused_alone_as_among_others():
+    nothing_is_left_of_x = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
+    for correction in (nothing_is_left_of_x, np.array([np.zeros(5), nothing_is_left_of_x])):
+        with pytest.raises(np.linalg.LinAlgError):
+            errors_from_correction(correction)
+
+
 def test_many_corrections_at_once_give_what_each_gives_alone(rng):
     corrections = rng.normal(0.0, 0.2, (50, 5))
     together = errors_from_correction(corrections)
