@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import medfilt
 
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
@@ -23,6 +24,8 @@ from .settings import SETTINGS
 BELIEVED = 0.25
 # Time step of the series, s; and the share of the shorter one that must overlap
 STEP_S, OVERLAP = 0.5, 0.4
+# Steps of the running median that takes spikes out of a speed
+SPIKE_STEPS = 9
 # Slower, a course says nothing of the heading
 MOVING_MPS = 0.2
 Series = NDArray[Any]  # of complex numbers
@@ -40,7 +43,8 @@ def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
     dvl, reference, attitude = recording.dvl, recording.reference, recording.attitude
     body = Curve(dvl.time, dvl.values @ rotation_dvl_from_body)
     known = reference.covers(_steps(reference)).astype(float)  # across an outage the curve is anything
-    late, is_far = lag(_speed(body), body.time[0], _speed(reference), reference.time[0], known)
+    own = body.covers(_steps(body)).astype(float)
+    late, is_far = lag(_speed(body), body.time[0], _speed(reference), reference.time[0], known, own)
     if is_far:
         raise InputError(_refused(recording.name, "the DVL's", "the reference's", late))
     if attitude is None or recording.frame is VelocityFrame.BODY:
@@ -77,11 +81,16 @@ def _steps(curve: Curve) -> Array:
 def _speed(curve: Curve) -> Series:
     """(N,) horizontal speed, m/s, every STEP_S from the curve's first sample on."""
     values = curve(_steps(curve))
-    return np.asarray(np.hypot(values[:, 0], values[:, 1]), dtype=complex)
+    return np.asarray(medfilt(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS), dtype=complex)
 
 
 def lag(
-    one: Series, one_start: float, other: Series, other_start: float, weight: Array | None = None
+    one: Series,
+    one_start: float,
+    other: Series,
+    other_start: float,
+    weight: Array | None = None,
+    own: Array | None = None,
 ) -> tuple[float, bool]:
     """By how many s a series is later than another, and whether that is surely more than LONGEST_OFFSET_S.
 
@@ -91,11 +100,12 @@ def lag(
     ----------
     one, other: (N,), (M,), every STEP_S.
     one_start, other_start: Times of their first samples, s.
-    weight: (M,) of samples of the other; by default all alike.
+    weight, own: (M,) of samples of the other, (N,) of the one; by default all alike.
 
     """
     n, m = len(one), len(other)
     weight = np.ones(m) if weight is None else weight
+    own = np.ones(n) if own is None else own
     size = n + m
 
     def correlated(a: Series | Array, b: Series | Array) -> Array:
@@ -103,9 +113,9 @@ def lag(
         sums = np.real(np.fft.ifft(np.fft.fft(a, size) * np.conj(np.fft.fft(b, size))))
         return np.concatenate([sums[size - (m - 1) :], sums[:n]])
 
-    count = correlated(np.ones(n), weight)
-    squares = correlated(np.abs(one) ** 2, weight) + correlated(np.ones(n), weight * np.abs(other) ** 2)
-    squares -= 2.0 * correlated(one, weight * other)
+    count = correlated(own, weight)
+    squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
+    squares -= 2.0 * correlated(own * one, weight * other)
     enough = count >= max(OVERLAP * min(float(n), float(weight.sum())), SETTINGS.min_seconds / STEP_S)
     mean = np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
     late = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
