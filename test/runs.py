@@ -9,12 +9,19 @@ import numpy as np
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.results import Estimate
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.simulation.sensors import measure_dvl_matched
 from dvl_calib_ros.simulation.trajectories import make_motion
 
 START_NS = 1_700_000_000_123_456_789
 SECOND = 1_000_000_000
+
+
+def claimed_covariance(estimate: Estimate) -> np.ndarray:
+    """What the filter alone claims (n, n), before blocks of time raise it."""
+    lowered = estimate.filter_std / estimate.std
+    return estimate.covariance * np.outer(lowered, lowered)
 
 
 @dataclass(frozen=True)
