@@ -122,7 +122,11 @@ def lag(
     near = np.abs(late) <= LONGEST_OFFSET_S + STEP_S
     best = int(np.argmin(mean))
     nearest = float(mean[near].min()) if near.any() else np.inf
-    if not near[best] and mean[best] < BELIEVED * nearest:
+    # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then it
+    # agrees there, too, to what one step of the grid makes
+    both = weight[1:] * weight[:-1]
+    of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
+    if not near[best] and mean[best] < BELIEVED * nearest and nearest > of_a_step:
         as_good = np.where(
             mean <= 1.5 * mean[best], np.abs(late), np.inf
         )  # legs that repeat agree at more than one lag
