@@ -364,7 +364,7 @@ class Aligner:
                 break
             self.n_paired += 1
             self.decided_ns = stamp_ns
-            self._pair(slot, stamp_ns, bracket)
+            self._pair(slot, bracket)
 
     @property
     def horizon_ns(self) -> int:
@@ -403,9 +403,9 @@ class Aligner:
             self.tally["pairing"]["oriented" if oriented else "not_oriented"] += 1
             self.given[Needs.ATTITUDE] += oriented
 
-    def _pair(self, slot: int, stamp_ns: int, bracket: Bracket | None) -> None:
+    def _pair(self, slot: int, bracket: Bracket | None) -> None:
         rows, tally = self.rows, self.tally["pairing"]
-        pairing = Pairing.UNPAIRED if bracket is None else self._pair_with(slot, stamp_ns, bracket)
+        pairing = Pairing.UNPAIRED if bracket is None else self._pair_with(slot, bracket)
         rows.pairing[slot] = pairing
         tally["paired" if pairing == Pairing.PAIRED else "unpaired"] += 1
         if pairing == Pairing.WITHOUT_ATTITUDE:
@@ -413,11 +413,11 @@ class Aligner:
         if pairing == Pairing.PAIRED and rows.verdict[slot] == Verdict.USED:
             self.given[Needs.REFERENCE] += 1
 
-    def _pair_with(self, slot: int, stamp_ns: int, bracket: Bracket) -> int:
+    def _pair_with(self, slot: int, bracket: Bracket) -> int:
         rows, track = self.rows, self.reference
         before, after, fraction = bracket
         values, unmeasured, frame = track.values[after], track.unmeasured[after], track.frames[after]
-        weight, since_s, until_s = 1.0, 0.0, 0.0
+        weight = 1.0
         if before >= 0:
             before_ns, after_ns = int(track.stamps_ns[before]), int(track.stamps_ns[after])
             interval_ns = int(rows.interval_ns[slot])
@@ -431,14 +431,12 @@ class Aligner:
                 # gives.
                 values = track.values[before] + (values - track.values[before]) * fraction
                 unmeasured = unmeasured | track.unmeasured[before]
-                since_s, until_s = 1e-9 * (stamp_ns - before_ns), 1e-9 * (after_ns - stamp_ns)
         if frame != _BODY and np.isnan(rows.attitude[slot, 0]):
             return Pairing.WITHOUT_ATTITUDE
         rows.reference[slot] = values
         rows.frames[slot] = frame
         rows.unmeasured[slot] = unmeasured
         rows.weight[slot] = weight
-        rows.around_s[slot] = since_s, until_s
         return Pairing.PAIRED
 
     def forget_old(self) -> None:
@@ -743,8 +741,6 @@ class Aligner:
             shared = np.rint((after_ns - before_ns) / np.where(interval_ns > 0, interval_ns, 1))
             is_shared = is_paired & has_before & (interval_ns > 0)
             rows.weight[at] = np.where(is_shared, 1.0 / np.maximum(1.0, shared), 1.0)
-            around_s = 1e-9 * np.column_stack([stamps_ns - before_ns, after_ns - stamps_ns])
-            rows.around_s[at] = np.where((is_paired & between)[:, None], around_s, 0.0)
         rows.pairing[at] = pairing
         self.n_paired = first + n
         self.decided_ns = int(stamps_ns[-1])

@@ -60,10 +60,8 @@ class Observations:
     where unknown, None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and
     heave, body frame. noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body:
     (N, 3, 3), and angular_velocity: (N, 3) rad/s in the body frame, None where the block has no attitude. interval:
-    (N,) s since the DVL sample before. reference_around: (N, 2) s since the reference sample before and until the one
-    after, between which reference_body lies on a straight line; zeros where it is one sample's own. unmeasured: axes of
-    the reference that hold what the DVL measures, by the nominal mounting, for want of a measurement; None if it
-    measures all.
+    (N,) s since the DVL sample before. unmeasured: axes of the reference that hold what the DVL measures, by the
+    nominal mounting, for want of a measurement; None if it measures all.
 
     What several models derive from these is computed once.
     """
@@ -77,7 +75,6 @@ class Observations:
     rotation_enu_from_body: Array | None = None
     angular_velocity: Array | None = None
     interval: Array | None = None
-    reference_around: Array | None = None
     assumptions: Assumptions = ASSUMPTIONS
     unmeasured: Unmeasured | None = None
 

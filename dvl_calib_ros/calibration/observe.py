@@ -62,7 +62,6 @@ class Observer:
             *common,
             self._paired_noise(block, rotation),
             interval=interval,
-            reference_around=block.around_s,
             assumptions=self._assumptions,
             unmeasured=unmeasured,
         )

@@ -31,7 +31,6 @@ class Rows(Table):
         "frames": (np.uint8, ()),
         "unmeasured": (np.uint8, ()),
         "weight": (np.float64, ()),
-        "around_s": (np.float64, (2,)),
         "late": (np.bool_, ()),
     }
     stamps_ns: Stamps
@@ -47,7 +46,6 @@ class Rows(Table):
     frames: Codes
     unmeasured: Codes
     weight: Array
-    around_s: Array
     late: Mask
 
     def await_partners(self, at: int | slice) -> None:
@@ -59,7 +57,6 @@ class Rows(Table):
         self.reference[at] = math.nan
         self.frames[at] = self.unmeasured[at] = 0
         self.weight[at] = 1.0
-        self.around_s[at] = 0.0
 
     def block(self, first: int, end: int) -> AlignedBlock:
         """The rows with these numbers, as long as nothing is added."""

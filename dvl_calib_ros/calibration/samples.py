@@ -325,8 +325,7 @@ class AlignedBlock:
     interpolated velocity (3), m/s, and covariance (9, nan where not given), in the frame of frames: (N,) places in
     `FRAMES`; nan where unpaired. unmeasured: (N,) a bit (1, 2, 4) for each axis of that frame that the reference does
     not measure. weight: (N,) share of its own information that a sample's reference brings: below 1 where neighbours
-    share it. around_s: (N, 2) s since the reference sample before and until the one after, between which `reference`
-    lies on a straight line; zeros where it is one sample's own.
+    share it.
     """
 
     stamps_ns: Stamps
@@ -342,7 +341,6 @@ class AlignedBlock:
     frames: Codes
     unmeasured: Codes
     weight: Array
-    around_s: Array
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

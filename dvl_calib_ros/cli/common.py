@@ -234,16 +234,11 @@ ESTIMATE_COLUMNS = ("φx °", "φy °", "φz °", "δk %")
 
 def result_table(result: Result, models: Sequence[str], title: str) -> Table:
     """One line per model, the selected one marked."""
-    from rich.table import Table
-
     from ..calibration.models import MODELS
+    from .tables import titled
 
-    table = Table(title=title, title_justify="left", caption="± 1σ;  ? not shown by this data", caption_justify="left")
-    table.add_column("model")
-    for column in ESTIMATE_COLUMNS:
-        table.add_column(column, justify="right", no_wrap=True)
-    for column in ("used", "gated", "NIS/m"):
-        table.add_column(column, justify="right")
+    caption = "± 1σ;  ? not shown by this data"
+    table = titled(title, ("model",), (*ESTIMATE_COLUMNS, "used", "gated", "NIS/m"), caption)
     table.add_column("convergence")
     for name in models:
         estimate = result.estimates[name]

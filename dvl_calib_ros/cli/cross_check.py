@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from . import common
+from .tables import cell, titled
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -16,13 +16,11 @@ if TYPE_CHECKING:
 def print_cross_check(check: CrossCheck) -> None:
     """Print what was found, its notes first."""
     from rich.markup import escape
-    from rich.table import Table
 
     common.print_warnings(check.notes)
     caption = "with the noise of GNSS, which no calibration removes; -: nothing to calibrate with, or to check against"
     title = "Difference of DVL and GNSS, rms m/s, on bags that were not calibrated on"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["calibrated on", "model"], [escape(bag) for bag in check.bags])
+    table = titled(title, ["calibrated on", "model"], [escape(bag) for bag in check.bags], caption=caption)
     table.add_row("nothing", "uncalibrated", *map(cell, check.uncorrected))
     for bag, rows in zip(check.bags, check.corrected, strict=True):
         table.add_section()
@@ -37,12 +35,10 @@ def print_cross_check(check: CrossCheck) -> None:
 def _drift_table(check: CrossCheck) -> Table:
     """Dead reckoning of each bag by each other one."""
     from rich.markup import escape
-    from rich.table import Table
 
     title = "Dead reckoning: drift in m per km, on bags that were not calibrated on"
     caption = "with the lever arm of the bag calibrated on; the delay, which is the day's, is that of the bag itself"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["calibrated on", "model"], [escape(bag) for bag in check.bags])
+    table = titled(title, ["calibrated on", "model"], [escape(bag) for bag in check.bags], caption=caption)
     nothing = [
         next((each.before.per_km for (_, bag), each in check.navigation.items() if bag == verified), float("nan"))
         for verified in check.bags
@@ -54,16 +50,3 @@ def _drift_table(check: CrossCheck) -> Table:
             escape(calibrated), model, *("-" if each is None else cell(each.after.per_km, 1) for each in found)
         )
     return table
-
-
-def cell(value: float, digits: int = 4) -> str:
-    """A number; - where there is none."""
-    return f"{value:.{digits}f}" if value == value else "-"
-
-
-def set_columns(table: Table, first: Iterable[str], rest: Iterable[str]) -> None:
-    """Add columns of words, and columns of numbers."""
-    for name in first:
-        table.add_column(name, no_wrap=True)
-    for name in rest:
-        table.add_column(name, justify="right", no_wrap=True)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import common
 from .reporting import add_report_option, report_writer
+from .tables import titled
 from .watch import node_command
 
 if TYPE_CHECKING:
@@ -125,16 +126,14 @@ def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
 
 def _compare(out: Any, saved: Path, offline: Result) -> bool:
     import numpy as np
-    from rich.table import Table
 
     from ..files.result_file import load_initial_calibration
     from ..files.yaml_files import load_yaml
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     live = load_initial_calibration(saved)
-    table = Table(title="Live node against replay and truth", title_justify="left")
-    for column in ("model", *common.ESTIMATE_COLUMNS, "max |live - replay|"):
-        table.add_column(column, justify="right", no_wrap=True)
+    numbers = ("model", *common.ESTIMATE_COLUMNS, "max |live - replay|")
+    table = titled("Live node against replay and truth", (), numbers)
     table.add_row("[bold]truth[/]", *(f"{value:+.2f}" for value in _truth().values()), "")
     worst = 0.0
     for name, estimate in offline.estimates.items():

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 
 from . import common, trial, unpaired
 from .reporting import add_report_option, report_writer
+from .tables import intervals, titled
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from rich.table import Table
 
@@ -154,15 +155,6 @@ def _print(diagnosis: Diagnosis) -> None:
     out.print(f"next: {escape(diagnosis.next_manoeuvre)}", soft_wrap=True)
 
 
-def _table(title: str, *columns: str) -> Table:
-    from rich.table import Table as RichTable
-
-    table = RichTable(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column)
-    return table
-
-
 def _effects(diagnosis: Diagnosis) -> Table:
     gap = diagnosis.gap
     title = (
@@ -170,19 +162,19 @@ def _effects(diagnosis: Diagnosis) -> Table:
         f"{1e3 * gap.noise_floor:.1f}; not explained {1e3 * gap.not_explained:.1f}; closure {_share(gap.closure)} "
         f"({_share(gap.interval[0])} to {_share(gap.interval[1])})"
     )
-    table = _table(title, "effect", "or else", "parameters (95 %)", "closure", "p")
+    table = titled(title, ("effect", "or else", "parameters (95 %)", "closure", "p"))
     for effect in diagnosis.effects:
         table.add_row(
-            effect.name, ", ".join(effect.equivalent_to) or "-", _values(effect.parameters), _share(effect.closure),
+            effect.name, ", ".join(effect.equivalent_to) or "-", intervals(effect.parameters), _share(effect.closure),
             f"{effect.p:.1g}",
         )  # fmt: skip
         for recording, parameters in effect.by_recording.items():
-            table.add_row(f"  {recording}", "", _values(parameters), "", "")
+            table.add_row(f"  {recording}", "", intervals(parameters), "", "")
     return table
 
 
 def _where(diagnosis: Diagnosis) -> Table:
-    table = _table("where the gap lies", "axis", "when", "time s", "band Hz", "share", "p")
+    table = titled("where the gap lies", ("axis", "when", "time s", "band Hz", "share", "p"))
     for place in diagnosis.where[:MAX_PLACES]:
         table.add_row(
             place.axis, place.regime, "{:.0f} .. {:.0f}".format(*place.segment_s),
@@ -192,21 +184,17 @@ def _where(diagnosis: Diagnosis) -> Table:
 
 
 def _noise(diagnosis: Diagnosis) -> Table:
-    table = _table("the noise is not what it should be", "finding", "parameters (95 %)", "p")
+    table = titled("the noise is not what it should be", ("finding", "parameters (95 %)", "p"))
     for finding in diagnosis.noise:
-        table.add_row(finding.name, _values(finding.parameters), f"{finding.p:.1g}")
+        table.add_row(finding.name, intervals(finding.parameters), f"{finding.p:.1g}")
     return table
 
 
 def _detectable(diagnosis: Diagnosis) -> Table:
-    table = _table("smallest sizes that would be found (4 times in 5)", "effect", "sizes")
+    table = titled("smallest sizes that would be found (4 times in 5)", ("effect", "sizes"))
     for name, sizes in diagnosis.minimum_detectable.items():
         table.add_row(name, ", ".join(f"{key} {size:.2g}" for key, size in sizes.items()))
     return table
-
-
-def _values(parameters: Mapping[str, tuple[float, float, float]]) -> str:
-    return ", ".join(f"{name} {value:.3g} ({low:.3g} .. {high:.3g})" for name, (value, low, high) in parameters.items())
 
 
 def _share(value: float) -> str:

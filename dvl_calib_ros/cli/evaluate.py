@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
-from .cross_check import cell, print_cross_check, set_columns
+from .cross_check import print_cross_check
 from .reporting import add_report_option, report_writer
+from .tables import cell, titled
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -150,10 +151,7 @@ def _print(e: Evaluation) -> None:
 
 
 def _score_table(e: Evaluation) -> Table:
-    from rich.table import Table
-
-    table = Table(title="Avg.VRMSE m/s", title_justify="left")
-    set_columns(table, ["set"], e.columns)
+    table = titled("Avg.VRMSE m/s", ["set"], e.columns)
     for each, scores, ratios in zip(e.sets, e.seed_mean, e.ratio, strict=True):
         window = "all" if each.window_s is None else f"{each.window_s:g} s"
         table.add_row(f"{each.name} ({each.calibration_run}, {window})", *map(cell, scores))
@@ -167,19 +165,14 @@ def _score_table(e: Evaluation) -> Table:
 
 
 def _baseline_table(e: Evaluation) -> Table:
-    from rich.table import Table
-
     caption = "rotation alone by least squares on SO(3), of displacements (2007) and of velocities (2010); no scale"
-    table = Table(title="Avg.VRMSE m/s, before", title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["baseline"], [*(each.name for each in e.sets), "mean"])
+    table = titled("Avg.VRMSE m/s, before", ["baseline"], [*(each.name for each in e.sets), "mean"], caption=caption)
     for name, values in e.baselines.items():
         table.add_row(name, *map(cell, values), cell(float(values.mean())))
     return table
 
 
 def _convergence_table(e: Evaluation) -> Table:
-    from rich.table import Table
-
     from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 
     title = "Error of the misalignment against time, ° rms: whole angle / pitch and yaw"
@@ -187,8 +180,7 @@ def _convergence_table(e: Evaluation) -> Table:
         "calibrated on each run with attitude; by the noise of the reference. Published for a network: "
         f"{PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s"
     )
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["first"], [curve.label for curve in e.convergence])
+    table = titled(title, ["first"], [curve.label for curve in e.convergence], caption=caption)
     for index, seconds in enumerate(TIMES_S):
         cells = (f"{each.angle_deg[index]:.2f} / {each.level_deg[index]:.2f}" for each in e.convergence)
         table.add_row(f"{seconds:g} s", *cells)
@@ -211,16 +203,13 @@ def _settings(e: Evaluation) -> str:
 def _held_out_table(e: Evaluation) -> Table:
     import math
 
-    from rich.table import Table
-
     caption = (
         "Velocity error against GNSS, whose noise is in it, on samples held back: rms over one combination of every "
         "misalignment; how many of these would be accepted / found marginal / rejected. By its size alone, a "
         f"misalignment of {math.degrees(e.parameters['accept_misalignment']):.3g}° is marginal, one of "
         f"{math.degrees(e.parameters['reject_misalignment']):.3g}° rejected."
     )
-    table = Table(title="Hold-out verification, m/s", title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["set", ""], e.models)
+    table = titled("Hold-out verification, m/s", ["set", ""], e.models, caption=caption)
     for each in e.sets:
         found = {one.model: one for one in e.held_out if one.set_name == each.name}
         for kind in ("uncorrected", "corrected", "predicted"):
@@ -234,10 +223,7 @@ def _held_out_table(e: Evaluation) -> Table:
 
 
 def _time_table(e: Evaluation) -> Table:
-    from rich.table import Table
-
-    table = Table(title="Avg.VRMSE m/s against calibration time", title_justify="left")
-    set_columns(table, ["set", "first"], e.columns)
+    table = titled("Avg.VRMSE m/s against calibration time", ["set", "first"], e.columns)
     for each, rows in zip(e.sets, e.avg_vrmse_by_time.mean(axis=-1), strict=True):
         for window, row in zip(e.windows_s, rows, strict=True):
             name = each.name if window == e.windows_s[0] else ""
@@ -249,13 +235,10 @@ def _time_table(e: Evaluation) -> Table:
 def _each_table(e: Evaluation, study: EachStudy, title: str) -> Table:
     import math
 
-    from rich.table import Table
-
     from ..evaluation.protocol import MANOEUVRING
 
     caption = "?: the model says that it has not seen yaw, in most of the combinations"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["run", "heading spread"], e.columns)
+    table = titled(title, ["run", "heading spread"], e.columns, caption=caption)
     scores = study.avg_vrmse.mean(axis=-1)
     for run, row, observed in zip(study.runs, scores, study.yaw_observed, strict=True):
         marks = ["", *(" ?" if share < 0.5 else "" for share in observed)]
@@ -269,12 +252,9 @@ def _each_table(e: Evaluation, study: EachStudy, title: str) -> Table:
 
 
 def _coverage_table(coverage: Sequence[Coverage], title: str) -> Table:
-    from rich.table import Table
-
     caption = "per cent of errors within the 68 % / 95 % interval; error / σ: rms, 1 for an honest σ"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     states = ("φx", "φy", "φz", "δk", "δk y", "δk z")[: max((len(each.state_names) for each in coverage), default=3)]
-    set_columns(table, ["model"], (*states, "pooled", "error / σ", "errors"))
+    table = titled(title, ["model"], (*states, "pooled", "error / σ", "errors"), caption=caption)
     for each in coverage:
         pairs = [f"{100 * a:.0f} / {100 * b:.0f}" for a, b in zip(each.within_68, each.within_95, strict=True)]
         pairs += ["-"] * (len(states) - len(pairs))
@@ -284,12 +264,9 @@ def _coverage_table(coverage: Sequence[Coverage], title: str) -> Table:
 
 
 def _noise_table(study: ErrorsInVariables) -> Table:
-    from rich.table import Table
-
     caption = "predicted / measured, per cent; predicted by " + study.formula
     title = "Errors in variables: pull of the scale by noise in the reference"
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    set_columns(table, ["model", "noisy axes"], [f"{std:g} m/s" for std in study.gnss_std])
+    table = titled(title, ["model", "noisy axes"], [f"{std:g} m/s" for std in study.gnss_std], caption=caption)
     for name, axes, predicted, measured in zip(
         study.models, study.noisy_axes, study.predicted, study.measured, strict=True
     ):

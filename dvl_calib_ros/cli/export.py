@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
+from .tables import titled
 
 if TYPE_CHECKING:
     from ..export.simulator import Export
@@ -54,7 +55,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(exported: Export, arguments: argparse.Namespace) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     out = common.console()
     out.print(f"wrote {arguments.output}: {', '.join(exported.settings.found)}", soft_wrap=True, markup=False)
@@ -66,9 +66,7 @@ def _print(exported: Export, arguments: argparse.Namespace) -> None:
     if not exported.missing:
         out.print(f"{arguments.simulator} can represent everything that was found")
         return
-    table = Table(title=f"{arguments.simulator} cannot represent", title_justify="left")
-    for column in ("what", "error that stays, mm/s", "why"):
-        table.add_column(column)
+    table = titled(f"{arguments.simulator} cannot represent", ("what", "error that stays, mm/s", "why"))
     for each in exported.missing:
         error = "-" if each.error is None else f"{1e3 * each.error:.1f}"
         table.add_row(each.name, error, escape(each.says))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
+from .tables import titled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -156,11 +157,9 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _rich(table: Table) -> object:
     from rich.markup import escape
-    from rich.table import Table as RichTable
 
-    shown = RichTable(title=table.title, title_justify="left")
-    for number, column in enumerate(table.columns):
-        shown.add_column(escape(column), justify="left" if number == 0 else "right")
+    first, *others = map(escape, table.columns)
+    shown = titled(table.title, [first], others)
     for row in table.rows:
         shown.add_row(*map(escape, row))
     return shown

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from . import common
 from .reporting import report_writer
+from .tables import interval, intervals, titled
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -94,21 +95,12 @@ def _print(comparison: UnpairedComparison) -> None:
             out.print(f"to tell {effect.name}: {escape(effect.needs)}", soft_wrap=True)
 
 
-def _table(title: str, *columns: str) -> Table:
-    from rich.table import Table as RichTable
-
-    table = RichTable(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column)
-    return table
-
-
 def _effects(comparison: UnpairedComparison) -> Table:
-    table = _table("effects", "effect", "", "vehicle (95 %)", "simulator (95 %)", "adds mm/s", "mostly", "p")
+    table = titled("effects", ("effect", "", "vehicle (95 %)", "simulator (95 %)", "adds mm/s", "mostly", "p"))
     for each in comparison.effects:
         names = " or ".join((each.name, *each.equivalent_to))
         table.add_row(
-            names, each.status.words, _values(each.vehicle), _values(each.simulator),
+            names, each.status.words, intervals(each.vehicle), intervals(each.simulator),
             f"{1e3 * each.adds_mps:.1f}", str(each.lies or "-"), "-" if math.isnan(each.p) else f"{each.p:.1g}",
         )  # fmt: skip
     return table
@@ -116,7 +108,7 @@ def _effects(comparison: UnpairedComparison) -> Table:
 
 def _rungs(comparison: UnpairedComparison) -> Table:
     title = f"the simulator on the vehicle's own motion, held out; noise {1e3 * comparison.floor_mps:.1f} mm/s"
-    table = _table(title, "simulator", "error mm/s", "energy distance", "alike: below", "p")
+    table = titled(title, ("simulator", "error mm/s", "energy distance", "alike: below", "p"))
     for rung in comparison.rungs:
         table.add_row(
             rung.name, f"{1e3 * rung.error_mps:.1f}", f"{rung.distance:.2f}", f"{rung.null95:.2f}", f"{rung.p:.2g}"
@@ -125,26 +117,17 @@ def _rungs(comparison: UnpairedComparison) -> Table:
 
 
 def _noise(comparison: UnpairedComparison) -> Table:
-    table = _table("noise and stream", "property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p", "")
+    table = titled("noise and stream", ("property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p", ""))
     for each in comparison.noise:
         table.add_row(
-            each.name, each.status.words, _value(each.vehicle), _value(each.simulator), each.unit,
+            each.name, each.status.words, interval(each.vehicle), interval(each.simulator), each.unit,
             f"{each.p:.1g}", each.note,
         )  # fmt: skip
     return table
 
 
 def _levels(comparison: UnpairedComparison) -> Table:
-    table = _table("noise of the DVL by regime, mm/s over the axes", "when", "vehicle", "simulator")
+    table = titled("noise of the DVL by regime, mm/s over the axes", ("when", "vehicle", "simulator"))
     for name, (vehicle, simulator) in comparison.levels.items():
         table.add_row(name, f"{1e3 * vehicle:.1f}", f"{1e3 * simulator:.1f}")
     return table
-
-
-def _values(parameters: Mapping[str, tuple[float, float, float]]) -> str:
-    return ", ".join(f"{name} {_value(each)}" for name, each in parameters.items()) or "-"
-
-
-def _value(each: tuple[float, float, float]) -> str:
-    value, low, high = each
-    return f"{value:.3g} ({low:.3g} .. {high:.3g})"

@@ -12,7 +12,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import median_abs_deviation
 
 from ..calibration.frames import Array, skew
 from ..calibration.samples import VelocityFrame
@@ -143,8 +142,3 @@ def _refined(look: _Look, start: tuple[float, float, float], turned: bool, step:
         else:
             step *= 0.5
     return best
-
-
-def noise_scale(residual: Array) -> Array:
-    """(A,) robust standard deviation per axis of a residual (M, A)."""
-    return np.maximum(np.asarray(median_abs_deviation(residual, axis=0, scale="normal")), 1e-9)

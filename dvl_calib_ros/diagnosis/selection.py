@@ -69,14 +69,13 @@ class Selected:
 @dataclass(frozen=True)
 class Selection:
     """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
-    fitter; all columns (M, A, n), of calibration and effects, about the fit; guesses per recording.
+    fitter; guesses per recording.
     """
 
     selected: tuple[Selected, ...]
     base: Fit
     fit: Fit
     fitter: Fitter
-    all_columns: Array
     guesses: tuple[FirstGuess, ...]
 
     def withdrawn(self) -> Selection:
@@ -107,7 +106,7 @@ def select(
     """Select among testable effects."""
     problem, start, guesses = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
-    fitter, fit, columns = _about(fitter, fit, effects)
+    fitter, fit = _about(fitter, fit, effects)
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
@@ -118,16 +117,16 @@ def select(
         best = fitter.refined(_best(fits, effects), finer[3:])
         best = _called_for(fitter, best, len(effects))
         names = frozenset(effect.name for effect in best.effects)
-        fitter, fit, columns = _about(fitter, best, effects)
+        fitter, fit = _about(fitter, best, effects)
         if names in seen_before:
             break
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
-    fitter, fit, columns = _about(fitter, fit, effects)
+    fitter, fit = _about(fitter, fit, effects)
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
-    return Selection(ordered, base, fit, fitter, columns, guesses)
+    return Selection(ordered, base, fit, fitter, guesses)
 
 
 # ------------------------------------------------------------------ noise
@@ -146,8 +145,8 @@ def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
     return fitter, fit
 
 
-def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit, Array]:
-    """A fit once more with the noise that everything together leaves, and outliers about that; and all columns."""
+def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
+    """A fit once more with the noise that everything together leaves, and outliers about that."""
     problem = fitter.problem
     columns = np.concatenate(
         [fit.columns, *(v.columns for v in _variants(fitter, fit, effects) if v.tried == 1.0)], axis=2
@@ -165,7 +164,7 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
     n, p = columns.shape[0] * columns.shape[1], np.linalg.matrix_rank(columns.reshape(-1, columns.shape[2]))
     grown = float(np.sqrt(n / max(n - int(p), 1)))
     noise = replace(noise, axes=tuple(replace(arma, std=arma.std * grown) for arma in noise.axes))
-    return fitter, fitter.fit(fit.hypothesis, noise), columns
+    return fitter, fitter.fit(fit.hypothesis, noise)
 
 
 def _frames(problem: Problem) -> list[Array | None]:

@@ -81,34 +81,30 @@ def _a_decade(values: Array) -> tuple[float, float]:
 
 def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
     """The gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
-    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
-    height = 0.8 / len(gaps)
-    for i, ((name, values), (colour, _)) in enumerate(zip(gaps.items(), _lines(list(gaps)), strict=True)):
-        rows = np.arange(len(names)) + (i - 0.5 * (len(gaps) - 1)) * height
-        value, low, high = MM * values.T
-        axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
-        axes.hlines(rows, low, high, color=INK, linewidth=1.0)
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.5, -0.5)
-    axes.set_xlim(left=0.0)
-    axes.set_xlabel("gap beyond the noise, mm/s rms (95 %)")
-    axes.grid(False, axis="y")
-    legend_above(axes)
-    return figure
+    return _bars(names, gaps, "gap beyond the noise, mm/s rms (95 %)")
 
 
 def error_bars(names: Sequence[str], errors: Mapping[str, Array], noise: float) -> Figure:
-    """Error in each regime of motion (R,) m/s rms, by name, and the noise that is in all."""
+    """Error in each regime of motion (R, 1) m/s rms, by name, and the noise that is in all."""
+    return _bars(names, errors, "recorded − twin, mm/s rms", noise)
+
+
+def _bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
+    """Bars of each regime, by name (R, 1), with an interval (R, 3), m/s; noise: a line across all."""
     figure, axes = new_figure(height=1.2 + 0.36 * len(names))
-    height = 0.8 / len(errors)
-    for i, ((name, values), (colour, _)) in enumerate(zip(errors.items(), _lines(list(errors)), strict=True)):
-        rows = np.arange(len(names)) + (i - 0.5 * (len(errors) - 1)) * height
-        axes.barh(rows, MM * values, height=0.9 * height, color=colour, alpha=0.85, label=name)
-    axes.axvline(MM * noise, color=INK, linewidth=1.0, linestyle=":", label="noise")
+    height = 0.8 / len(groups)
+    for i, ((name, values), (colour, _)) in enumerate(zip(groups.items(), _lines(list(groups)), strict=True)):
+        rows = np.arange(len(names)) + (i - 0.5 * (len(groups) - 1)) * height
+        value, *interval = MM * values.T
+        axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
+        if interval:
+            axes.hlines(rows, *interval, color=INK, linewidth=1.0)
+    if noise is not None:
+        axes.axvline(MM * noise, color=INK, linewidth=1.0, linestyle=":", label="noise")
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("recorded − twin, mm/s rms")
+    axes.set_xlabel(label)
     axes.grid(False, axis="y")
     legend_above(axes)
     return figure

@@ -102,9 +102,9 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
         caption="On the line, it is distributed as the noise is; what is far off runs out of the picture.",
     )  # fmt: skip
     masks = {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}
-    errors = {name: np.array([rms(values[mask]) for mask in masks.values()]) for name, values in found.items()}
+    errors = {name: np.array([[rms(values[mask])] for mask in masks.values()]) for name, values in found.items()}
     alt = "; ".join(
-        f"{regime}: " + ", ".join(f"{name} {1e3 * errors[name][i]:.1f} mm/s" for name in errors)
+        f"{regime}: " + ", ".join(f"{name} {1e3 * errors[name][i, 0]:.1f} mm/s" for name in errors)
         for i, regime in enumerate(masks)
     )
     yield picture(
