@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import Array, skew
+from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, MountingEffect, Needs, ParameterSpec
 from ..effects.composition import Injection, late, traces, turns
@@ -290,7 +290,7 @@ class Problem:
         if stream.frame is not VelocityFrame.BODY:
             g = np.einsum("nji,nj->ni", rotation, g)
         raw, smooth, change = self._kept_at("dvl", recording, dvl, lambda: _measured(stream.dvl, dvl, by_dvl))
-        lever = np.zeros(3) if rates is None or not self.lever_arm.any() else np.cross(rates, self.lever_arm)
+        lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
         matrix = hypothesis.body_from_measured(nominal)
@@ -421,7 +421,7 @@ class Problem:
         motion = seen.motion
         turning = np.zeros_like(motion.velocity_body)
         if motion.angular_velocity is not None and motion.reference_frame is not VelocityFrame.BODY:
-            turning = np.cross(motion.angular_velocity, motion.velocity_body)
+            turning = cross(motion.angular_velocity, motion.velocity_body)
         if clock is ActsOn.ATTITUDE_CLOCK:
             return turning
         gradient = np.gradient(motion.velocity_body, motion.time, axis=0)

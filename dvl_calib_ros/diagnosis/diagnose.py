@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import norm
 
+from ..calibration.distributions import normal_isf
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
@@ -213,7 +213,7 @@ def _minimum_detectable(selection: Selection, effect: Effect, n_tested: int) -> 
     prior = np.concatenate(std)
     system = WhitenedLeastSquares.of(white, np.zeros(len(white)), prior, np.zeros(len(prior)))
     own = np.sqrt(np.maximum(np.diag(system.covariance()), 0.0))[at:]
-    factor = float(norm.isf(SETTINGS.level / n_tested / 2.0) + norm.ppf(POWER))
+    factor = float(normal_isf(SETTINGS.level / n_tested / 2.0) + normal_isf(1.0 - POWER))
     return {spec.name: factor * float(each) for spec, each in zip(amplitudes(effect), own, strict=False)}
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..calibration.frames import Array
 from .composed import Grid, Problem, Seen
+from .recursion import recursion
 
 TIME_KNOTS = 7
 SPEED_KNOTS = 7
@@ -79,10 +80,7 @@ def faded(time: Array, values: Array, seconds: float) -> Array:
     """(N,) what values (N,) were, fading with a time constant."""
     steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
     decay = np.exp(-steps / seconds)
-    out = np.zeros_like(values)
-    for i in range(1, len(values)):
-        out[i] = decay[i] * out[i - 1] + (1.0 - decay[i]) * values[i]
-    return out
+    return recursion(decay, (1.0 - decay) * values)
 
 
 def _side_of_last_turn(turn_rate: Array) -> Array:

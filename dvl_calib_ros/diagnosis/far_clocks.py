@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import medfilt
 
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
@@ -81,7 +80,8 @@ def _steps(curve: Curve) -> Array:
 def _speed(curve: Curve) -> Series:
     """(N,) horizontal speed, m/s, every STEP_S from the curve's first sample on."""
     values = curve(_steps(curve))
-    return np.asarray(medfilt(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS), dtype=complex)
+    around = np.pad(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS // 2)
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(around, SPIKE_STEPS), axis=1), dtype=complex)
 
 
 def lag(

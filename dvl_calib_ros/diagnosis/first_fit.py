@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import Array, skew
+from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
 from ..effects.base import Needs
 from .composed import Offsets, Problem, make_problem
@@ -75,7 +75,7 @@ class _Look:
         if recording.frame is not VelocityFrame.BODY and rotation is not None:
             g = np.einsum("nji,nj->ni", rotation, g)
         nominal = problem.rotation_dvl_from_body
-        lever = np.zeros((len(at), 3)) if rates is None else np.cross(rates, problem.lever_arm)
+        lever = np.zeros((len(at), 3)) if rates is None else cross(rates, problem.lever_arm)
         target = g + lever - velocity @ nominal
         columns = np.zeros((len(at), 3, 15))
         for axis in range(3):

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from ..calibration.distributions import chi2_isf
 from ..calibration.frames import Array
 from ..effects.base import Effect
 from .composed import Hypothesis, Problem, Seen, Values, amplitudes, is_time_of_run, whose_parameters
@@ -275,7 +275,7 @@ class Fitter:
                     for index, each in enumerate(fit.values[effect.name])
                 )
                 moved = replace(fit.hypothesis, values={**fit.values, effect.name: per})
-                if self.fit(moved, fit.noise, 2).deviance > fit.deviance + chi2.isf(0.05, 1):
+                if self.fit(moved, fit.noise, 2).deviance > fit.deviance + chi2_isf(0.05, 1):
                     as_good.append(at)  # the first that is worse bounds those that are as good
                     break
                 as_good.append(at)

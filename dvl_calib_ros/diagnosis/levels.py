@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from ..calibration.distributions import chi2_sf
 from ..calibration.frames import Array
 from ..effects.base import Needs
 from .composed import Problem, Seen
@@ -48,9 +48,9 @@ def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Lev
     covariance = (inverse @ (left.T @ left) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
     slopes = parameters[1:]
     wald = float(slopes @ np.linalg.solve(covariance, slopes))
-    p_of = chi2.sf(slopes**2 / np.diag(covariance), 1)
+    p_of = chi2_sf(slopes**2 / np.diag(covariance), 1)
     level = np.exp(np.clip(0.5 * x[:, 1:] @ slopes, -2.0, 2.0))
-    return Level(tuple(found), 0.5 * slopes, float(chi2.sf(wald, len(slopes))), p_of, level)
+    return Level(tuple(found), 0.5 * slopes, float(chi2_sf(wald, len(slopes))), p_of, level)
 
 
 def estimated(problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None) -> tuple[Noise, Array]:

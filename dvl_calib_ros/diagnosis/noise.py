@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
-from scipy.stats import median_abs_deviation
+from numpy.typing import NDArray
 
+from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
+from .recursion import recursion
 
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)
 HUBER = 2.5
@@ -23,6 +24,7 @@ LONGEST_S = 15.0
 ORDERS = ((0, 0), (1, 0), (1, 1))
 # of a periodogram, after averaging neighbours
 MAX_FREQUENCIES = 300
+Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -34,20 +36,38 @@ class Arma:
     std: float
     ratio: float
 
-    def innovations(self, series: Array) -> Array:
-        """Innovations (M, ...) over std, of series (M, ...) that begins after a gap."""
+    def innovations(self, series: Array, starts: Integers) -> Array:
+        """Innovations (M, ...) over std, of series (M, ...) of which a new one, after a gap, begins at every start."""
         if not len(self.ar) and not self.ma:
             return series / self.std
-        numerator = np.concatenate([[1.0], -self.ar])
-        white = lfilter(numerator, [1.0, self.ma], series, axis=0) / self.std
-        white[0] /= self.ratio  # nothing is known before the first, so it is as uncertain as the noise itself
-        return np.asarray(white)
+        known = self._after(series, starts, -self.ar[0] if len(self.ar) else 0.0)
+        white: Array = self._recursion(known, starts, -self.ma) / self.std
+        white[starts] /= self.ratio  # nothing is known before the first, so it is as uncertain as the noise itself
+        return white
 
-    def series(self, innovations: Array) -> Array:
+    def series(self, innovations: Array, starts: Integers) -> Array:
         """Inverse of `innovations`."""
         white = innovations * self.std
-        white[0] *= self.ratio
-        return np.asarray(lfilter([1.0, self.ma], np.concatenate([[1.0], -self.ar]), white, axis=0))
+        white[starts] *= self.ratio
+        return self._recursion(self._after(white, starts, self.ma), starts, self.ar[0] if len(self.ar) else 0.0)
+
+    @staticmethod
+    def _after(series: Array, starts: Integers, share: float) -> Array:
+        """The series and a share of the sample before, but at starts."""
+        after = series.copy()
+        if share:
+            after[1:] += share * series[:-1]
+            after[starts] = series[starts]
+        return after
+
+    @staticmethod
+    def _recursion(added: Array, starts: Integers, share: float) -> Array:
+        """x_n = share x_(n-1) + added_n, beginning anew at starts."""
+        if not share:
+            return added
+        decay = np.full(len(added), share)
+        decay[starts] = 0.0
+        return recursion(decay, added)
 
 
 @dataclass(frozen=True)
@@ -69,20 +89,22 @@ class Noise:
         """Values (M, A, ...) as white noise of unit variance would be, flattened to (M A, ...)."""
         scaled = self._scaled(values)
         white = np.empty_like(scaled)
-        for part in self.segments:
-            for axis, arma in enumerate(self.axes):
-                white[part, axis] = arma.innovations(scaled[part, axis])
+        for axis, arma in enumerate(self.axes):
+            white[:, axis] = arma.innovations(scaled[:, axis], self._starts)
         return white.reshape(-1, *values.shape[2:])
 
     def unwhiten(self, white: Array) -> Array:
         """Inverse of `whiten` for one series: (M A,) -> (M, A)."""
         innovations = white.reshape(self.level.shape)
         scaled = np.empty_like(innovations)
-        for part in self.segments:
-            for axis, arma in enumerate(self.axes):
-                scaled[part, axis] = arma.series(innovations[part, axis].copy())
+        for axis, arma in enumerate(self.axes):
+            scaled[:, axis] = arma.series(innovations[:, axis], self._starts)
         values = scaled * self.level
         return values if self.rotation is None else np.einsum("mji,mj->mi", self.rotation, values)
+
+    @property
+    def _starts(self) -> Integers:
+        return _starts_of(self.segments)
 
     def _scaled(self, values: Array) -> Array:
         if self.rotation is not None:
@@ -128,7 +150,7 @@ class Noise:
         Pseudo-values ψ(r) / E[ψ'] of the innovations r about zero; so it must be the residual of a good fit.
         """
         white = self.whiten(residual).reshape(residual.shape)
-        scale = median_abs_deviation(white, axis=0, scale="normal")
+        scale = robust_std(white)
         pseudo = np.clip(white, -HUBER * scale, HUBER * scale)
         pseudo /= np.mean(np.abs(white) < HUBER * scale, axis=0)
         return self.unwhiten(pseudo.ravel())
@@ -150,9 +172,14 @@ def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:
 def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:
     """White noise with the standard deviation per axis that a residual (M, A) has, robustly. interval: s."""
     scaled = residual if rotation is None else np.einsum("mij,mj->mi", rotation, residual)
-    stds = np.maximum(median_abs_deviation(scaled, axis=0, scale="normal"), 1e-9)
+    stds = np.maximum(robust_std(scaled), 1e-9)
     axes = tuple(Arma(np.zeros(0), 0.0, float(std), 1.0) for std in stds)
     return Noise(segments, rotation, np.ones_like(residual), axes, float(np.exp(-interval / LONGEST_S)))
+
+
+def _starts_of(segments: Sequence[slice]) -> Integers:
+    """Where those begin that are not empty."""
+    return np.array([part.start for part in segments if part.stop > part.start], dtype=np.intp)
 
 
 def _fit_arma(series: Array, segments: Sequence[slice], memory: float, orders: Sequence[tuple[int, int]]) -> Arma:
@@ -168,8 +195,9 @@ def _fit_arma(series: Array, segments: Sequence[slice], memory: float, orders: S
         best = min(best, (deviance + (p + q) * np.log(n), ar, ma))
     _, ar, ma = best
     coefficients = np.array([ar]) if ar else np.zeros(0)
-    std = float(np.sqrt(np.mean(_innovations(series, segments, coefficients, ma) ** 2)))
-    return Arma(coefficients, ma, max(std, 1e-12), _ratio(coefficients, ma))
+    arma = Arma(coefficients, ma, 1.0, _ratio(coefficients, ma))
+    std = float(np.sqrt(np.mean(arma.innovations(series, _starts_of(segments)) ** 2)))
+    return replace(arma, std=max(std, 1e-12))
 
 
 def _periodogram(series: Array) -> tuple[Array, Array]:
@@ -186,36 +214,25 @@ def _periodogram(series: Array) -> tuple[Array, Array]:
 def _searched(frequency: Array, power: Array, n: int, memory: float, p: int, q: int) -> tuple[float, float, float]:
     """Deviance, ar and ma of the best ARMA(p, q), on a grid made finer about its best point."""
     power, counts = power
+    power, wave = power * counts / counts.sum(), np.cos(frequency)
+    moments = np.column_stack([power, power * wave])
     bound = float(np.arctanh(memory))
     centre, reach = np.zeros(2), np.array([bound if p else 0.0, 2.5 if q else 0.0])
     best = (np.inf, 0.0, 0.0)
-    wave = np.cos(frequency)
-    for _ in range(5):
+    for _ in range(5 if p or q else 1):
         axes = [np.unique(np.clip(np.linspace(c - r, c + r, 15), -b, b)) if r else np.zeros(1)
                 for c, r, b in zip(centre, reach, (bound, 2.5), strict=True)]  # fmt: skip
-        ars, mas = np.tanh(axes[0])[:, None], np.tanh(axes[1])[:, None]
-        numerator = 1.0 + mas**2 + 2.0 * mas * wave
-        denominator = 1.0 + ars**2 - 2.0 * ars * wave
-        mean = (1.0 / numerator) @ (power * counts * denominator).T / counts.sum()
-        deviance = n * np.log(np.maximum(mean, 1e-300)).ravel()
-        ar, ma = (each.ravel() for each in np.meshgrid(ars, mas))
+        ars, mas = np.tanh(axes[0])[None, :], np.tanh(axes[1])[:, None]
+        # the mean of power over spectrum, with |1 - ar e^iω|² = 1 + ar² - 2 ar cos ω and the like of ma
+        even, odd = ((1.0 / (1.0 + mas**2 + 2.0 * mas * wave)) @ moments).T[:, :, None]
+        mean = (1.0 + ars**2) * even - 2.0 * ars * odd
         # no noise is quieter at low frequencies than at high ones: where it looks so, a fit has taken them in
-        deviance = np.where(ar + ma >= -1e-12, deviance, np.inf)
-        at = int(np.argmin(deviance))
-        best = min(best, (float(deviance[at]), float(ar[at]), float(ma[at])))
+        deviance = np.where(ars + mas >= -1e-12, n * np.log(np.maximum(mean, 1e-300)), np.inf)
+        row, column = divmod(int(np.argmin(deviance)), ars.size)
+        best = min(best, (float(deviance[row, column]), float(ars[0, column]), float(mas[row, 0])))
         centre = np.arctanh(np.clip(best[1:], -0.9999, 0.9999))
         reach = reach / 4.0
     return best
-
-
-def _innovations(series: Array, segments: Sequence[slice], ar: Array, ma: float) -> Array:
-    numerator, denominator = np.concatenate([[1.0], -ar]), [1.0, ma]
-    ratio = _ratio(ar, ma)
-    out = np.empty_like(series)
-    for part in segments:
-        out[part] = lfilter(numerator, denominator, series[part])
-        out[part.start] /= ratio
-    return out
 
 
 def _ratio(ar: Array, ma: float) -> float:

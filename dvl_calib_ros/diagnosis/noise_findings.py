@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binomtest, chi2, median_abs_deviation, norm
 
+from ..calibration.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf, robust_std
 from ..calibration.frames import Array
 from .closure import claimed_std, high_frequency_variance
 from .composed import Problem
@@ -55,7 +55,7 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
 
 
 def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
-    scale = median_abs_deviation(innovations, axis=0, scale="normal")
+    scale = robust_std(innovations)
     far = (np.abs(innovations) > OUTLIER_SIGMA * scale).any(axis=1)
     count, n = int(np.count_nonzero(far)), len(innovations)
     spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
@@ -63,9 +63,8 @@ def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
         count, n = spikes, received
     if count < 3:
         return None
-    test = binomtest(count, n, 6.0 * norm.sf(OUTLIER_SIGMA), "greater")
-    interval = binomtest(count, n).proportion_ci()
-    return NoiseFinding("outliers", {"share": (count / n, interval.low, interval.high)}, float(test.pvalue))
+    p = binomial_sf(count, n, 6.0 * float(normal_sf(OUTLIER_SIGMA)))
+    return NoiseFinding("outliers", {"share": (count / n, *binomial_interval(count, n))}, p)
 
 
 def _stale(problem: Problem) -> NoiseFinding | None:
@@ -73,9 +72,8 @@ def _stale(problem: Problem) -> NoiseFinding | None:
     n = sum(recording.received for recording in problem.recordings)
     if count < 3:
         return None
-    test = binomtest(count, n, CHANCE_OF_REPEAT, "greater")
-    interval = binomtest(count, n).proportion_ci()
-    return NoiseFinding("stale_samples", {"share": (count / n, interval.low, interval.high)}, float(test.pvalue))
+    p = binomial_sf(count, n, CHANCE_OF_REPEAT)
+    return NoiseFinding("stale_samples", {"share": (count / n, *binomial_interval(count, n))}, p)
 
 
 def _coloured(noise: Noise, residual: Array, problem: Problem) -> NoiseFinding | None:
@@ -90,7 +88,7 @@ def _coloured(noise: Noise, residual: Array, problem: Problem) -> NoiseFinding |
         return None  # neighbours share samples of the reference by interpolation
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
     parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
-    return NoiseFinding("coloured_reference_noise", parameters, float(chi2.sf(max(drop, 0.0), dof)))
+    return NoiseFinding("coloured_reference_noise", parameters, float(chi2_sf(max(drop, 0.0), dof)))
 
 
 def _time_constant(arma: Arma, interval: float) -> float:
@@ -108,13 +106,13 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
         ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in claimed])))
         error = 0.5 * error
         if ratio > INFLATION:
-            p = float(2.0 * norm.sf(np.log(ratio) / error))
+            p = float(2.0 * normal_sf(np.log(ratio) / error))
             low, high = float(ratio * np.exp(-1.96 * error)), float(ratio * np.exp(1.96 * error))
             found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
     level = fit_level(problem, fit.seen, innovations * fit.noise.level)
     if level is not None and level.p < SIGNIFICANT:
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}
-        z = norm.isf(np.maximum(level.p_of, 1e-300) / 2.0)
+        z = normal_isf(np.maximum(level.p_of, 1e-300) / 2.0)
         parameters = {
             units[name]: (
                 float(slope),

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dst, idst
 from scipy.interpolate import make_interp_spline
-from scipy.signal import savgol_filter
-from scipy.stats import median_abs_deviation
 
 from ..bags.reader import BagReader
 from ..calibration.clocks import Clocks
+from ..calibration.distributions import robust_std
 from ..calibration.findings import Finding
-from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
+from ..calibration.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ..calibration.parameters import Parameters
 from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ..calibration.screening import SMALLEST_VARIANCE
@@ -103,7 +102,7 @@ class Curve:
         """The same for regressors: `quiet`, or of a slow stream each sample on the cubic through those around it."""
         if self.interval <= FAST_ENOUGH_S or len(self.time) <= SMOOTH_SAMPLES:
             return self.quiet
-        return Curve(self.time, savgol_filter(self.values, SMOOTH_SAMPLES, 3, axis=0))
+        return Curve(self.time, _on_cubics(self.values))
 
     @cached_property
     def stretches(self) -> list[slice]:
@@ -128,7 +127,7 @@ class Curve:
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
         differences = np.diff(self.values, 4, axis=0)
-        return np.asarray(median_abs_deviation(differences, axis=0, scale="normal") / np.sqrt(70.0))
+        return robust_std(differences) / np.sqrt(70.0)
 
     def without_spikes(self) -> Curve:
         """The same without samples far from where their neighbours are, which would bend the curve about them.
@@ -142,7 +141,7 @@ class Curve:
                 return curve
             off = np.zeros_like(x)
             off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
-            scale = np.maximum(np.asarray(median_abs_deviation(off, axis=0, scale="normal")), 1e-9)
+            scale = np.maximum(robust_std(off), 1e-9)
             far = (np.abs(off) / scale).max(axis=1)
             beside = np.maximum(np.append(far[1:], 0.0), np.append(0.0, far[:-1]))
             kept = (far < SPIKE) | (far < beside)  # what a spike does to its neighbours is not theirs
@@ -185,6 +184,17 @@ class Curve:
         time = np.add.reduceat(self.time, starts) / counts
         claimed = None if self.claimed is None else self.claimed / np.sqrt(every)
         return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed)
+
+
+def _on_cubics(values: Array) -> Array:
+    """Each of values (N, k), evenly spaced, on the cubic through SMOOTH_SAMPLES about it (Savitzky and Golay)."""
+    half = SMOOTH_SAMPLES // 2
+    powers = np.vander(np.arange(-half, half + 1.0), 4)
+    fitted = powers @ np.linalg.pinv(powers)  # (5, 5) values on the cubic of values
+    around = np.lib.stride_tricks.sliding_window_view(values, SMOOTH_SAMPLES, axis=0)
+    return np.concatenate(
+        [fitted[:half] @ values[:SMOOTH_SAMPLES], around @ fitted[half], fitted[half + 1 :] @ values[-SMOOTH_SAMPLES:]]
+    )
 
 
 def _sines(values: Array) -> tuple[Array, Array]:
@@ -261,7 +271,7 @@ class Recording:
         q, dq = attitude(at), attitude.derivative(np.clip(at, attitude.time[0], attitude.time[-1]))
         square = (q * q).sum(axis=1)[:, None]
         # vector part of 2 q* dq/dt, with q = (x, y, z, w)
-        xyz = q[:, 3:] * dq[:, :3] - dq[:, 3:] * q[:, :3] - np.cross(q[:, :3], dq[:, :3])
+        xyz = q[:, 3:] * dq[:, :3] - dq[:, 3:] * q[:, :3] - cross(q[:, :3], dq[:, :3])
         return np.asarray(2.0 * xyz / square)
 
 

@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
+from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..effects.base import Effect
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
@@ -260,7 +259,7 @@ def _std(effect: Effect, p: int, n_recordings: int) -> Array:
 def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
     """Deviance that an effect explains by chance, once in 1 / level data sets, having looked at all of them."""
     dof = n_amplitudes(effect, n_recordings)
-    return float(chi2.isf(SETTINGS.level / n_effects / tried, dof))
+    return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
 
 
 def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
@@ -411,7 +410,7 @@ def _without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
 
 def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
     """log p of a drop in deviance, times how many alternatives were tried."""
-    return min(0.0, float(chi2.logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
+    return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 
 def _log_p(fit: Fit, rest: Fit, effect: Effect) -> float:
@@ -461,7 +460,7 @@ def _robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp]) -> float:
     covariance = fit.covariance(block)[np.ix_(at, at)]
     wald = float(values @ np.linalg.solve(covariance, values)) / len(at)
     blocks = int(block.max()) + 1
-    return float(f_distribution.sf(wald, len(at), max(blocks - len(at), 2)))
+    return float(f_sf(wald, len(at), max(blocks - len(at), 2)))
 
 
 def blocks_of(problem: Problem) -> NDArray[np.intp]:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from ..calibration.distributions import chi2_isf, chi2_logsf
 from ..calibration.frames import Array
 from .composed import Problem, Seen
 from .dictionary import ALTERNATIVES, dictionary
@@ -103,7 +103,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     clear_energy = explained(_orthonormal(noise.whiten(fit.columns)), noise.whiten(best[2]), white, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(best[1], 1.0)
-    cost = float(chi2.isf(LEVEL / np.exp(looked_at), best[2].shape[2]))
+    cost = float(chi2_isf(LEVEL / np.exp(looked_at), best[2].shape[2]))
     found = Unexplained(min(log_p, 0.0), energy, best[1], columns, best[2], clear_energy, cost)
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
@@ -126,7 +126,7 @@ class Look:
 
     def log_p(self, grown: float = 1.0) -> float:
         """Of the energy, which by chance is larger by a factor."""
-        return float(chi2.logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
+        return float(chi2_logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
 
 
 def _looked(
@@ -200,7 +200,7 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
         inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
         if not inside.any():
             continue
-        log_p = np.vstack([chi2.logsf(power, 2), chi2.logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, inside]
+        log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, inside]
         best = int(np.argmin(log_p.min(axis=0)))
         period = 1.0 / float(frequency[inside][best])
         phase = 2.0 * np.pi * problem.time / period
@@ -300,7 +300,7 @@ def explained(q: Array, white_columns: Array, white: Array, variance: float) -> 
     """log p of what columns explain of a whitened series, and their energy beyond chance."""
     energy, dof = _energy(q, white_columns, white)
     energy /= variance
-    return (float(chi2.logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
+    return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
 
 
 def _energy(q: Array, white_columns: Array, white: Array) -> tuple[float, int]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.frames import Array, cross
 from .base import ActsOn, Effect, EffectInput, Needs, ParameterSpec, along_axes, vector
 
 
@@ -23,7 +23,7 @@ class LeverArm(Effect):
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """ω × l."""
-        return np.cross(motion.turn_rate, vector(values, "m"))
+        return cross(motion.turn_rate, vector(values, "m"))
 
 
 class Sideslip(Effect):

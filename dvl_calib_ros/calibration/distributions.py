@@ -1,0 +1,69 @@
+"""Tails and quantiles of the usual distributions, and a robust spread, on `scipy.special` alone.
+
+`scipy.stats` says the same, but importing it takes longer (half a second of CPU) than most of what it is asked here: so
+no module that a command needs for its everyday answer imports it, nor `scipy.signal`, which imports it (a test says
+which may).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import bdtrc, betaincinv, chdtr, chdtrc, chdtri, fdtrc, gammaincinv, ndtr, ndtri
+
+from .frames import Array
+
+# Median of a normal variable's distance from its median, in standard deviations
+_MEDIAN_DISTANCE = float(ndtri(0.75))
+
+
+def chi2_sf(x: ArrayLike, dof: ArrayLike) -> Array:
+    """P(X > x) of chi-square."""
+    return np.asarray(chdtrc(dof, x))
+
+
+def chi2_isf(p: float, dof: ArrayLike) -> Array:
+    """x that chi-square exceeds with probability p."""
+    return np.asarray(chdtri(dof, p))
+
+
+def chi2_logsf(x: ArrayLike, dof: ArrayLike) -> Array:
+    """log P(X > x) of chi-square; -inf where the probability is no number any more."""
+    x = np.asarray(x, dtype=float)
+    median = 2.0 * gammaincinv(0.5 * np.asarray(dof), 0.5)
+    with np.errstate(divide="ignore"):  # each where it is exact
+        return np.where(x > median, np.log(chdtrc(dof, x)), np.log1p(-chdtr(dof, x)))
+
+
+def f_sf(x: ArrayLike, dof: ArrayLike, dof_of_denominator: ArrayLike) -> Array:
+    """P(X > x) of Fisher's F."""
+    return np.asarray(fdtrc(dof, dof_of_denominator, x))
+
+
+def normal_sf(x: ArrayLike) -> Array:
+    """P(X > x) of a standard normal variable."""
+    return np.asarray(ndtr(-np.asarray(x, dtype=float)))
+
+
+def normal_isf(p: ArrayLike) -> Array:
+    """x that a standard normal variable exceeds with probability p."""
+    return np.asarray(-ndtri(p))
+
+
+def binomial_sf(count: int, n: int, p: float) -> float:
+    """P(X >= count) of n trials that succeed with probability p each."""
+    return 1.0 if count <= 0 else float(bdtrc(count - 1, n, p))
+
+
+def binomial_interval(count: int, n: int) -> tuple[float, float]:
+    """Clopper and Pearson's 95 per cent interval of the probability of success, of `count` in n trials."""
+    low = 0.0 if count == 0 else float(betaincinv(count, n - count + 1, 0.025))
+    high = 1.0 if count == n else float(betaincinv(count + 1, n - count, 0.975))
+    return low, high
+
+
+def robust_std(values: Array) -> Array:
+    """(...) standard deviation of normal values (N, ...), by the median distance from the median; nan of none."""
+    if not len(values):
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(np.median(np.abs(values - np.median(values, axis=0)), axis=0) / _MEDIAN_DISTANCE)

@@ -1,0 +1,21 @@
+"""First-order recursions along time, of any decay from sample to sample."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dtbtrs
+
+from ..calibration.frames import Array
+
+
+def recursion(decay: Array, added: Array) -> Array:
+    """x (N, ...) with x_n = decay_n x_(n-1) + added_n, from x_0 = added_0 on.
+
+    decay: (N,), of which the first says nothing. added: (N, ...). It is a triangular system of two bands.
+    """
+    if not added.size:
+        return added.copy()
+    bands = np.ones((2, len(added)))
+    bands[1, :-1] = -decay[1:]
+    solved, _ = dtbtrs(bands, added.reshape(len(added), -1), uplo="L", diag="U")
+    return np.ascontiguousarray(solved).reshape(added.shape)
