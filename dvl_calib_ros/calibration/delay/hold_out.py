@@ -102,11 +102,13 @@ class Compared(NamedTuple):
     """N DVL samples beside the reference.
 
     error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
-    does not measure. body (N, 3): the reference velocity. rotation_enu_from_body (N, 3, 3), oriented (N,): whether that
-    is known. variance (N, 3): of the reference. acceleration (N, 3): of the reference, body. rates (N, 3): rad/s.
+    does not measure. measured (N, 3, 3): onto what it does measure, body. body (N, 3): the reference velocity.
+    rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. variance (N,): of the reference, over the
+    axes that it measures. acceleration (N, 3): of the reference, body. rates (N, 3): rad/s.
     """
 
     error: Array
+    measured: Array
     body: Array
     rotation_enu_from_body: Array
     oriented: Mask
@@ -139,14 +141,12 @@ class Recording(NamedTuple):
         n, v = len(at), self.dvl.velocity[at]
         seen = self.compared(at, Terms.of_state(state), p)
         t = p.rotation_dvl_from_body
-        measured = seen.variance < MEASURED_BELOW
         jacobian = np.zeros((n, 3, len(state)))
         jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
         jacobian[:, :, LEVER_ARM] = skew(seen.rates)
         jacobian[:, :, DELAY] = -seen.acceleration
-        jacobian[~measured] = 0.0
-        noise = np.where(measured, seen.variance + self.noise_dvl[at, None] / 3.0, 0.0).sum(axis=1)
-        return _Errors(seen.error, jacobian, noise)
+        share = np.trace(seen.measured, axis1=1, axis2=2) / 3.0
+        return _Errors(seen.error, seen.measured @ jacobian, seen.variance + self.noise_dvl[at] * share)
 
     def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
         """Some DVL samples beside the reference, corrected, interpolated as pairing does."""
@@ -168,13 +168,16 @@ class Recording(NamedTuple):
         error = body + (np.cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
         found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
         found &= (v**2).sum(axis=1) >= p.min_speed**2
-        body_noise = body_from_reference @ self.reference.noise[after] @ body_from_reference.swapaxes(1, 2)
-        variance = np.diagonal(body_noise, axis1=1, axis2=2)
-        measured = variance < MEASURED_BELOW
-        error[~measured] = 0.0
+        # axes are left out in the reference's own frame: tilted by 2°, a vertical that is not measured would still
+        # reach the horizontal of the body
+        variance = np.diagonal(self.reference.noise, axis1=1, axis2=2)
+        axes = (np.maximum(variance[after], variance[after - 1]) < MEASURED_BELOW).astype(float)
+        measured = (body_from_reference * axes[:, None]) @ body_from_reference.swapaxes(1, 2)
+        error = np.matmul(measured, error[..., None])[..., 0]
         error[~found] = np.nan
         acceleration = np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
-        return Compared(error, body, rotation, oriented, variance, acceleration, rates)
+        total = (variance[after] * axes).sum(axis=1)
+        return Compared(error, measured, body, rotation, oriented, total, acceleration, rates)
 
 
 def thinned(stamps_ns: Stamps) -> Index:

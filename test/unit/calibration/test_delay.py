@@ -210,6 +210,33 @@ def test_held_out_samples_are_judged_where_and_when_the_dvl_was():
     assert verification.verdict.value == "accept"
 
 
+@pytest.mark.parametrize("vertical", [lambda i: 0.0, lambda i: 5.0 * np.sin(i)], ids=["zero", "anything"])
+def test_an_axis_that_the_reference_does_not_measure_is_not_judged_however_the_vehicle_tilts(vertical):
+    """A vertical of 1e6 (m/s)² tilted by 2° is 1e3 (m/s)² of the body's horizontal, which was predicted as an error."""
+    in_full = judged([s._replace(covariance=GNSS_STD**2 * np.eye(3)) if is_reference(s) else s for s in late(-1.4)])
+    level = judged(
+        [
+            s._replace(velocity=(*s.velocity[:2], vertical(i)), covariance=np.diag([GNSS_STD**2, GNSS_STD**2, 1e6]))
+            if is_reference(s)
+            else s
+            for i, s in enumerate(late(-1.4))
+        ]
+    )
+    assert in_full.verdict.value == level.verdict.value == "accept"
+    assert level.held_out.samples == in_full.held_out.samples
+    two_axes_of_three = np.sqrt(2.0 / 3.0)
+    assert level.held_out.corrected == pytest.approx(two_axes_of_three * in_full.held_out.corrected, rel=0.05)
+    assert level.held_out.predicted == pytest.approx(two_axes_of_three * in_full.held_out.predicted, rel=0.05)
+
+
+def is_reference(sample):
+    return isinstance(sample, ReferenceSample)
+
+
+def judged(samples):
+    return calibrate(samples, Parameters(gnss_free_std=DVL_STD), verified=True).verification("G2")
+
+
 def test_the_model_is_one_entry_of_the_table_that_extends_another():
     model = MODELS["G2"]
     base = MODELS[model.extends]
