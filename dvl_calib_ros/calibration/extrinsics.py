@@ -2,6 +2,9 @@
 
 A model's angles are relative to the mounting that it was given, and its states are its own. What two calibrations can
 be compared in is the whole: the corrected mounting in the body, the lever arm, the scale of motion ahead and the delay.
+A calibration is right for its own day. What is constant on that day and another on the next, the error of the heading
+reference (in yaw, one to one) and the speed of sound (in scale), no scatter within a recording shows: it is in the
+covariance here, by `day_std_heading` and `day_std_scale`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -49,8 +52,8 @@ class Extrinsics:
     time_offset
         By how much the DVL's stamps are late, s: found, else as the parameters said.
     covariance
-        (8, 8) of `COMPONENTS`: a turn of the mounting about the body's axes (rad), lever arm, scale and delay; zero
-        where `shown` is not.
+        (8, 8) of `COMPONENTS` as of another day: a turn of the mounting about the body's axes (rad), lever arm, scale
+        and delay; zero where `shown` is not.
     shown
         (8,) which of them the data showed.
     used
@@ -103,6 +106,8 @@ def extrinsics_of(
     covariance = jacobian @ state.p @ jacobian.T
     std = np.sqrt(np.diag(covariance))
     shown = jacobian.any(axis=1) & (std <= OBSERVED_SHARE * _unknown(parameters))
+    covariance[TURN, TURN][2, 2] += parameters.day_std_heading**2
+    covariance[SCALE, SCALE] += parameters.day_std_scale**2
     covariance[~shown] = 0.0
     covariance[:, ~shown] = 0.0
     rotation, rest = found

@@ -61,7 +61,9 @@ class Observations:
     heave, body frame. noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body:
     (N, 3, 3), and angular_velocity: (N, 3) rad/s in the body frame, None where the block has no attitude. interval:
     (N,) s since the DVL sample before. unmeasured: axes of the reference that hold what the DVL measures, by the
-    nominal mounting, for want of a measurement; None if it measures all.
+    nominal mounting, for want of a measurement; None if it measures all. earth_in_body: (N, 3, 2) east and north as
+    columns in the body frame where the reference is in an earth frame, along which it may be wrong constantly; zeros
+    where it is in the body frame; None if all are.
 
     What several models derive from these is computed once.
     """
@@ -77,6 +79,7 @@ class Observations:
     interval: Array | None = None
     assumptions: Assumptions = ASSUMPTIONS
     unmeasured: Unmeasured | None = None
+    earth_in_body: Array | None = None
 
     @cached_property
     def reference(self) -> Reference:

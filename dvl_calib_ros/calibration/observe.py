@@ -45,7 +45,7 @@ class Observer:
                 interval,
                 assumptions=self._assumptions,
             )
-        rotation = _rotation_body_from_reference(block)
+        rotation, earth = _reference_in_body(block)
         reference = block.reference[:, :3]
         unmeasured = None
         if block.unmeasured.any():
@@ -64,6 +64,7 @@ class Observer:
             interval=interval,
             assumptions=self._assumptions,
             unmeasured=unmeasured,
+            earth_in_body=earth,
         )
 
     def _paired_noise(self, block: AlignedBlock, rotation_body_from_reference: Array | None) -> Array:
@@ -79,13 +80,15 @@ class Observer:
         return noise if given.all() else np.where(given[:, None, None], noise, self._aided_noise)
 
 
-def _rotation_body_from_reference(block: AlignedBlock) -> Array | None:
-    """Rotations (N, 3, 3) that take each reference velocity to the body frame; None if all are in it."""
+def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]:
+    """Rotations (N, 3, 3) that take each reference velocity to the body frame, and `Observations.earth_in_body`;
+    None, None if all are in it."""
     frames: Codes = block.frames
     if not frames.any():
-        return None
+        return None, None
     # attitude is enu from body, so its transpose turns ENU into the body
     attitude = np.where((frames == _BODY)[:, None], (0.0, 0.0, 0.0, 1.0), block.attitude[:, :4])
     rotation = rotation_from_quaternion(attitude * (-1.0, -1.0, -1.0, 1.0))
+    earth = rotation[:, :, :2] * (frames != _BODY)[:, None, None]
     is_ned = frames == _NED
-    return np.where(is_ned[:, None, None], rotation @ ENU_FROM_NED, rotation) if is_ned.any() else rotation
+    return np.where(is_ned[:, None, None], rotation @ ENU_FROM_NED, rotation) if is_ned.any() else rotation, earth

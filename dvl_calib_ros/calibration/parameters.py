@@ -347,6 +347,30 @@ class Parameters:
         low=1e-6,
         high=10.0,
     )
+    reference_offset_std: float = _parameter(
+        0.005,
+        "Prior standard deviation, east and north, of a constant error of a reference velocity in an earth frame, as "
+        "of an inertial navigation (G1, G2). On one heading yaw and scale are never better known than by it; several "
+        "headings find it.",
+        unit="m/s",
+        low=1e-6,
+        high=10.0,
+    )
+    day_std_heading: float = _parameter(
+        math.radians(0.1),
+        "By how much the heading reference is off on a day, constantly: where calibrations of different days are "
+        "compared, in the σ of yaw (0.1°: a fibre-optic gyrocompass; a magnetic compass: 1° and more).",
+        unit="rad",
+        low=0.0,
+        high=0.5,
+    )
+    day_std_scale: float = _parameter(
+        0.003,
+        "By how much the scale differs from day to day: where calibrations of different days are compared, in the σ of "
+        "scale (0.3 %: 4.5 m/s of the speed of sound, as of 1.5 °C).",
+        low=0.0,
+        high=0.5,
+    )
     current_std: float = _parameter(
         ASSUMPTIONS.current_std,
         "Prior standard deviation of the current per axis (A1, F1). On one heading it decides how much of the sway is "

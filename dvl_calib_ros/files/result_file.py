@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from .. import __version__
+from ..calibration.assembly import prior
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
@@ -250,6 +251,20 @@ def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequen
         )
 
 
+def _with_new_states(name: str, names: tuple[str, ...], x: Array, p: Array) -> tuple[tuple[str, ...], Array, Array]:
+    """States of a file of before its model got further nuisance states, with the prior of these; others as they are."""
+    model = MODELS[name]
+    at = [index for index, each in enumerate(model.state_names) if each in names]
+    ordered = names == tuple(model.state_names[index] for index in at) and len(names) < model.n_state
+    whole = x.shape == (len(names),) and p.shape == (len(names), len(names))
+    if not ordered or not whole or at[: model.n_errors] != [*range(model.n_errors)]:
+        return names, x, p
+    start = prior(model, Parameters())
+    start.x[at] = x
+    start.p[np.ix_(at, at)] = p
+    return model.state_names, *start
+
+
 def _gaussian(where: str, name: str, saved: Any) -> GaussianState:
     model = MODELS[name]
     try:
@@ -258,6 +273,7 @@ def _gaussian(where: str, name: str, saved: Any) -> GaussianState:
         names = tuple(saved["state_names"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: damaged ({type(error).__name__}: {error})") from error
+    names, x, p = _with_new_states(name, names, x, p)
     if names != model.state_names or x.shape != (model.n_state,) or p.shape != (model.n_state, model.n_state):
         raise InputError(f"{where}: states {names} are not those of the model, {model.state_names}")
     if not np.isfinite(x).all() or not np.isfinite(p).all() or not np.allclose(p, p.T, rtol=1e-9, atol=0.0):

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.delay.rows import BEYOND
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting, scale_advice
@@ -439,8 +440,11 @@ def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_
     again = replayed(bag, **{name: getattr(written, name) for name in ("mounting_rpy", "lever_arm", "dvl_time_offset")})
     assert again.result.selected == "G1"
     rest = again.result.estimates["G2"]
-    assert np.linalg.norm(found.estimate.state[6:8]) > 1.0 and abs(found.estimate.state[9]) > 0.5
-    assert np.all(np.abs(rest.state[6:]) < np.minimum(2.0 * rest.std[6:], [0.03, 0.03, 0.1, 0.03]))
+    assert (
+        np.linalg.norm(found.estimate.lever_arm((0.0, 0.0, 0.0))[:2]) > 1.0
+        and abs(found.estimate.dvl_time_offset(0.0)) > 0.5
+    )
+    assert np.all(np.abs(rest.state[BEYOND]) < np.minimum(2.0 * rest.std[BEYOND], [0.03, 0.03, 0.1, 0.03]))
     assert np.linalg.norm(again.result.estimate.misalignment[1:]) < 0.003
     # once more changes nothing, and the way back leads to what was there
     assert apply(saved, "--params", parameters) == 0

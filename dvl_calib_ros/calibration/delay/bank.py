@@ -1,7 +1,7 @@
 """G2's filter: a bank of delays side by side, each with a linear least-squares fit of everything else.
 
 A delay of seconds is no small error: no linearisation about zero finds it. Each of K hypotheses holds the information
-(Λ, Λx) of ψ, κ, heave, lever arm and of how much more than its own the delay is; its evidence says how well it
+(Λ, Λx) of G1's states, lever arm and of how much more than its own the delay is; its evidence says how well it
 explains the data. What is published is the mixture of all, moment-matched: on a straight run no hypothesis is better
 than another, and the delay's standard deviation stays that of the prior.
 
@@ -54,9 +54,9 @@ class Hypotheses(NamedTuple):
 class Posterior:
     """What the bank says.
 
-    state: x (n,), P (n, n) of φ, δk, heave, lever arm (m) and delay (s). shown: (n,) which states the data alone
-    shows. level: mean squared innovation of the best hypothesis over what the noise claims, at least 1. inflation:
-    (n,) by how much its standard deviations were raised above the filter's own.
+    state: x (n,), P (n, n) of G2's states. shown: (n,) which of them the data alone shows. level: mean squared
+    innovation of the best hypothesis over what the noise claims, at least 1. inflation: (n,) by how much its standard
+    deviations were raised above the filter's own.
     """
 
     state: GaussianState
@@ -66,7 +66,7 @@ class Posterior:
 
 
 class DelayBank:
-    """Accumulates rows; asks for nothing else. prior: x (n,), P (n, n) of φ, δk, heave, lever arm and delay."""
+    """Accumulates rows; asks for nothing else. prior: x (n,), P (n, n) of G2's states."""
 
     def __init__(
         self, prior: GaussianState, unknown_std: Array, gate: float, process_rate: Array | None, verified: bool

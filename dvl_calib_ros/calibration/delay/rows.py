@@ -34,9 +34,9 @@ LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
 MOST_REACH_S = 3.4
 # How far beyond a block of references the other streams have to be known.
 MARGIN_S = 7.0
-N_STATE = 10
-HEAVE, LEVER_ARM, DELAY = 5, slice(6, 9), 9
-BEYOND = slice(6, 10)  # what G1 has not
+N_G1, N_STATE = 8, 12
+LEVER_ARM, DELAY = slice(8, 11), 11
+BEYOND = slice(N_G1, N_STATE)  # what G1 has not
 
 
 class DvlColumns(NamedTuple):
@@ -71,7 +71,7 @@ class ImuColumns(NamedTuple):
 class DelayedRows:
     """J reference samples, each compared at K delays.
 
-    index: (J,) of the reference. z: (J, K, 3) m/s and h: (J, K, 3, 10) on ψ, κ, heave, lever arm (m, body) and what the
+    index: (J,) of the reference. z: (J, K, 3) m/s and h: (J, K, 3, 12) on G1's states, lever arm (m, body) and what the
     delay is more (s) than that of its hypothesis. information: (J, 3, 3) inverse of the noise. weight: (J,) share of
     its own information that a sample adds. regressor_noise: (J, 4) how much of the information on lever arm (3) and
     delay is that of noise: angular velocity and slope that only seem to change.
@@ -108,12 +108,13 @@ def delayed_rows(
     """
     times = reference.times
     turning, turning_noise = _angular_velocity(imu, times, imu_gap_s)
-    body, noise, oriented = _in_body(reference, imu, imu_gap_s)
+    seen = _in_body(reference, imu, imu_gap_s)
+    body, noise, earth = seen.velocity, seen.noise, seen.earth_in_body
     moving = (body**2).sum(axis=1) >= min_speed**2
     if max_turn_rate > 0.0:
         moving &= (turning**2).sum(axis=1) <= max_turn_rate**2
     read = _read(dvl, times)
-    use = oriented & ~np.isnan(turning[:, 0]) & moving & read.known
+    use = seen.known & ~np.isnan(turning[:, 0]) & moving & read.known
     index = np.flatnonzero(use)
     body, noise, turning = body[index], noise[index], turning[index]
     value, slope, spacing = read.velocity[index], read.slope[index], read.spacing[index]
@@ -122,7 +123,10 @@ def delayed_rows(
     interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)[index]
     # references closer together than the DVL's samples share these
     weight = np.clip(interval / spacing, 0.0, 1.0)
-    return _rows(index, value, slope, body, turning, uncertain, noise + added, interval, weight, template, lever_arm)
+    earth = earth[index]
+    return _rows(
+        index, value, slope, body, earth, turning, uncertain, noise + added, interval, weight, template, lever_arm
+    )
 
 
 class _Uncertain(NamedTuple):
@@ -183,6 +187,7 @@ def _rows(
     velocity_dvl: Array,
     slope: Array,
     body: Array,
+    earth: Array,
     turning: Array,
     uncertain: _Uncertain,
     noise: Array,
@@ -203,6 +208,7 @@ def _rows(
         noise=noise,
         interval=interval,
         assumptions=template.assumptions,
+        earth_in_body=earth,
     )
     # the same reference beside the DVL at every delay
     each = Observations(
@@ -214,10 +220,11 @@ def _rows(
         noise=np.repeat(noise, k, axis=0),
         interval=np.repeat(interval, k),
         assumptions=template.assumptions,
+        earth_in_body=np.repeat(earth, k, axis=0),
     )
     z, h_g1 = linearise_g1(each)
     h = np.zeros((n, k, 3, N_STATE))
-    h[..., : HEAVE + 1] = h_g1.reshape(n, k, 3, HEAVE + 1)
+    h[..., :N_G1] = h_g1.reshape(n, k, 3, N_G1)
     h[..., LEVER_ARM] = -skew(turning)[:, None]
     h[..., DELAY] = slope @ body_from_dvl.T
     information = np.linalg.inv(g1_noise(once))
@@ -265,16 +272,26 @@ def _noise_of(times: Array, values: Array) -> Array:
     return bent
 
 
-def _in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> tuple[Array, Array, Mask]:
-    """Velocity (J, 3), noise (J, 3, 3) in the body frame, and where that is known (J,)."""
+class _InBody(NamedTuple):
+    """Velocity (J, 3), noise (J, 3, 3) in the body frame, where that is known (J,), `Observations.earth_in_body`."""
+
+    velocity: Array
+    noise: Array
+    known: Mask
+    earth_in_body: Array
+
+
+def _in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> _InBody:
     in_body = reference.in_body
     if in_body.all():
-        return reference.velocity, reference.noise, np.ones(len(in_body), dtype=bool)
+        n = len(in_body)
+        return _InBody(reference.velocity, reference.noise, np.ones(n, dtype=bool), np.zeros((n, 3, 2)))
     rotation, known = attitude_at(imu, reference.times, gap_s)
     body_from_enu = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
     velocity = np.matmul(body_from_enu, reference.velocity[..., None])[..., 0]
     noise = body_from_enu @ reference.noise @ body_from_enu.swapaxes(1, 2)
-    return velocity, noise, known | in_body
+    earth = body_from_enu[:, :, :2] * ~in_body[:, None, None]
+    return _InBody(velocity, noise, known | in_body, earth)
 
 
 def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:

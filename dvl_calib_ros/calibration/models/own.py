@@ -17,7 +17,7 @@ SCALE_SHOWN_FROM = 0.3
 
 
 def linearise_g1(seen: Observations) -> Linearised:
-    """z = Tᵀr' - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), -k] on ψ, κ, h; body frame.
+    """z = Tᵀr' - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), -k, E'] on ψ, κ, h, o; body frame.
 
     The models of the paper put the noisy GNSS velocity r into H: noise in a regressor pulls its coefficient, here the
     scale, down ("errors in variables"). Here the correction itself is estimated,
@@ -31,6 +31,10 @@ def linearise_g1(seen: Observations) -> Linearised:
     variance against the receiver's. The heave h, constant (trim), is a state. In the row of heave κ acts on level
     motion only: what is assumed to be near zero must not be read as a scale that makes it so. Nor does an axis say
     anything of its scale while it moves so slowly that its own noise would pull (SCALE_SHOWN_FROM).
+
+    A reference in an earth frame is wrong by a constant o (east, north) beside its noise: an inertial navigation by
+    some mm/s all along. On one heading no data tell it from yaw and scale, and σ says so; over several it is found
+    (E: its axes in the body, E' = E - k E_z as for r'). Of one in the body frame no such thing is assumed.
     """
     assert seen.reference_body is not None
     r = seen.reference_body - seen.heave_gain * seen.reference_body[:, 2:]
@@ -40,11 +44,13 @@ def linearise_g1(seen: Observations) -> Linearised:
     measured = seen.velocity_dvl @ body_from_dvl.T
     level = measured * (1.0, 1.0, 0.0) @ body_from_dvl
     fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
-    h = np.zeros((len(r), 3, 6))
+    h = np.zeros((len(r), 3, 8))
     h[:, :, :3] = np.matmul(body_from_dvl, skew(seen.velocity_dvl))
     h[:, :2, 3:5] = -(body_from_dvl[:2] * (fast * seen.velocity_dvl)[:, None, :])[:, :, :2]
     h[:, 2, 3:5] = -(body_from_dvl[2] * fast * level)[:, :2]
     h[:, :, 5] = -seen.heave_gain
+    if seen.earth_in_body is not None:
+        h[:, :, 6:] = seen.earth_in_body - seen.heave_gain[:, :, None] * seen.earth_in_body[:, 2:]
     return r - measured, h
 
 
@@ -127,6 +133,12 @@ def _a1_noise(seen: Observations) -> Array:
 
 
 _SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
+# A constant heave, and by what the reference is wrong all along.
+_G1_NUISANCE = (
+    Nuisance("heave", "m/s", "heave_offset_std"),
+    Nuisance("reference_east", "m/s", "reference_offset_std"),
+    Nuisance("reference_north", "m/s", "reference_offset_std"),
+)
 _SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
 # What shows the states that only G2 has, by name.
 _SHOWN_TO_G2 = {
@@ -142,7 +154,7 @@ OWN = (
         assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
         wrong_when="trimmed by more than heave_offset_std, or heaving in long waves beyond motion_std",
         scale_axes=_SCALE_PER_AXIS,
-        nuisance=(Nuisance("heave", "m/s", "heave_offset_std"),),
+        nuisance=_G1_NUISANCE,
         noise=g1_noise,
         rows_in_body=True,
         in_correction_parameters=True,
@@ -153,7 +165,7 @@ OWN = (
         wrong_when="the delay changes along the run; a vehicle that bends",
         scale_axes=_SCALE_PER_AXIS,
         nuisance=(
-            Nuisance("heave", "m/s", "heave_offset_std"),
+            *_G1_NUISANCE,
             Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
             Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
             Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),

@@ -6,10 +6,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from runs import MatchedRun, calibrate, make_samples
+from runs import START_NS, MatchedRun, calibrate, make_samples
 
+from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ReferenceSample
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.files.result_file import result_document
 
 CLAIMED = Parameters(gnss_aided_std=0.03)
@@ -56,3 +57,45 @@ def test_the_state_is_the_same_and_the_result_file_has_both_sigmas():
     document = result_document(calibrator.result())
     yaw, by_filter = (float(document[key]["phi_z"].split()[0]) for key in ("std", "std_by_filter"))
     assert yaw > 2.0 * by_filter
+
+
+@cache
+def level_course(offset: tuple[float, float], headings: bool):
+    """300 s at 1.5 m/s, on a circle or one heading; the reference is wrong by a constant (east, north) m/s."""
+    rng = np.random.default_rng(8)
+    samples = []
+    for i in range(300 * 5):
+        stamp, yaw = START_NS + i * 200_000_000, 0.3 + (2.0 * np.pi * i / 500.0 if headings else 0.0)
+        rotation = rotation_from_rpy([0.0, 0.0, yaw])
+        rate = 2.0 * np.pi / 100.0 if headings else 0.0
+        velocity = rotation @ (1.5, 0.0, 0.0) + (*offset, 0.0) + rng.normal(0.0, 0.02, 3)
+        samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), (0.0, 0.0, rate)))
+        samples.append(ReferenceSample(stamp, tuple(velocity.tolist()), None, VelocityFrame.ENU))
+        samples.append(DvlSample(stamp, tuple((np.array([1.5, 0.0, 0.0]) + rng.normal(0.0, 0.005, 3)).tolist())))
+    return samples
+
+
+def test_a_constant_error_of_the_reference_is_found_over_several_headings():
+    estimate = calibrate(level_course((0.012, -0.009), True), CLAIMED).estimate("G1")
+    assert estimate.state_of("reference_east") == pytest.approx(0.012, abs=0.003)
+    assert estimate.state_of("reference_north") == pytest.approx(-0.009, abs=0.003)
+    assert abs(estimate.state[2]) < 2.5 * estimate.std[2] < np.radians(0.25)
+
+
+def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may_be_wrong():
+    """5 mm/s across 1.5 m/s are 0.19 degrees, ahead 0.33 per cent; data of any length do not tell them."""
+    estimate = calibrate(level_course((0.006, 0.004), False), CLAIMED).estimate("G1")
+    assert np.radians(0.18) < estimate.std[2] < np.radians(0.25)
+    assert abs(estimate.state[2]) < 2.0 * estimate.std[2] and abs(estimate.state[3]) < 2.0 * estimate.std[3]
+    trusting = calibrate(level_course((0.006, 0.004), False), CLAIMED.replace(reference_offset_std=1e-6))
+    assert abs(trusting.estimate("G1").state[2]) > 2.0 * trusting.estimate("G1").std[2]
+
+
+def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed():
+    samples = [
+        each._replace(frame=VelocityFrame.BODY, velocity=(1.5, 0.0, 0.0)) if isinstance(each, ReferenceSample) else each
+        for each in level_course((0.0, 0.0), False)
+    ]
+    estimate = calibrate(samples, CLAIMED).estimate("G1")
+    assert estimate.state_of("reference_east") == estimate.state_of("reference_north") == 0.0
+    assert estimate.std[2] < np.radians(0.1)

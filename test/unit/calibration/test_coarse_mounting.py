@@ -75,7 +75,7 @@ def test_a_mounting_that_fits_is_named_in_rad():
 
 
 def judged(**changes):
-    state = GaussianState(np.zeros(6), np.eye(6) * 1e-6)
+    state = GaussianState(np.zeros(8), np.eye(8) * 1e-6)
     arguments = {"held_out": HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), "used_and_gated": (1000, 10)} | changes
     return verify(MODELS["G1"], state, Convergence.FINE, parameters=Parameters(), **arguments)
 
@@ -98,7 +98,7 @@ def test_a_verdict_protects(changes, word, sentence):
 
 
 def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
-    state = GaussianState(np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]), np.eye(6) * 1e-6)
+    state = GaussianState(np.array([0.0, 0.05, *np.zeros(6)]), np.eye(8) * 1e-6)
     found = verify(
         MODELS["G1"], state, Convergence.FINE, HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), Parameters(), (1000, 0)
     )

@@ -96,12 +96,12 @@ def test_chi_square_of_a_pair_and_of_each_against_the_rest_is_that_of_the_covari
 
 def test_the_turn_sigma_is_worth_what_simulated_states_scatter_by():
     """Of a DVL mounted at an angle, for a model in the DVL's frame: against Monte Carlo through the error model."""
-    parameters = Parameters(mounting_rpy=(0.1, -0.2, 0.8))
+    parameters = Parameters(mounting_rpy=(0.1, -0.2, 0.8), day_std_heading=0.0)
     model, rng = MODELS["G1"], np.random.default_rng(5)
-    x = np.array([0.03, -0.02, 0.05, 0.004, -0.002, 0.01])
-    root = np.tril(rng.normal(size=(6, 6))) * 1e-3 + np.eye(6) * 1e-3
+    x = np.array([0.03, -0.02, 0.05, 0.004, -0.002, 0.01, 0.0, 0.0])
+    root = np.tril(rng.normal(size=(8, 8))) * 1e-3 + np.eye(8) * 1e-3
     made = extrinsics_of("a", model, GaussianState(x, root @ root.T), parameters, (0, 1), 100)
-    draws = x + rng.normal(size=(3000, 6)) @ root.T
+    draws = x + rng.normal(size=(3000, 8)) @ root.T
     turns = np.array(
         [
             rotation_vector(
@@ -113,14 +113,29 @@ def test_the_turn_sigma_is_worth_what_simulated_states_scatter_by():
     assert np.allclose(np.cov(turns.T), made.covariance[:3, :3], rtol=0.1, atol=1e-7)
 
 
+def test_what_is_the_days_own_is_in_the_sigma_that_calibrations_are_compared_with():
+    """A heading reference's error about the body's z and the speed of sound, whatever the mounting; nothing beside."""
+    model, state = MODELS["G1"], GaussianState(np.zeros(8), np.eye(8) * 1e-8)
+    with_day, without = (
+        extrinsics_of("a", model, state, parameters, (0, 1), 100)
+        for parameters in (
+            Parameters(mounting_rpy=(0.0, 0.0, 0.8), day_std_heading=0.002, day_std_scale=0.004),
+            Parameters(mounting_rpy=(0.0, 0.0, 0.8), day_std_heading=0.0, day_std_scale=0.0),
+        )
+    )
+    added = with_day.covariance - without.covariance
+    assert np.allclose(added, np.diag([0.0, 0.0, 0.002**2, 0.0, 0.0, 0.0, 0.004**2, 0.0]), atol=1e-15)
+    assert (with_day.shown == without.shown).all() and not with_day.shown[7]
+
+
 def test_totals_are_compared_so_the_same_dvl_under_another_nominal_mounting_is_the_same():
-    model, p = MODELS["G1"], np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-4])
+    model, p = MODELS["G1"], np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-4, 1e-5, 1e-5])
     flat, turned = Parameters(), Parameters(mounting_rpy=(0.0, 0.0, math.radians(3.0)))
     total = rotation_from_rpy((0.0, 0.0, math.radians(2.0)))
     states = []
     for parameters in (flat, turned):
         phi = -np.tan(rotation_vector(parameters.rotation_dvl_from_body @ total))
-        states.append(GaussianState(np.array([*phi, 0.0, 0.0, 0.0]), p))
+        states.append(GaussianState(np.array([*phi, *np.zeros(5)]), p))
     a, b = (
         extrinsics_of(name, model, state, parameters, (0, 1), 10)
         for name, state, parameters in zip("ab", states, (flat, turned), strict=True)

@@ -11,6 +11,8 @@ from runs import START_NS, calibrate, feed, shifted
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.correction import lever_arm
 from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
+from dvl_calib_ros.calibration.delay.rows import BEYOND
+from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -22,7 +24,6 @@ from dvl_calib_ros.simulation.trajectories import body_rates
 LEVER_ARM = (-1.9, 0.4, -0.3)
 PHI = (0.0, 0.01, -0.02)
 NOISE = Parameters(gnss_aided_std=0.021)
-BEYOND = slice(6, 10)
 GNSS_STD, DVL_STD = 0.02, 0.005
 
 
@@ -97,8 +98,8 @@ def test_what_the_run_does_not_show_is_not_claimed_and_g2_is_g1(samples):
     calibrator = calibrate(samples, NOISE)
     g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
     prior = [2.0, 2.0, 2.0, 1.0]
-    np.testing.assert_array_equal(g2.state[:6], g1.state)
-    np.testing.assert_array_equal(g2.covariance[:6, :6], g1.covariance)
+    np.testing.assert_array_equal(g2.state[:8], g1.state)
+    np.testing.assert_array_equal(g2.covariance[:8, :8], g1.covariance)
     np.testing.assert_allclose(g2.std[BEYOND], prior)
     assert not g2.state[BEYOND].any()
     assert (g2.used, g2.gated) == (g1.used, g1.gated)
@@ -141,7 +142,9 @@ def test_what_is_known_of_lever_arm_and_delay_is_not_found_again():
 
 def test_the_position_found_is_that_of_the_parameters_and_what_was_found_beside():
     state = found(-1.4).state("G2")
-    np.testing.assert_allclose(lever_arm(MODELS["G2"], state, (0.1, 0.0, 0.0)), np.add(state.x[6:9], (0.1, 0.0, 0.0)))
+    np.testing.assert_allclose(
+        lever_arm(MODELS["G2"], state, (0.1, 0.0, 0.0)), np.add(state.x[LEVER_ARM_STATES], (0.1, 0.0, 0.0))
+    )
     assert lever_arm(MODELS["G1"], found(-1.4).state("G1"), (0.1, 0.0, 0.0)) == (0.1, 0.0, 0.0)
 
 
@@ -186,21 +189,21 @@ def test_outliers_are_gated_and_a_large_effect_is_not_taken_for_them():
     ]
     estimate = calibrate(spoilt, NOISE).estimate("G2")
     assert 0.02 < estimate.gated / (estimate.used + estimate.gated) < 0.12
-    np.testing.assert_allclose(estimate.state[6:8], LEVER_ARM[:2], atol=0.1)
+    np.testing.assert_allclose(estimate.state[8:10], LEVER_ARM[:2], atol=0.1)
 
 
 def test_a_random_walk_lets_go_of_the_past():
     calibrator = calibrate(late(-1.4), NOISE.replace(process_std_misalignment=1e-3))
     still, walking = found(-1.4).estimate("G2"), calibrator.estimate("G2")
     assert np.all(walking.std[:3] > still.std[:3])
-    np.testing.assert_allclose(walking.state[6:8], LEVER_ARM[:2], atol=0.1)
+    np.testing.assert_allclose(walking.state[8:10], LEVER_ARM[:2], atol=0.1)
 
 
 def test_an_initial_calibration_of_g2_goes_on_where_it_was():
     first = found(-1.4)
     later = calibrate(late(-1.4, seed=1), NOISE, initial={"G2": first.state("G2"), "G1": first.state("G1")})
-    assert np.all(later.estimate("G2").std[6:8] < first.estimate("G2").std[6:8])
-    np.testing.assert_allclose(later.estimate("G2").state[6:8], LEVER_ARM[:2], atol=0.05)
+    assert np.all(later.estimate("G2").std[8:10] < first.estimate("G2").std[8:10])
+    np.testing.assert_allclose(later.estimate("G2").state[8:10], LEVER_ARM[:2], atol=0.05)
 
 
 def test_held_out_samples_are_judged_where_and_when_the_dvl_was():

@@ -51,6 +51,7 @@ def observations(velocity_dvl, velocity_body, t, sway_heave=PRIOR, frame="flu", 
         rotation_enu_from_body=rotation_from_rpy(angles) @ FRAMES[frame],
         angular_velocity=rates @ FRAMES[frame],
         interval=np.full(n, 0.2),
+        earth_in_body=(rotation_from_rpy(angles) @ FRAMES[frame]).swapaxes(1, 2)[:, :, :2],
     )
 
 
@@ -72,14 +73,16 @@ def predicted_z(model, state, seen):
     phi, dk = state_to_terms(model, state)
     speed = np.linalg.norm(velocity_dvl, axis=1)
     expected = np.column_stack([speed, np.tile(PRIOR, (len(speed), 1))])
-    if model.in_correction_parameters:  # G1: the state is ψ, κ, heave
+    if model.in_correction_parameters:  # G1: the state is ψ, κ, heave, error of the reference east and north
         fast = np.abs(velocity_dvl) > 0.3  # axes that are slower say nothing of their scale
         level = (velocity_dvl @ t) * [1, 1, 0] @ t.T  # scale acts on level motion only
         body = velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - fast * velocity_dvl @ np.diag(dk) @ t
         body[:, 2] = (velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - fast * level @ np.diag(dk) @ t)[:, 2]
         r = t.T @ np.eye(3) @ t
         variance = seen.assumptions.motion_std**2 * 2 * seen.assumptions.motion_correlation_time / 0.2
-        return body - velocity_dvl @ t - r[:, 2] / (r[2, 2] + variance) * state[5]
+        gain = r[:, 2] / (r[2, 2] + variance)
+        error = np.einsum("nei,e->ni", seen.rotation_enu_from_body, [*state[6:8], 0.0])
+        return body - velocity_dvl @ t - gain * state[5] + error - np.outer(error[:, 2], gain)
     if model.aided:  # the measured velocity is what the errors make of the reference
         level = velocity_body * [1, 1, 0] if model.name in ("M3", "M4") else velocity_body
         return level @ t.T - distort(level, phi, dk, t)

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.calibration.error_model import corrected_mounting
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.atomic import save_text
@@ -229,6 +230,20 @@ def test_a_torn_file_is_refused_unless_all_its_models_are_whole(saved, result, p
     else:
         with suppress(InputError):
             assert [*load_initial_calibration(saved)["M7"].x] == [*result.estimates["M7"].state]
+
+
+def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_prior(saved):
+    now = load_initial_calibration(saved)["G1"]
+
+    def as_before(content):
+        g1 = content["models"]["G1"]
+        g1["state_names"], g1["state"] = g1["state_names"][:6], g1["state"][:6]
+        g1["covariance"] = [row[:6] for row in g1["covariance"][:6]]
+
+    before = load_initial_calibration(change(saved, as_before))["G1"]
+    np.testing.assert_array_equal(before.x, [*now.x[:6], 0.0, 0.0])
+    np.testing.assert_array_equal(before.p[:6, :6], now.p[:6, :6])
+    np.testing.assert_array_equal(before.p[6:], np.eye(8)[6:] * Parameters().reference_offset_std ** 2)
 
 
 def test_files_that_are_no_result_file_are_refused(tmp_path):
