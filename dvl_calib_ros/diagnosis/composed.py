@@ -34,7 +34,6 @@ from .settings import SETTINGS
 Values = Mapping[str, float]
 # Passes in which an effect is undone that acts on the very motion it changes: it is small against that motion
 _PASSES = 3
-_KEPT = 12
 
 
 def is_time_of_run(spec: ParameterSpec) -> bool:
@@ -186,7 +185,6 @@ class Problem:
     lever_arm: Array
     grids: tuple[Grid, ...]
     of_axes: tuple[bool, bool, bool] = (True, True, True)
-    _kept: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
     # Hypotheses as they were fitted last, by what they are made of: where to start from again
     fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -267,7 +265,7 @@ class Problem:
         reference = [replace(one, reference=one.reference.shaken(rng)) for one in self.recordings]
         by_dvl = any(grid.clock is ActsOn.DVL_CLOCK for grid in self.grids)
         each = [dvl, reference] if by_dvl else [dvl]
-        return tuple(replace(self, recordings=tuple(recordings), _kept={}) for recordings in each)
+        return tuple(replace(self, recordings=tuple(recordings)) for recordings in each)
 
     # ------------------------------------------------------------------ the model
 
@@ -280,16 +278,12 @@ class Problem:
             for clock in (ActsOn.DVL_CLOCK, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
         )
         by_dvl = self.grids[recording].clock is ActsOn.DVL_CLOCK
-        rotation, rates = self._kept_at("attitude", recording, attitude, lambda: self._oriented(stream, attitude))
-        g = self._kept_at(
-            "reference",
-            recording,
-            reference,
-            lambda: (stream.reference.quiet if by_dvl else stream.reference)(reference),
-        )
-        if stream.frame is not VelocityFrame.BODY:
+        rotation, rates = self._oriented(stream, attitude)
+        curve = stream.reference.quiet if by_dvl else stream.reference
+        g = curve.kept.at("values", reference, lambda: curve(reference))
+        if stream.frame is not VelocityFrame.BODY and rotation is not None:
             g = np.einsum("nji,nj->ni", rotation, g)
-        raw, smooth, change = self._kept_at("dvl", recording, dvl, lambda: _measured(stream.dvl, dvl, by_dvl))
+        raw, smooth, change = _measured(stream.dvl, dvl, by_dvl)
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
@@ -309,14 +303,6 @@ class Problem:
     def _oriented(self, stream: Recording, at: Array) -> tuple[Array | None, Array | None]:
         rotation = stream.rotation_enu_from_body(at) if Needs.ATTITUDE in self.available else None
         return rotation, stream.angular_velocity(at) if Needs.ANGULAR_VELOCITY in self.available else None
-
-    def _kept_at(self, what: str, recording: int, at: Array, make: Callable[[], Any]) -> Any:
-        key = what, recording, len(at), float(at[0]), float(at[-1]), float(at[len(at) // 2]), float(at.sum())
-        if key not in self._kept:
-            while len(self._kept) > _KEPT * len(self.recordings):
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = make()
-        return self._kept[key]
 
     def all_seen(self, hypothesis: Hypothesis) -> list[Seen]:
         """Every recording through a hypothesis."""
@@ -408,7 +394,11 @@ class Problem:
             stacked = np.stack([np.broadcast_to(slope, seen.error.shape) for slope in slopes], axis=2)
             return np.asarray(by_turn @ stacked)
         motion = seen.at_dvl if effect.acts_on is ActsOn.DVL else seen.motion
-        slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
+        if all(spec.linear for spec in specs):
+            none = {**values, **{spec.name: 0.0 for spec in specs}}
+            slopes = [effect.trace(motion, {**none, spec.name: 1.0}) for spec in specs]
+        else:
+            slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
         stacked = -np.stack(slopes, axis=2)
         if effect.acts_on is not ActsOn.DVL:
             return stacked
@@ -429,10 +419,17 @@ class Problem:
 
 
 def _measured(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array, Array]:
-    smooth = curve.smooth
-    clipped = np.clip(at, curve.time[0], curve.time[-1])
-    raw = curve if at_samples else curve.quiet
-    return raw(at), smooth(at), np.asarray(smooth.derivative(clipped))
+    """(F, 3) velocity, smoothed velocity and its change."""
+
+    def made() -> tuple[Array, Array, Array]:
+        smooth = curve.smooth
+        clipped = np.clip(at, curve.time[0], curve.time[-1])
+        raw = curve if at_samples else curve.quiet
+        smoothed = smooth(at)
+        return smoothed if raw is smooth else raw(at), smoothed, np.asarray(smooth.derivative(clipped))
+
+    measured: tuple[Array, Array, Array] = curve.kept.at(f"measured, {at_samples}", at, made)
+    return measured
 
 
 def _undone(
@@ -443,8 +440,10 @@ def _undone(
     if not any(each.effect.acts_on is acts_on for each in injections):
         return motion, added
     for _ in range(_PASSES):
-        added = traces(injections, motion, acts_on)
+        before, added = added, traces(injections, motion, acts_on)
         added = added if turned is None else _turned(turned, added)
+        if np.array_equal(added, before):  # they do not depend on the velocity
+            break
         motion = replace(motion, velocity_body=after - added)
     return motion, added
 

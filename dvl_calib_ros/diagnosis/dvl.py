@@ -55,7 +55,7 @@ STALE = "stale_samples"
 
 def dvl_seen(selection: Selection, parameters: Parameters) -> DvlSeen:
     """The DVL of what was selected; parameters: those with which the recordings were read."""
-    problem = replace(selection.fitter.problem, lever_arm=np.zeros(3), _kept={})
+    problem = replace(selection.fitter.problem, lever_arm=np.zeros(3))
     hypothesis = _whole(selection, parameters)
     measured = _measured(problem, hypothesis)
     without = {

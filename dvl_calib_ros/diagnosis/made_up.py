@@ -46,7 +46,7 @@ def made_up(problem: Problem, fit: Fit, count: int) -> Iterator[tuple[Problem, l
     White noise as large as the streams show it, drawn anew; what the residual has beyond that has its colour.
     """
     rng = np.random.default_rng(0)
-    moving = replace(problem, recordings=tuple(map(_moving, problem.recordings)), _kept={})
+    moving = replace(problem, recordings=tuple(map(_moving, problem.recordings)))
     truth = [_reference(moving, fit.hypothesis, index) for index in range(len(problem.recordings))]
     wanted = float(np.mean(fit.noise.whiten(fit.residual) ** 2))
     share = 1.0
@@ -55,7 +55,7 @@ def made_up(problem: Problem, fit: Fit, count: int) -> Iterator[tuple[Problem, l
             _drawn(recording, reference, share, rng)
             for recording, reference in zip(problem.recordings, truth, strict=True)
         ]
-        other = replace(problem, recordings=tuple(drawn), _kept={})
+        other = replace(problem, recordings=tuple(drawn))
         seen = other.all_seen(fit.hypothesis)
         residual = other.residual(seen)
         made = float(np.mean(fit.noise.whiten(residual) ** 2))

@@ -51,6 +51,24 @@ FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 SLOWEST_AVERAGE_HZ = 2.5
 
 
+class Kept:
+    """What was made of a stream at some times, the last few: fits look at the same times again and again."""
+
+    _LIMIT = 8
+
+    def __init__(self) -> None:
+        self._made: dict[Any, Any] = {}
+
+    def at(self, what: str, times: Array, make: Callable[[], Any]) -> Any:
+        """What `make` gives, which is asked if this is not kept for these times (M,) s."""
+        key = what, len(times), float(times.sum()), *times[[0, len(times) // 2, -1] if len(times) else []].tolist()
+        made = self._made.pop(key) if key in self._made else make()
+        self._made[key] = made  # as the newest
+        if len(self._made) > self._LIMIT:
+            self._made.pop(next(iter(self._made)))
+        return made
+
+
 @dataclass(frozen=True, eq=False)
 class Curve:
     """One stream as a function of time: cubic between samples. time: (N,) s, increasing. values: (N, k). claimed:
@@ -62,6 +80,7 @@ class Curve:
     values: Array
     claimed: Array | None = None
     like: Curve | None = None
+    kept: Kept = field(init=False, default_factory=Kept, repr=False)
 
     @cached_property
     def interval(self) -> float:
@@ -238,7 +257,6 @@ class Recording:
     received: int = 0
     spikes: int = 0
     first_ns: int = 0
-    _kept: dict[Any, Any] = field(default_factory=dict)
 
     @property
     def available(self) -> frozenset[Needs]:
@@ -258,21 +276,33 @@ class Recording:
         """(M, 3, 3)."""
         if self.attitude is None:
             raise ValueError(f"{self.name}: no attitude")
-        q = self.attitude(at)
-        return rotation_from_quaternion(q / np.linalg.norm(q, axis=1)[:, None])
+        attitude = self.attitude
+
+        def rotation() -> Array:
+            q = attitude.kept.at("quaternion", at, lambda: attitude(at))
+            return rotation_from_quaternion(q / np.sqrt((q * q).sum(axis=1))[:, None])
+
+        return np.asarray(attitude.kept.at("rotation", at, rotation))
 
     def angular_velocity(self, at: Array) -> Array:
         """(M, 3) rad/s, body: of the IMU's own rates, or of its attitude where these are too slow."""
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
-            return rates(at)
+            own = rates
+            return np.asarray(own.kept.at("values", at, lambda: own(at)))
         if attitude is None:
             raise ValueError(f"{self.name}: no angular velocity")
-        q, dq = attitude(at), attitude.derivative(np.clip(at, attitude.time[0], attitude.time[-1]))
-        square = (q * q).sum(axis=1)[:, None]
-        # vector part of 2 q* dq/dt, with q = (x, y, z, w)
-        xyz = q[:, 3:] * dq[:, :3] - dq[:, 3:] * q[:, :3] - cross(q[:, :3], dq[:, :3])
-        return np.asarray(2.0 * xyz / square)
+        oriented = attitude
+
+        def turning() -> Array:
+            q = oriented.kept.at("quaternion", at, lambda: oriented(at))
+            dq = oriented.derivative(np.clip(at, oriented.time[0], oriented.time[-1]))
+            square = (q * q).sum(axis=1)[:, None]
+            # vector part of 2 q* dq/dt, with q = (x, y, z, w)
+            xyz = q[:, 3:] * dq[:, :3] - dq[:, 3:] * q[:, :3] - cross(q[:, :3], dq[:, :3])
+            return np.asarray(2.0 * xyz / square)
+
+        return np.asarray(oriented.kept.at("angular velocity", at, turning))
 
 
 def make_recording(

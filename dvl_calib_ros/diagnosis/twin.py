@@ -128,8 +128,8 @@ def _regimes(recording: Recording, at: Array, speed: Array) -> dict[str, NDArray
 
 def with_quiet_reference(problem: Problem) -> Problem:
     """The problem with the noise of every reference taken off where there is no motion in it."""
-    quiet = tuple(replace(one, reference=one.reference.quiet, _kept={}) for one in problem.recordings)
-    return replace(problem, recordings=quiet, _kept={})
+    quiet = tuple(replace(one, reference=one.reference.quiet) for one in problem.recordings)
+    return replace(problem, recordings=quiet)
 
 
 def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:

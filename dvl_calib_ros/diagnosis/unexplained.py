@@ -146,10 +146,9 @@ def _looked(
     sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
-        whitened = noise.whiten(raw[name])
+        told = _Told.by(q, noise.whiten(raw[name]), white)
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
-            energy, dof = _energy(q, whitened[:, at], white)
-            looks.append(Look(name, at, number == 0, energy, dof))
+            looks.append(Look(name, at, number == 0, *told.energy(at)))
     return looks, white, raw
 
 
@@ -298,17 +297,37 @@ def _orthonormal(white: Array) -> Array:
 
 def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
     """log p of what columns explain of a whitened series, and their energy beyond chance."""
-    energy, dof = _energy(q, white_columns, white)
+    energy, dof = _Told.by(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
     energy /= variance
     return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
 
 
-def _energy(q: Array, white_columns: Array, white: Array) -> tuple[float, int]:
-    """Square that columns explain of a whitened series, beside those of q, and of how many dimensions."""
-    lengths = np.linalg.norm(white_columns, axis=0)
-    left = white_columns - q @ (q.T @ white_columns)
-    keep = np.linalg.norm(left, axis=0) > 0.02 * np.maximum(lengths, 1e-300)
-    if not keep.any():
-        return 0.0, 0
-    u = _orthonormal(left[:, keep])
-    return float(np.sum((u.T @ white) ** 2)), u.shape[1]
+@dataclass(frozen=True)
+class _Told:
+    """What columns tell of a whitened series beside those of an orthonormal basis.
+
+    gram: (c, c) of unit columns less what the basis tells of them. along: (c,) their products with the series. has:
+    (c,) whether there is more left of a column than its rounding.
+    """
+
+    gram: Array
+    along: Array
+    has: NDArray[np.bool_]
+
+    @staticmethod
+    def by(q: Array, white_columns: Array, white: Array) -> _Told:
+        left = white_columns - q @ (q.T @ white_columns)
+        before, after = (np.sqrt(np.einsum("mc,mc->c", each, each)) for each in (white_columns, left))
+        has = after > 0.02 * np.maximum(before, 1e-300)
+        left = left / np.where(has, after, 1.0)
+        return _Told(left.T @ left, left.T @ white, has)
+
+    def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
+        """Square of the series that columns `at` explain together, and of how many dimensions."""
+        at = at[self.has[at]]
+        if not len(at):
+            return 0.0, 0
+        squares, directions = np.linalg.eigh(self.gram[np.ix_(at, at)])
+        apart = squares > INDEPENDENT**2
+        along = directions[:, apart].T @ self.along[at]
+        return float(np.sum(along**2 / squares[apart])), int(np.count_nonzero(apart))

@@ -179,8 +179,7 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
     """(N, 3) m/s per recording: what made-up noise of the reference makes in the DVL's frame."""
     noisy = replace(
         problem,
-        recordings=tuple(replace(one, reference=one.reference.shaken(rng), _kept={}) for one in problem.recordings),
-        _kept={},
+        recordings=tuple(replace(one, reference=one.reference.shaken(rng)) for one in problem.recordings),
     )
     return [
         simulated(noisy, hypothesis, index) - simulated(problem, hypothesis, index)

@@ -37,7 +37,7 @@ def recording(request) -> Recording:
 
 def late(recording: Recording, stream: str, seconds: float) -> Recording:
     curve = getattr(recording, stream)
-    return replace(recording, **{stream: Curve(curve.time + seconds, curve.values)}, _kept={})
+    return replace(recording, **{stream: Curve(curve.time + seconds, curve.values)})
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1.5, -4.0, 7.9])

@@ -37,7 +37,7 @@ def test_what_an_effect_adds_at_four_times_its_typical_size_is_taken_off_again(r
     hypothesis = calibration.with_effects([effect], 1, {name: (values,)})
     plain = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
     dvl = Curve(recording.dvl.time, simulated(plain, hypothesis, 0))
-    problem = make_problem([replace(recording, dvl=dvl, _kept={})], np.eye(3), np.zeros(3), [Offsets()])
+    problem = make_problem([replace(recording, dvl=dvl)], np.eye(3), np.zeros(3), [Offsets()])
     inside = slice(10, -10)  # a delay reaches beyond the ends
     added = np.abs(problem.residual(problem.all_seen(calibration))[inside]).max()
     left = np.abs(problem.residual(problem.all_seen(hypothesis))[inside]).max()
