@@ -27,6 +27,8 @@ ALIKE = 0.9
 BY_CHANCE = 1.5
 # Prior of an effect's parameters, in their typical sizes: wide enough to do nothing but where the data says nothing
 PRIOR_IN_TYPICAL = 50.0
+# A fit is not made where it would come out worse by so much deviance, and by this share of what its first step gains
+SURELY, BENT = 2.0, 0.2
 Mask = NDArray[np.bool_]
 
 
@@ -254,11 +256,25 @@ class Fitter:
             if not all(np.isfinite(each[name]) for each in per):
                 continue
             moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
-            values = {**fit.values, effect.name: moved}
-            trial = self.fit(replace(fit.hypothesis, values=values), fit.noise, 3)
+            hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
+            if self._is_surely_worse(hypothesis, fit.noise, fit.deviance):
+                continue
+            trial = self.fit(hypothesis, fit.noise, 3)
             if trial.deviance < fit.deviance:
                 fit = trial
         return fit
+
+    def _is_surely_worse(self, hypothesis: Hypothesis, noise: Noise, deviance: float) -> bool:
+        """Whether a hypothesis, fitted, would have a larger deviance, as one straight step tells well enough.
+
+        The deviance at which that step would end is the least there is, but for what is bent.
+        """
+        seen, residual = self.evaluated(hypothesis)
+        system = self._system(noise, self.columns(hypothesis, seen), residual, hypothesis)
+        own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
+        least = system.misfit(system.solution())
+        gained = self._misfit(noise, residual, hypothesis) - least
+        return least - float(own_noise @ own_noise) > deviance + SURELY + BENT * gained
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """A time at which an effect begins or ends, with those that the data takes for as good (95 per cent)."""
@@ -275,7 +291,8 @@ class Fitter:
                     for index, each in enumerate(fit.values[effect.name])
                 )
                 moved = replace(fit.hypothesis, values={**fit.values, effect.name: per})
-                if self.fit(moved, fit.noise, 2).deviance > fit.deviance + chi2_isf(0.05, 1):
+                worse = fit.deviance + float(chi2_isf(0.05, 1))
+                if self._is_surely_worse(moved, fit.noise, worse) or self.fit(moved, fit.noise, 2).deviance > worse:
                     as_good.append(at)  # the first that is worse bounds those that are as good
                     break
                 as_good.append(at)
