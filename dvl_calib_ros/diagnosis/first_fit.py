@@ -7,10 +7,11 @@ the scatter about the best fit, never from that of a poor one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array, cross, skew
@@ -43,6 +44,7 @@ class FirstGuess:
 class _Look:
     problem: Problem
     times: Array
+    _streams: dict[tuple[bool, float], tuple[NDArray[np.bool_], Array]] = field(default_factory=dict)
 
     @property
     def recording(self) -> Recording:
@@ -54,55 +56,90 @@ class _Look:
         return None if self.recording.attitude is None else self.recording.rotation_enu_from_body(self.times)
 
     @cached_property
-    def rates(self) -> Array | None:
-        """(N, 3) rad/s at the times."""
+    def rates(self) -> Array:
+        """(N, 3) rad/s at the times, zero where they are not known: then nothing is learnt of the lever arm."""
         if Needs.ANGULAR_VELOCITY not in self.recording.available:
-            return None
+            return np.zeros((len(self.times), 3))
         return self.recording.angular_velocity(self.times)
+
+    @cached_property
+    def lever(self) -> Array:
+        """(N, 3) m/s, of the lever arm that is known."""
+        return cross(self.rates, self.problem.lever_arm)
+
+    @cached_property
+    def projection(self) -> Array | None:
+        """(N, A, 3) from the body frame to the axes that are compared, None if these are all of it."""
+        if all(self.problem.measured):
+            return None
+        projection = self.problem.projection(self.recording, self.rotation)
+        return np.broadcast_to(projection, (len(self.times), self.problem.axes, 3))
+
+    def _stream(self, of_dvl: bool, offset: float) -> tuple[NDArray[np.bool_], Array]:
+        """Whether a stream is known at the times (N,), and its values (N, 3), those of the reference in the body."""
+        recording = self.recording
+        if (of_dvl, offset) not in self._streams:
+            curve, at = recording.dvl if of_dvl else recording.reference, self.times + offset
+            values = curve(at)
+            if not of_dvl and recording.frame is not VelocityFrame.BODY and self.rotation is not None:
+                values = np.einsum("nji,nj->ni", self.rotation, values)
+            self._streams[of_dvl, offset] = curve.covers(at), values
+        return self._streams[of_dvl, offset]
 
     def solved(self, offsets: Offsets) -> tuple[float, Array]:
         """Spread of the best half, and (15,) C - Tᵀ row by row, lever arm, bias."""
-        recording, problem = self.recording, self.problem
-        at = self.times
-        known = recording.dvl.covers(at + offsets.dvl) & recording.reference.covers(at + offsets.reference)
+        has_dvl, velocity = self._stream(True, offsets.dvl)
+        has_reference, g = self._stream(False, offsets.reference)
+        known = has_dvl & has_reference
         if known.mean() < 0.5:
             return np.inf, np.zeros(15)
-        at = at[known]
-        rotation = None if self.rotation is None else self.rotation[known]
-        rates = None if self.rates is None else self.rates[known]
-        velocity = recording.dvl(at + offsets.dvl)
-        g = recording.reference(at + offsets.reference)
-        if recording.frame is not VelocityFrame.BODY and rotation is not None:
-            g = np.einsum("nji,nj->ni", rotation, g)
-        nominal = problem.rotation_dvl_from_body
-        lever = np.zeros((len(at), 3)) if rates is None else cross(rates, problem.lever_arm)
-        target = g + lever - velocity @ nominal
-        columns = np.zeros((len(at), 3, 15))
-        for axis in range(3):
-            columns[:, axis, 3 * axis : 3 * axis + 3] = velocity
-        if rates is not None:
-            columns[:, :, 9:12] = -skew(rates)
-        columns[:, :, 12:] = np.eye(3)
-        projection = np.broadcast_to(problem.projection(recording, rotation), (len(at), problem.axes, 3))
-        return _robust(projection @ columns, np.einsum("nij,nj->ni", projection, target))
+        target = g + self.lever - velocity @ self.problem.rotation_dvl_from_body
+        regressors = np.column_stack([velocity, self.rates, np.ones(len(known))])
+        projection = None if self.projection is None else self.projection[known]
+        return _robust(regressors[known], target[known], projection)
 
 
 _PRIOR = np.concatenate([np.full(9, _PRIOR_C), np.full(3, _PRIOR_LEVER), np.full(3, _PRIOR_BIAS)])
 
 
-def _robust(columns: Array, target: Array) -> tuple[float, Array]:
-    """Least trimmed squares by concentration: fit, keep the best three quarters, fit again."""
-    weight = np.ones(len(target))
+def _by_parameters() -> Array:
+    """(7, 3, 15): what each of (velocity, angular velocity, 1) makes of each parameter on each axis of the body."""
+    found = np.zeros((7, 3, 15))
+    for axis in range(3):
+        found[:3, axis, 3 * axis : 3 * axis + 3] = np.eye(3)
+        found[6, axis, 12 + axis] = 1.0
+    found[3:6, :, 9:12] = -skew(np.eye(3))
+    return found
+
+
+_BY_PARAMETERS = _by_parameters()
+
+
+def _robust(regressors: Array, target: Array, projection: Array | None) -> tuple[float, Array]:
+    """Least trimmed squares by concentration: fit, keep the best three quarters, fit again.
+
+    regressors: (N, 7), of which all columns are made (`_BY_PARAMETERS`), so their products are all that is summed up.
+    """
+    products, aims = regressors, target
+    if projection is not None:
+        seen = np.swapaxes(projection, 1, 2) @ projection  # (N, 3, 3)
+        products = (regressors[:, :, None] * seen.reshape(-1, 1, 9)).reshape(-1, 63)
+        aims = np.einsum("nij,nj->ni", seen, target)
+    columns = _BY_PARAMETERS.reshape(21, 15)
     held = np.diag((_NOISE_MPS / _PRIOR) ** 2)
-    x = np.zeros(columns.shape[2])
     kept = len(target) * 3 // 4
+    weighted = regressors.T
     for _ in range(3):
-        a = (columns * weight[:, None, None]).reshape(-1, columns.shape[2])
-        x = np.linalg.solve(a.T @ a + held, a.T @ (target * weight[:, None]).ravel())
-        distance = np.linalg.norm(target - columns @ x, axis=1)
+        squares = (weighted @ products).reshape(7, 7, -1)
+        squares = (squares if projection is not None else squares * np.eye(3).ravel()).reshape(7, 7, 3, 3)
+        squares = squares.transpose(0, 2, 1, 3).reshape(21, 21)
+        x = np.linalg.solve(columns.T @ squares @ columns + held, columns.T @ (weighted @ aims).ravel())
+        left = target - regressors @ (columns @ x).reshape(7, 3)
+        left = left if projection is None else np.einsum("nij,nj->ni", projection, left)
+        distance = np.einsum("ni,ni->n", left, left)
         best = np.partition(distance, kept)[: kept + 1]
-        weight = (distance <= best[kept]).astype(float)
-    return float(np.sqrt(np.mean(best**2))), x
+        weighted = regressors.T * (distance <= best[kept])
+    return float(np.sqrt(np.mean(best))), x
 
 
 def first_guess(recording: Recording, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
