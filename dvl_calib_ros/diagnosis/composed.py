@@ -133,6 +133,7 @@ class Seen:
     """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
     (F, 3) m/s smoothed DVL velocity, its frame. rate_of_change: (F, 3) m/s² of it. error: (F, 3) e, body frame.
     angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
+    dvl_stamps, reference_stamps: (F,) s that these give the same times.
     """
 
     motion: EffectInput
@@ -142,6 +143,8 @@ class Seen:
     error: Array
     angles: Array
     body_from_measured: Array
+    dvl_stamps: Array
+    reference_stamps: Array
 
 
 @dataclass(frozen=True)
@@ -256,6 +259,17 @@ class Problem:
         projected: Array = level @ rotation_enu_from_body[:, :2]
         return projected
 
+    def to_compared(self, recording: Recording, at: Array, of_dvl: bool) -> Array:
+        """(M, A, 3) or (1, A, 3) from the frame of the DVL or of the reference to the axes that are compared."""
+        oriented = Needs.ATTITUDE in self.available
+        rotation = recording.rotation_enu_from_body(at) if oriented else None
+        projection = self.projection(recording, rotation)
+        if of_dvl:
+            return np.asarray(projection @ self.rotation_dvl_from_body.T)
+        if recording.frame is VelocityFrame.BODY or rotation is None:
+            return projection
+        return np.asarray(projection @ np.swapaxes(rotation, 1, 2))
+
     @cached_property
     def shaken(self) -> tuple[Problem, ...]:
         """The problem with made-up noise, like its own, in one velocity and then in the other.
@@ -300,7 +314,7 @@ class Problem:
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
         error = _turned(matrix, raw) - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
-        return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix)
+        return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix, dvl, reference)
 
     def _oriented(self, stream: Recording, at: Array) -> tuple[Array | None, Array | None]:
         rotation = stream.rotation_enu_from_body(at) if Needs.ATTITUDE in self.available else None

@@ -113,15 +113,24 @@ def lag(
         sums = np.real(np.fft.ifft(np.fft.fft(a, size) * np.conj(np.fft.fft(b, size))))
         return np.concatenate([sums[size - (m - 1) :], sums[:n]])
 
-    count = correlated(own, weight)
-    squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
-    squares -= 2.0 * correlated(own * one, weight * other)
-    enough = count >= max(OVERLAP * min(float(n), float(weight.sum())), SETTINGS.min_seconds / STEP_S)
-    mean = np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
+    def means(weight: Array) -> Array:
+        """Mean square of the difference at each lag, infinite where too little overlaps."""
+        count = correlated(own, weight)
+        squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
+        squares -= 2.0 * correlated(own * one, weight * other)
+        enough = count >= max(OVERLAP * min(float(n), float(weight.sum())), SETTINGS.min_seconds / STEP_S)
+        return np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
+
+    mean = means(weight)
     late = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
     near = np.abs(late) <= LONGEST_OFFSET_S + STEP_S
     best = int(np.argmin(mean))
     nearest = float(mean[near].min()) if near.any() else np.inf
+    if (
+        near.any() and not near[best]
+    ):  # on the same samples: a stretch that is noisy may be out of the far one's overlap
+        index = np.arange(m) + best - (m - 1)
+        nearest = float(means(np.where((index >= 0) & (index < n), weight, 0.0))[near].min())
     # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then it
     # agrees there, too, to what one step of the grid makes
     both = weight[1:] * weight[:-1]

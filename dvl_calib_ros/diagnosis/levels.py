@@ -1,4 +1,4 @@
-"""How the noise's level follows the vehicle: louder at speed or in turns."""
+"""How the noise's level follows what messages claim, sample by sample, and the vehicle: louder at speed or in turns."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from ..calibration.distributions import chi2_sf
 from ..calibration.frames import Array
 from ..effects.base import Needs
+from .claims import Claims, claims_of, exponents, followed, stretches_of
 from .composed import Problem, Seen
 from .noise import Noise, white_noise
 
@@ -59,8 +60,19 @@ def estimated(problem: Problem, seen: Sequence[Seen], left: Array, rotation: Arr
     """
     noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
     noise = noise.refitted(noise.robust(left))
+    names, log_claims = claims_of(problem, seen, rotation)
+    if names:
+        innovations = noise.whiten(left).reshape(left.shape)
+        noise = replace(noise, level=noise.level * followed(log_claims, innovations, names, stretches_of(problem)))
+        noise = noise.refitted(noise.robust(left))
     level = fit_level(problem, seen, noise.whiten(left).reshape(left.shape))
     if level is not None and level.p < SIGNIFICANT:
         noise = replace(noise, level=noise.level * level.values[:, None])
     robust = noise.robust(left)
     return noise.refitted(robust), robust
+
+
+def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Claims | None:
+    """How innovations (M, A), of noise at one level, follow claims that differ from sample to sample; None without."""
+    names, log_claims = claims_of(problem, seen, rotation)
+    return exponents(names, log_claims, innovations, stretches_of(problem)) if names else None

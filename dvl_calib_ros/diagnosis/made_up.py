@@ -82,8 +82,8 @@ def _moving(recording: Recording) -> Recording:
 
 def _drawn(recording: Recording, reference: Array, share: float, rng: np.random.Generator) -> Recording:
     def noisy(curve: Curve, values: Array) -> Curve:
-        noise = share * curve.noise * rng.standard_normal(values.shape)
-        return Curve(curve.time, values + noise, curve.claimed)
+        noise = share * curve.noise * curve.loudness * rng.standard_normal(values.shape)
+        return Curve(curve.time, values + noise, curve.claimed, claims=curve.claims)
 
     return replace(
         recording,

@@ -1,4 +1,6 @@
-"""What the noise is like, beside the verdict: outliers, repeats, larger than reported, coloured."""
+"""What the noise is like, beside the verdict: outliers, repeats, larger than reported, coloured; and whether it follows
+what messages claim of their own noise, where that differs from sample to sample.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +11,12 @@ import numpy as np
 
 from ..calibration.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf, robust_std
 from ..calibration.frames import Array
+from .claims import claims_of, followed, stretches_of
 from .closure import claimed_std, high_frequency_variance
 from .composed import Problem
 from .fitting import Fit, Fitter
 from .holm import holm
-from .levels import SIGNIFICANT, fit_level
+from .levels import SIGNIFICANT, fit_claims, fit_level
 from .noise import Arma, Noise
 
 LEVEL = 0.01
@@ -22,6 +25,8 @@ OUTLIER_SIGMA = 6.0
 CHANCE_OF_REPEAT = 1e-3
 # A floor this much above the reported one is worth telling
 INFLATION = 1.2
+# An exponent below this is of a claim that does not hold; the other stream's noise lowers that of an honest one, too
+HALF = 0.5
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,7 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
         _stale(problem),
         _coloured(fit.noise, fit.residual, problem),
         *_inflation(problem, fit, innovations),
+        _reported_covariance(problem, fit, innovations * fit.noise.level),
     ]
     found = [each for each in candidates if each is not None]
     if not found:
@@ -109,7 +115,10 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
             p = float(2.0 * normal_sf(np.log(ratio) / error))
             low, high = float(ratio * np.exp(-1.96 * error)), float(ratio * np.exp(1.96 * error))
             found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
-    level = fit_level(problem, fit.seen, innovations * fit.noise.level)
+    names, log_claims = claims_of(problem, fit.seen, fit.noise.rotation)
+    even = innovations * fit.noise.level
+    even = even / followed(log_claims, even, names, stretches_of(problem))
+    level = fit_level(problem, fit.seen, even)
     if level is not None and level.p < SIGNIFICANT:
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}
         z = normal_isf(np.maximum(level.p_of, 1e-300) / 2.0)
@@ -125,3 +134,18 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
         if parameters:
             found.append(NoiseFinding("noise_inflation", parameters, level.p))
     return found
+
+
+def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFinding | None:
+    """How the noise even (M, A), with its level left in, follows covariances that differ: 1 as claimed, 0 not at all.
+
+    p: of not following at all, or, of less than half, of following. None where claims are all alike.
+    """
+    found = fit_claims(problem, fit.seen, even, fit.noise.rotation)
+    if found is None:
+        return None
+    parameters, p_values = {}, []
+    for name, value, std in zip(found.names, found.exponents.tolist(), found.stds.tolist(), strict=True):
+        parameters[f"{name}_exponent"] = value, value - 1.96 * std, value + 1.96 * std
+        p_values.append(2.0 * norm.sf(abs(value - (0.0 if value > HALF else 1.0)) / std))
+    return NoiseFinding("reported_covariance", parameters, float(min(1.0, len(p_values) * min(p_values))))

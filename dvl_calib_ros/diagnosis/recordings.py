@@ -32,6 +32,7 @@ from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import KNOWN_DEFINITIONS
 from ..replay.replay import Topics, _check_topics, _of_types
+from .claims import loudness
 from .settings import SETTINGS
 
 SECOND_NS = 1_000_000_000
@@ -45,6 +46,8 @@ NOISE_ALONE, SOME_MOTION = 1.4, 2.5
 MOVING_MPS = 0.1
 # Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out
 SPIKE, SPIKE_PASSES = 12.0, 3
+# Fourth differences
+FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Streams slower than this show turns and waves barely; they have no frequencies to spare
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 # However long a recording is, its streams are averaged to no less
@@ -73,13 +76,14 @@ class Kept:
 class Curve:
     """One stream as a function of time: cubic between samples. time: (N,) s, increasing. values: (N, k). claimed:
     (k,) standard deviation that messages claim. like: a curve of the same stream, without made-up noise, that tells
-    what is noise.
+    what is noise. claims: (N, k) standard deviation that each sample's message claims.
     """
 
     time: Array
     values: Array
     claimed: Array | None = None
     like: Curve | None = None
+    claims: Array | None = None
     kept: Kept = field(init=False, default_factory=Kept, repr=False)
 
     @cached_property
@@ -109,9 +113,8 @@ class Curve:
             if part.stop - part.start < MIN_SPECTRUM or self.interval > FAST_ENOUGH_S:
                 continue
             spectrum, _ = _sines((self.like or self).values[part])
-            gain = np.column_stack(
-                [_gain(column**2, std**2) for column, std in zip(spectrum.T, self.noise, strict=True)]
-            )
+            variance = self.noise**2 * (self.loudness[part] ** 2).mean(axis=0)
+            gain = np.column_stack([_gain(column**2, of) for column, of in zip(spectrum.T, variance, strict=True)])
             own, line = _sines(self.values[part])
             values[part] = line + idst(gain * own, type=2, axis=0, norm="ortho")
         return Curve(self.time, values)
@@ -137,7 +140,7 @@ class Curve:
 
     @cached_property
     def roughness(self) -> Array:
-        """(k,) what neighbours do not tell of a sample, std: its noise, and what it is too far from them to show.
+        """(k,) what neighbours do not tell of a usual sample, std: its noise, and what it is too far from them to show.
 
         Of fourth differences, to which turns are nothing and white noise is √70 times itself.
         """
@@ -145,8 +148,14 @@ class Curve:
             return self.like.roughness
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
-        differences = np.diff(self.values, 4, axis=0)
-        return robust_std(differences) / np.sqrt(70.0)
+        return robust_std(np.diff(self.values, 4, axis=0) / self.loudness[2:-2]) / np.sqrt(70.0)
+
+    @cached_property
+    def loudness(self) -> Array:
+        """(N, k) standard deviation of each sample's noise over that of the usual one, if its claim tells it."""
+        if self.like is not None:
+            return self.like.loudness
+        return loudness(self.time, self.claims, np.diff(self.values, 4, axis=0), FOURTH)
 
     def without_spikes(self) -> Curve:
         """The same without samples far from where their neighbours are, which would bend the curve about them.
@@ -160,18 +169,20 @@ class Curve:
                 return curve
             off = np.zeros_like(x)
             off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
+            off /= curve.loudness
             scale = np.maximum(robust_std(off), 1e-9)
             far = (np.abs(off) / scale).max(axis=1)
             beside = np.maximum(np.append(far[1:], 0.0), np.append(0.0, far[:-1]))
             kept = (far < SPIKE) | (far < beside)  # what a spike does to its neighbours is not theirs
             if kept.all():
                 return curve
-            curve = Curve(curve.time[kept], x[kept], curve.claimed)
+            claims = None if curve.claims is None else curve.claims[kept]
+            curve = Curve(curve.time[kept], x[kept], curve.claimed, claims=claims)
         return curve
 
     @cached_property
     def noise(self) -> Array:
-        """(k,) standard deviation of what is noise: the roughness; of a slow stream no more than is claimed.
+        """(k,) standard deviation of a usual sample's noise: the roughness; of a slow stream no more than is claimed.
 
         Between the samples of a slow stream a vehicle turns, which is rough as well; else a claim is not believed.
         """
@@ -183,7 +194,8 @@ class Curve:
 
     def shaken(self, rng: np.random.Generator) -> Curve:
         """The same with as much noise again."""
-        return Curve(self.time, self.values + self.noise * rng.standard_normal(self.values.shape), like=self)
+        noise = self.noise * self.loudness * rng.standard_normal(self.values.shape)
+        return Curve(self.time, self.values + noise, like=self)
 
     def covers(self, at: Array) -> NDArray[np.bool_]:
         """(M,) whether samples stand on both sides, not too far apart."""
@@ -202,7 +214,10 @@ class Curve:
         counts = np.diff(np.append(starts, len(self.time)))
         time = np.add.reduceat(self.time, starts) / counts
         claimed = None if self.claimed is None else self.claimed / np.sqrt(every)
-        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed)
+        claims = self.claims
+        if claims is not None:
+            claims = np.sqrt(np.add.reduceat(claims**2, starts, axis=0)) / counts[:, None]
+        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed, claims=claims)
 
 
 def _on_cubics(values: Array) -> Array:
@@ -239,9 +254,9 @@ class Recording:
 
     name: of the bag. dvl: (N, 3) m/s, DVL frame. reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
     attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of neighbours alike in sign. rates: (G, 3) rad/s,
-    body. dvl_std, reference_std: (3,) m/s that the messages claim, the reference's in its frame; None where they do
-    not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many have the
-    very velocity of the one before; spikes: how many were far off and are left out.
+    body. dvl_std, reference_std: (3,) m/s, RMS of what the messages claim, the reference's in its frame; None where
+    they do not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many
+    have the very velocity of the one before; spikes: how many were far off and are left out.
     """
 
     name: str
@@ -318,17 +333,28 @@ def make_recording(
     axes: str = "auto",
     first_ns: int = 0,
 ) -> Recording:
-    """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4). axes: as gnss_axes."""
+    """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4).
+
+    Parameters
+    ----------
+    name: Of the recording.
+    dvl, reference, attitude, rates: (N,) s and (N, k).
+    frame: Of the reference.
+    dvl_std, reference_std: m/s that messages claim, (3,) or of each sample (N, 3); None where they do not.
+    axes: As gnss_axes.
+    first_ns: Stamp of the DVL's first sample.
+
+    """
     time, velocity = dvl
     seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
     repeats = int((np.diff(velocity, axis=0) == 0.0).all(axis=1).sum())
-    spikes = len(time) - len(Curve(time, velocity).without_spikes().time) if len(time) > 1 else 0
+    spikes = len(time) - len(_claiming(dvl, dvl_std).without_spikes().time) if len(time) > 1 else 0
 
-    def curve(stream: tuple[Array, Array] | None, claimed: Array | None = None) -> Curve | None:
+    def curve(stream: tuple[Array, Array] | None, std: Array | None = None) -> Curve | None:
         if stream is None or len(stream[0]) < 2:
             return None
-        return Curve(*stream, claimed).without_spikes().averaged(rate)
+        return _claiming(stream, std).without_spikes().averaged(rate)
 
     if attitude is not None:
         attitude = attitude[0], _alike_in_sign(attitude[1])
@@ -336,9 +362,35 @@ def make_recording(
     if dvl_curve is None or reference_curve is None:
         raise InputError(f"{name}: fewer than two samples of DVL or reference")
     return Recording(
-        name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), dvl_std, reference_std,
-        _measured_axes(reference[1], reference_std, axes), repeats, len(time), spikes, first_ns,
+        name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), _rms(dvl_std), _rms(reference_std),
+        _measured_axes(reference[1], _usual(reference_std), axes), repeats, len(time), spikes, first_ns,
     )  # fmt: skip
+
+
+def _usual(std: Array | None) -> Array | None:
+    """(3,) median of claims (3,) or (N, 3)."""
+    return std if std is None or std.ndim == 1 else np.asarray(np.median(std, axis=0))
+
+
+def _rms(std: Array | None) -> Array | None:
+    """(3,) RMS of claims (3,) or (N, 3), without those that say that nothing was measured."""
+    usual = _usual(std)
+    if std is None or usual is None or std.ndim == 1:
+        return std
+    known = std < SETTINGS.unmeasured_std
+    squares = np.where(known, std, 0.0) ** 2
+    rms = np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
+    return np.where(usual < SETTINGS.unmeasured_std, rms, usual)
+
+
+def _claiming(stream: tuple[Array, Array], std: Array | None) -> Curve:
+    """A stream with what its messages claim, (3,) or (N, 3); who says -1 or nothing claims what is usual."""
+    usual = _usual(std)
+    if std is None or usual is None or std.ndim == 1:
+        return Curve(*stream, std)
+    finite = np.where(np.isfinite(usual), usual, SETTINGS.unmeasured_std)
+    claims = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
+    return Curve(*stream, usual, claims=np.minimum(claims, SETTINGS.unmeasured_std))
 
 
 def _alike_in_sign(quaternions: Array) -> Array:
@@ -443,7 +495,7 @@ def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[
     dvl = _without_zeros(dvl, reference, notes)
     velocity, std, frame = reference.values, _std(reference.covariances), FRAMES[code]
     if frame is VelocityFrame.NED:
-        velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[[1, 0, 2]], VelocityFrame.ENU
+        velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[:, [1, 0, 2]], VelocityFrame.ENU
     if frame is VelocityFrame.ENU:
         velocity = velocity - np.array([*parameters.reference_velocity_offset, 0.0])
     imu = _in_order(streams.imu.part(streams.imu.refused == 0), parameters, notes)
@@ -457,14 +509,16 @@ def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[
         )
     at = clocks.dvl(dvl.stamps_ns, first_ns)
     imu_ns = clocks.imu_ns
+    dvl_stream, dvl_std = _claimed_stream(at, dvl.values, _std(dvl.covariances), first_ns)
+    reference_stream, std = _claimed_stream(reference.stamps_ns - clocks.reference_ns, velocity, std, first_ns)
     return make_recording(
         name,
-        _stream(at, dvl.values, first_ns),
-        _stream(reference.stamps_ns - clocks.reference_ns, velocity, first_ns),
+        dvl_stream,
+        reference_stream,
         frame=frame,
         attitude=_stream(oriented.stamps_ns - imu_ns, oriented.orientation, first_ns) if len(oriented) > 1 else None,
         rates=_stream(rated.stamps_ns - imu_ns, rated.angular_velocity, first_ns) if len(rated) > 1 else None,
-        dvl_std=_std(dvl.covariances),
+        dvl_std=dvl_std,
         reference_std=std,
         axes=parameters.gnss_axes,
         first_ns=first_ns,
@@ -475,6 +529,16 @@ def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple
     time = 1e-9 * (stamps_ns - first_ns)
     later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])  # a jump taken off may cross two
     return time[later], values[later]
+
+
+def _claimed_stream(
+    stamps_ns: NDArray[np.int64], values: Array, std: Array | None, first_ns: int
+) -> tuple[tuple[Array, Array], Array | None]:
+    """`_stream` with the claims (N, 3) of its samples."""
+    if std is None:
+        return _stream(stamps_ns, values, first_ns), None
+    time, both = _stream(stamps_ns, np.hstack([values, std]), first_ns)
+    return (time, both[:, :3]), both[:, 3:]
 
 
 def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
@@ -526,9 +590,9 @@ def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> S
 
 
 def _std(covariances: Covariances) -> Array | None:
-    """(3,) median standard deviation per axis that messages claim; infinite where -1 or more; None where not given."""
+    """(N, 3) standard deviation per axis that messages claim; infinite where -1 or more; None where not given."""
     if not len(covariances.index) or (covariances.index < 0).any():
         return None
     variance = np.diagonal(covariances.distinct, axis1=1, axis2=2)[covariances.index]
-    variance = np.median(np.where(variance < 0.0, np.inf, variance), axis=0)
-    return None if (variance < SMALLEST_VARIANCE).any() else np.asarray(np.sqrt(variance))
+    variance = np.where(variance < 0.0, np.inf, variance)
+    return None if (np.median(variance, axis=0) < SMALLEST_VARIANCE).any() else np.asarray(np.sqrt(variance))

@@ -38,6 +38,7 @@ NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",
     "stale_samples": "samples that repeat the one before, as a share",
     "noise_inflation": "the noise is larger than reported, or grows with speed or turn rate",
+    "reported_covariance": "how the noise follows covariances that differ by sample: 1 as claimed, 0 not at all",
     "coloured_reference_noise": "the noise has a memory",
 }
 # Lines over time are means over this share of the run, and over so many seconds at least

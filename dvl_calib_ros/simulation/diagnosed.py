@@ -14,7 +14,7 @@ from .scenario import Scenario
 from .sensors import JANUS_FROM_VERTICAL, DvlErrors
 
 # Findings that are no effect with a size: noise_std holds the one already, of the other nobody knows how much
-_NOT_TAKEN = ("noise_inflation", "coloured_reference_noise", NOT_EXPLAINED)
+_NOT_TAKEN = ("noise_inflation", "coloured_reference_noise", "reported_covariance", NOT_EXPLAINED)
 
 
 def with_dvl(scenario: Scenario, description: DvlDescription) -> tuple[Scenario, tuple[str, ...]]:

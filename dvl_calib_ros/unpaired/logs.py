@@ -80,7 +80,7 @@ def dithered(recording: Recording) -> Recording:
     """The recording with white noise over its DVL, the same at every call."""
     dvl = recording.dvl
     noise = DITHER_MPS * np.random.default_rng(0).standard_normal(dvl.values.shape)
-    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed))
+    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed, claims=dvl.claims))
 
 
 def dvl_residuals(selection: Selection) -> tuple[Array, ...]:

@@ -1,0 +1,158 @@
+"""How far the noise of single samples is what their messages claim.
+
+Receivers go from a fixed to a floating solution, DVLs tell how good a ping was: then reported covariances differ from
+sample to sample. How large the noise is in all, the data tells; which sample is worth more, the claims may. The
+exponent of what they claim is fitted: 1 is a claim that holds, 0 one that says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from ..calibration.frames import Array
+
+if TYPE_CHECKING:
+    from .composed import Problem, Seen
+
+# A claim is followed where its exponent is above zero at this level (one-sided)
+SURE = 1e-4
+# Claims that differ by less (standard deviation of their logarithm) tell no sample from another
+DIFFER = 0.05
+# Samples of one stretch whose squares may be alike, whatever makes them so
+STRETCH_S = 20.0
+# However far claims lie apart: logarithm of the level about its mean
+FARTHEST = 4.0
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Exponents (c,) of claims, and their standard deviations, by name of the stream."""
+
+    names: tuple[str, ...]
+    exponents: Array
+    stds: Array
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """(c,) whether the noise follows the claim at all."""
+        return np.asarray(self.exponents > norm.isf(SURE) * self.stds)
+
+
+def differ(log_claims: Array) -> bool:
+    """Whether claims (M, A) tell some samples from others."""
+    return bool(np.max(np.std(log_claims, axis=0), initial=0.0) > DIFFER)
+
+
+def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Claims:
+    """Fit of log squares of values (M, A) to claims (M, A, c), each axis about its own mean.
+
+    Parameters
+    ----------
+    names: Of the c streams.
+    log_claims: Logarithms of standard deviations.
+    values: Noise, white; of any size.
+    stretch: (M,) index of stretches of time, by whose scatter the fit is judged.
+
+    """
+    y = np.log(np.maximum(values**2, 1e-12 * np.median(values**2) + 1e-300))
+    y = y - y.mean(axis=0)
+    x = log_claims - log_claims.mean(axis=0)
+    inverse = np.linalg.pinv(np.einsum("mac,mad->cd", x, x))
+    slopes = inverse @ np.einsum("mac,ma->c", x, y)
+    scores = np.einsum("mac,ma->mc", x, y - x @ slopes)
+    sums = np.stack([np.bincount(stretch, column) for column in scores.T], axis=1)
+    n = len(sums)
+    covariance = inverse @ (sums.T @ sums) @ inverse * n / max(n - len(slopes) - 1, 1)
+    return Claims(tuple(names), 0.5 * slopes, 0.5 * np.sqrt(np.maximum(np.diag(covariance), 1e-300)))
+
+
+def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: NDArray[np.intp]) -> Array:
+    """(M, A) relative standard deviation of values (M, A), as far as they surely follow claims (M, A, c)."""
+    kept = list(range(log_claims.shape[2]))
+    while kept:
+        found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
+        if found.sure.all():
+            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, 1.0)
+            return np.asarray(np.exp(np.clip(logarithm, -FARTHEST, FARTHEST)))
+        kept.pop(int(np.argmin(found.exponents / found.stds)))
+    return np.ones(values.shape)
+
+
+# ------------------------------------------------------------------ of one stream
+
+
+def loudness(time: Array, claims: Array | None, differences: Array, weights: Array) -> Array:
+    """(N, k) relative standard deviation of a stream's samples, of the usual one, as far as it follows their claims.
+
+    Parameters
+    ----------
+    time: (N,) s.
+    claims: (N, k) standard deviations, None without.
+    differences: (N - w + 1, k) of w neighbours, in which motion does not count.
+    weights: (w,) of the neighbours in these.
+
+    """
+    shape = len(time), differences.shape[1]
+    if claims is None or len(differences) < len(weights) or not differ(np.log(claims)):
+        return np.ones(shape)
+    variance = np.stack([np.convolve(column, weights**2, "valid") for column in (claims**2).T], axis=1)
+    middle = time[len(weights) // 2 :][: len(differences)]
+    stretch = np.floor((middle - middle[0]) / STRETCH_S).astype(np.intp)
+    found = exponents(["own"], 0.5 * np.log(variance)[:, :, None], differences, stretch)
+    if not found.sure.all():
+        return np.ones(shape)
+    usual = np.median(claims, axis=0)
+    return np.asarray((claims / usual) ** min(float(found.exponents[0]), 1.0))
+
+
+# ------------------------------------------------------------------ of what is compared
+
+
+def claims_of(problem: Problem, seen: Sequence[Seen], rotation: Array | None) -> tuple[tuple[str, ...], Array]:
+    """Streams whose claims differ, and logarithms (M, A, c) of these in the frame of the noise."""
+    names, columns = [], []
+    for name in ("dvl", "reference"):
+        each = _of_stream(problem, seen, rotation, name)
+        if each is not None and differ(each):
+            names.append(name)
+            columns.append(each)
+    return tuple(names), np.stack(columns, axis=2) if columns else np.zeros((len(problem.time), problem.axes, 0))
+
+
+def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, name: str) -> Array | None:
+    """(M, A) log standard deviation, None where a recording has none."""
+    parts = []
+    start = 0
+    for recording, grid, each in zip(problem.recordings, problem.grids, seen, strict=True):
+        curve, stamps = (
+            (recording.dvl, each.dvl_stamps) if name == "dvl" else (recording.reference, each.reference_stamps)
+        )
+        if curve.claims is None:
+            return None
+        variance = np.stack([np.interp(stamps, curve.time, column) for column in (curve.claims**2).T], axis=1)
+        variance = grid.averaged(variance)
+        at = slice(start, start + len(variance))
+        start = at.stop
+        if name == "reference":
+            variance = np.where(recording.measured, variance, 0.0)
+        used = variance[:, variance.any(axis=0)]
+        if np.ptp(used, axis=1).max(initial=0.0) <= 1e-9 * used.max(initial=0.0):  # alike on all axes, so in any frame
+            parts.append(np.repeat(used[:, :1], problem.axes, axis=1))
+            continue
+        to_compared = problem.to_compared(recording, grid.bin_time, of_dvl=name == "dvl")
+        turned = to_compared if rotation is None else rotation[at] @ to_compared
+        parts.append((turned**2 @ variance[:, :, None])[:, :, 0])
+    return np.asarray(0.5 * np.log(np.maximum(np.concatenate(parts), 1e-12)))
+
+
+def stretches_of(problem: Problem) -> NDArray[np.intp]:
+    """(M,) index of the stretch of time of each bin."""
+    index = np.floor(problem.time / STRETCH_S).astype(int)
+    keys = problem.recording_of * (int(np.ptp(index)) + 1) + index - index.min()
+    return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)
