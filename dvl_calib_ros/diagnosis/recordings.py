@@ -157,27 +157,36 @@ class Curve:
             return self.like.loudness
         return loudness(self.time, self.claims, np.diff(self.values, 4, axis=0), FOURTH)
 
+    def part(self, kept: NDArray[np.bool_]) -> Curve:
+        """The samples (N,) that are to be kept."""
+        claims = None if self.claims is None else self.claims[kept]
+        return Curve(self.time[kept], self.values[kept], self.claimed, claims=claims)
+
+    @cached_property
+    def from_neighbours(self) -> Array:
+        """(N, k) how far samples are from the cubic through two neighbours on either side, over their loudness."""
+        x = self.values
+        off = np.zeros_like(x)
+        off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
+        return off / self.loudness
+
     def without_spikes(self) -> Curve:
         """The same without samples far from where their neighbours are, which would bend the curve about them.
 
-        Of a fast stream only: between the samples of a slow one a vehicle can turn.
+        Of a fast stream only: between the samples of a slow one a vehicle can turn (`without_contradicted`).
         """
         curve = self
         for _ in range(SPIKE_PASSES):
-            x = curve.values
-            if curve.interval > FAST_ENOUGH_S or len(x) < 10:
+            if curve.interval > FAST_ENOUGH_S or len(curve.time) < 10:
                 return curve
-            off = np.zeros_like(x)
-            off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
-            off /= curve.loudness
+            off = curve.from_neighbours
             scale = np.maximum(robust_std(off), 1e-9)
             far = (np.abs(off) / scale).max(axis=1)
             beside = np.maximum(np.append(far[1:], 0.0), np.append(0.0, far[:-1]))
             kept = (far < SPIKE) | (far < beside)  # what a spike does to its neighbours is not theirs
             if kept.all():
                 return curve
-            claims = None if curve.claims is None else curve.claims[kept]
-            curve = Curve(curve.time[kept], x[kept], curve.claimed, claims=claims)
+            curve = curve.part(kept)
         return curve
 
     @cached_property

@@ -20,6 +20,7 @@ from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..effects.base import Effect
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
+from .contradicted import without_contradicted
 from .first_fit import FirstGuess, first_guess
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
 from .least_squares import WhitenedLeastSquares
@@ -105,6 +106,10 @@ def select(
     """Select among testable effects."""
     problem, start, guesses = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
+    kept = without_contradicted(problem, fit.hypothesis)
+    if kept is not None:
+        problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+        fitter, fit = _first_fit(problem, fit.hypothesis)
     fitter, fit = _about(fitter, fit, effects)
     best = fit
     seen_before: set[frozenset[str]] = set()

@@ -72,7 +72,10 @@ def read_log(
     recordings = tuple(dithered(one) for one in loaded.recordings) if exact else loaded.recordings
     diagnosis = diagnose_recordings(recordings, source.parameters, loaded.notes, effects, with_series)
     on_progress(1.0)
-    residuals = () if diagnosis.selection is None else dvl_residuals(diagnosis.selection)
+    residuals: tuple[Array, ...] = ()
+    if diagnosis.selection is not None:
+        residuals = dvl_residuals(diagnosis.selection)
+        recordings = diagnosis.selection.fitter.problem.recordings  # without samples that were left out
     return Log(diagnosis, recordings, facts, residuals, exact, not exact and is_copied(recordings, residuals))
 
 
