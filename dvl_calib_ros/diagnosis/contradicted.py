@@ -17,7 +17,7 @@ from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn
 from ..effects.composition import late
 from .composed import Hypothesis, Problem
-from .recordings import FAST_ENOUGH_S, SPIKE_PASSES, Curve, Recording
+from .recordings import FAST_ENOUGH_S, Recording
 
 # Scatter about neighbours and about the other stream, beyond which both contradict
 FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
@@ -69,38 +69,29 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
     for _ in range(_PASSES):
         true = curve.time - late(injections, clock, true)
     seen = problem.seen(hypothesis, index, true)
-    known = other.covers(seen.reference_stamps if of_dvl else seen.dvl_stamps)
     measured = np.array(problem.measured)
-    for _ in range(SPIKE_PASSES):
-        at = np.flatnonzero(kept)
-        part = curve.part(kept)
-        off = _in_body(problem, hypothesis, recording, part, of_dvl, true[at]) * measured
-        error = (seen.error[at] if of_dvl else -seen.error[at]) * measured
-        from_neighbours, from_other = _far(off), _far(error)
-        along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300)
-        bad = (from_neighbours > FROM_NEIGHBOURS) & (from_other > FROM_OTHER) & known[at]
-        bad &= (along > ALIKE[0]) & (along < ALIKE[1])
-        beside = np.maximum(np.append(from_neighbours[1:], 0.0), np.append(0.0, from_neighbours[:-1]))
-        bad &= from_neighbours >= beside  # what a spike does to its neighbours is not theirs
-        if not bad.any():
-            break
-        kept[at[bad]] = False
-    return kept
+    error = (seen.error if of_dvl else -seen.error) * measured
+    suspicious = other.covers(seen.reference_stamps if of_dvl else seen.dvl_stamps)
+    suspicious &= np.abs(error / _scatter(error)).max(axis=1) > FROM_OTHER
+    others = curve.part(~suspicious)  # two that are off side by side would bear each other out
+    if not suspicious.any() or len(others.time) < FEWEST:
+        return kept
+
+    def in_body(values: Array) -> Array:
+        if of_dvl:
+            return np.asarray(values @ hypothesis.body_from_measured(problem.rotation_dvl_from_body).T) * measured
+        if recording.frame is VelocityFrame.BODY:
+            return values * measured
+        return np.asarray(np.einsum("nji,nj->ni", recording.rotation_enu_from_body(true), values)) * measured
+
+    usual = _scatter(in_body(curve.from_neighbours))
+    off = in_body((curve.values - others(curve.time)) / curve.loudness)
+    along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300) / curve.loudness.mean(axis=1)
+    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > FROM_NEIGHBOURS)
+    bad &= (along > ALIKE[0]) & (along < ALIKE[1])
+    return ~bad
 
 
-def _far(values: Array) -> Array:
-    """(N,) how many standard deviations values (N, 3) are from nothing, on the axis on which they are farthest."""
-    scale = np.maximum(np.asarray(median_abs_deviation(values, axis=0, scale="normal")), 1e-9)
-    return np.asarray((np.abs(values) / scale).max(axis=1))
-
-
-def _in_body(
-    problem: Problem, hypothesis: Hypothesis, recording: Recording, curve: Curve, of_dvl: bool, true: Array
-) -> Array:
-    """(N, 3) how far samples of a stream are from what their neighbours tell, body frame."""
-    off = curve.from_neighbours
-    if of_dvl:
-        return np.asarray(off @ hypothesis.body_from_measured(problem.rotation_dvl_from_body).T)
-    if recording.frame is VelocityFrame.BODY:
-        return off
-    return np.asarray(np.einsum("nji,nj->ni", recording.rotation_enu_from_body(true), off))
+def _scatter(values: Array) -> Array:
+    """(3,) standard deviation of values (N, 3), robustly."""
+    return np.maximum(np.asarray(median_abs_deviation(values, axis=0, scale="normal")), 1e-9)
