@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # A claim is followed where its exponent is above zero at this level (one-sided)
 SURE = 1e-4
+# Who writes standard deviations where variances belong claims the roots of what is: an exponent of 2
+LARGEST = 2.0
 # Claims that differ by less (standard deviation of their logarithm) tell no sample from another
 DIFFER = 0.05
 # Samples of one stretch whose squares may be alike, whatever makes them so
@@ -78,7 +80,7 @@ def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: ND
     while kept:
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
         if found.sure.all():
-            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, 1.0)
+            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, LARGEST)
             return np.asarray(np.exp(np.clip(logarithm, -FARTHEST, FARTHEST)))
         kept.pop(int(np.argmin(found.exponents / found.stds)))
     return np.ones(values.shape)
@@ -108,7 +110,7 @@ def loudness(time: Array, claims: Array | None, differences: Array, weights: Arr
     if not found.sure.all():
         return np.ones(shape)
     usual = np.median(claims, axis=0)
-    return np.asarray((claims / usual) ** min(float(found.exponents[0]), 1.0))
+    return np.asarray((claims / usual) ** min(float(found.exponents[0]), LARGEST))
 
 
 # ------------------------------------------------------------------ of what is compared

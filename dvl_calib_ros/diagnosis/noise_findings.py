@@ -5,7 +5,7 @@ what messages claim of their own noise, where that differs from sample to sample
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from .composed import Problem
 from .fitting import Fit, Fitter
 from .holm import holm
 from .levels import SIGNIFICANT, fit_claims, fit_level
+from .made_up import made_up
 from .noise import Arma, Noise
 
 LEVEL = 0.01
@@ -25,6 +26,8 @@ OUTLIER_SIGMA = 6.0
 CHANCE_OF_REPEAT = 1e-3
 # A floor this much above the reported one is worth telling
 INFLATION = 1.2
+# Recordings with white noise that tell what colour comparing gives it
+MADE_UP = 5
 # An exponent below this is of a claim that does not hold; the other stream's noise lowers that of an honest one, too
 HALF = 0.5
 
@@ -46,7 +49,7 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
     candidates = [
         _outliers(innovations, problem),
         _stale(problem),
-        _coloured(fit.noise, fit.residual, problem),
+        _coloured(problem, fit),
         *_inflation(problem, fit, innovations),
         _reported_covariance(problem, fit, innovations * fit.noise.level),
     ]
@@ -82,7 +85,9 @@ def _stale(problem: Problem) -> NoiseFinding | None:
     return NoiseFinding("stale_samples", {"share": (count / n, *binomial_interval(count, n))}, p)
 
 
-def _coloured(noise: Noise, residual: Array, problem: Problem) -> NoiseFinding | None:
+def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
+    """Whether the noise has a memory, beyond that which streams of white noise get where they are compared."""
+    noise, residual = fit.noise, fit.residual
     if all(not len(arma.ar) for arma in noise.axes):
         return None
     drop = noise.refitted(residual, [(0, 0)]).deviance(residual) - noise.deviance(residual)
@@ -92,9 +97,33 @@ def _coloured(noise: Noise, residual: Array, problem: Problem) -> NoiseFinding |
     constant = _time_constant(clearest, interval)
     if constant < 2.0 * interval:
         return None  # neighbours share samples of the reference by interpolation
+    if chi2.sf(drop, dof) < LEVEL:
+        drop = min(drop, _made_by_comparing(problem, fit).deviance(residual) - noise.deviance(residual))
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
     parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
     return NoiseFinding("coloured_reference_noise", parameters, float(chi2_sf(max(drop, 0.0), dof)))
+
+
+def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
+    """The noise with the colour that comparing gives to white noise.
+
+    A stream that is `quiet` between its samples has only the low frequencies of its noise left, which are as slow as
+    the vehicle's motion.
+    """
+    noise, white = fit.noise, replace(fit, noise=fit.noise.white)
+    residuals = [residual for _, _, residual in made_up(problem, white, MADE_UP)]
+    m = len(fit.residual)
+    pooled = replace(
+        noise,
+        segments=tuple(
+            slice(part.start + k * m, part.stop + k * m) for k in range(len(residuals)) for part in noise.segments
+        ),
+        rotation=None if noise.rotation is None else np.concatenate([noise.rotation] * len(residuals)),
+        level=np.concatenate([noise.level] * len(residuals)),
+    ).like(np.concatenate(residuals))
+    unit = replace(noise, axes=tuple(replace(arma, std=1.0) for arma in pooled.axes))
+    stds = np.sqrt((unit.whiten(fit.residual).reshape(fit.residual.shape) ** 2).mean(axis=0)).tolist()
+    return replace(unit, axes=tuple(replace(arma, std=std) for arma, std in zip(unit.axes, stds, strict=True)))
 
 
 def _time_constant(arma: Arma, interval: float) -> float:
