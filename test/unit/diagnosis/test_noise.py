@@ -1,0 +1,260 @@
+"""The noise as the diagnosis takes it: claims of single samples, spikes of slow streams, colour."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.diagnosis.claims import claims_of, exponents, followed
+from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
+from dvl_calib_ros.diagnosis.contradicted import without_contradicted
+from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
+from dvl_calib_ros.diagnosis.far_clocks import lag
+from dvl_calib_ros.diagnosis.recordings import Recording, make_recording
+from dvl_calib_ros.diagnosis.results import Verdict
+from dvl_calib_ros.diagnosis.selection import blocks_of
+from dvl_calib_ros.simulation.injection import injection
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+CLAIMS = (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
+# A receiver that floats for a third of the run, m/s
+FIXED, FLOATING, FROM_S, TO_S = 0.03, 0.3, 120.0, 250.0
+Streams = dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def streams(*effects: str, seed: int = 1, trajectory: str = "free", seconds: float = 400.0, **changes) -> Streams:
+    """Of a run whose reference has next to no noise."""
+    rates = {"dvl_rate": 2.5, "gnss_rate": 2.5, "imu_rate": 10.0, "gnss_std": 1e-6} | changes
+    errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.003)
+    given = Scenario(
+        trajectory, seconds=seconds, seed=seed, errors=errors, effects=tuple(map(injection, effects)), **rates
+    )
+    run = simulate(given)
+    first_ns = run.dvl[0].stamp_ns
+
+    def stream(samples, field):
+        time = np.array([1e-9 * (sample.stamp_ns - first_ns) for sample in samples])
+        order = np.argsort(time)
+        return time[order], np.array([getattr(sample, field) for sample in samples])[order]
+
+    return {
+        "dvl": stream(run.dvl, "velocity"),
+        "reference": stream(run.gnss, "velocity"),
+        "attitude": stream(run.imu, "orientation"),
+        "rates": stream(run.imu, "angular_velocity"),
+    }
+
+
+def floating(given: Streams, seed: int = 1) -> tuple[Streams, np.ndarray]:
+    """The same with a reference as loud as a standard deviation (N, 3), and that."""
+    time, velocity = given["reference"]
+    std = np.where((time > FROM_S) & (time < TO_S), FLOATING, FIXED)[:, None] * np.ones(3)
+    noise = std * np.random.default_rng(1000 + seed).standard_normal(std.shape)
+    return given | {"reference": (time, velocity + noise)}, std
+
+
+def recorded(given: Streams, std: np.ndarray | None = None) -> Recording:
+    dvl_std = None if std is None else np.full((len(given["dvl"][0]), 3), 0.004)
+    return make_recording("run", frame=VelocityFrame.ENU, dvl_std=dvl_std, reference_std=std, **given)
+
+
+def claimed_otherwise(std: np.ndarray) -> dict[str, np.ndarray | None]:
+    rng = np.random.default_rng(5)
+    return {
+        "random": 0.03 * np.exp(rng.standard_normal((len(std), 1))) * np.ones(3),
+        "constant": np.full_like(std, 0.1),
+        "nothing": None,
+    }
+
+
+# ------------------------------------------------------------------ claims of single samples
+
+
+@pytest.mark.slow
+def test_a_reference_that_says_when_it_is_noisy_is_worth_what_the_best_weights_make_of_it():
+    given, std = floating(streams("lever_arm:x_m=0.4"))
+    diagnosis = diagnose_recordings([recorded(given, std)], Parameters())
+    assert [effect.name for effect in diagnosis.effects] == ["lever_arm"]
+    _, low, high = diagnosis.effects[0].parameters["x_m"]
+    assert low < 0.4 < high
+    problem, fit = diagnosis.selection.fitter.problem, diagnosis.selection.fit
+    true = np.stack(
+        [np.interp(problem.grids[0].stamps, given["reference"][0], column) ** 2 for column in std.T], axis=1
+    )
+    true = np.sqrt(problem.grids[0].averaged(true) / problem.grids[0].per_bin)
+    white = (fit.columns / true[:, :, None]).reshape(-1, fit.columns.shape[2])
+    prior = np.diag([1e2] * 3 + [2.5e3] * 3 + [0.0] * 3)
+    best = np.sqrt(np.diag(np.linalg.inv(white.T @ white + prior)))
+    own = np.sqrt(np.diag(fit.covariance(blocks_of(problem))))
+    assert own[6] == pytest.approx(best[6], rel=0.15)
+    assert np.all(own[:6] < 1.4 * best[:6])
+    finding = {each.name: each.parameters for each in diagnosis.noise}["reported_covariance"]
+    assert finding["reference_exponent"][0] == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.slow
+def test_an_effect_is_found_by_what_samples_claim_that_is_not_without():
+    given, std = floating(streams("lever_arm:x_m=0.12", seed=3, trajectory="figure8"), seed=3)
+    with_claims, without = (diagnose_recordings([recorded(given, each)], Parameters()) for each in (std, None))
+    assert "lever_arm" in [effect.name for effect in with_claims.effects]
+    assert "lever_arm" not in [effect.name for effect in without.effects]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "trajectory"), [(20, "free"), (21, "box"), (22, "lawnmower")])
+def test_noise_that_is_louder_for_a_while_and_says_so_is_no_effect(seed, trajectory):
+    given, std = floating(streams(seed=seed, trajectory=trajectory), seed)
+    assert diagnose_recordings([recorded(given, std)], Parameters()).verdict not in CLAIMS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["random", "constant", "nothing"])
+def test_claims_that_say_nothing_change_nothing(what):
+    given = streams(seed=4)
+    time, velocity = given["reference"]
+    noise = 0.05 * np.random.default_rng(4).standard_normal(velocity.shape)
+    given["reference"] = time, velocity + noise
+    usual = recorded(given, np.full_like(velocity, 0.05))
+    other = recorded(given, claimed_otherwise(np.full_like(velocity, 0.05))[what])
+    one, two = (diagnose_recordings([each], Parameters()).selection.fit for each in (usual, other))
+    assert one.hypothesis.phi == pytest.approx(two.hypothesis.phi, abs=1e-9)
+    assert one.noise.level == pytest.approx(two.noise.level)
+
+
+def test_the_exponent_of_a_claim_is_found_whatever_the_noise_is_in_all():
+    rng = np.random.default_rng(0)
+    claims = np.repeat(rng.normal(0.0, 0.7, (100, 1)), 10, axis=0) * np.ones((1, 3))
+    stretch = np.arange(1000) // 25
+    for exponent in (0.0, 0.5, 1.0, 2.0):
+        values = 0.02 * np.exp(exponent * claims) * rng.standard_normal(claims.shape)
+        found = exponents(["reference"], claims[:, :, None], values, stretch)
+        assert found.exponents[0] == pytest.approx(exponent, abs=4.0 * found.stds[0])
+        assert bool(found.sure[0]) == (exponent > 0.0)
+        relative = followed(claims[:, :, None], values, ["reference"], stretch)
+        assert np.std(np.log(relative) - exponent * (claims - claims.mean(axis=0))) < 0.1
+
+
+def test_claims_of_the_earths_axes_are_turned_into_the_frame_of_the_noise():
+    time = np.arange(0.0, 100.0, 0.2)
+    east = np.column_stack([1.0 + 0.2 * np.sin(0.3 * time), 0.1 * np.cos(0.2 * time), 0.05 * np.sin(time)])
+    std = np.where(time[:, None] < 50.0, [0.1, 0.02, 0.05], [0.2, 0.04, 0.1])
+    heading = Rotation.from_euler("z", np.full((len(time), 1), np.pi / 2))  # ahead is north
+    run = make_recording(
+        "run", (time, heading.inv().apply(east)), (time, east), attitude=(time, heading.as_quat()),
+        reference_std=std, dvl_std=np.full((len(time), 3), 0.01),
+    )  # fmt: skip
+    problem = make_problem([run], np.eye(3), np.zeros(3), [Offsets()])
+    seen = problem.all_seen(no_effect())
+    for rotation, order in ((None, [1, 0, 2]), (problem.earth_from_compared, [0, 1, 2])):
+        names, claims = claims_of(problem, seen, rotation)
+        assert names == ("reference",)
+        early = problem.time < 49.0
+        expected = np.log(np.array([0.1, 0.02, 0.05])[order])
+        assert claims[early, :, 0] == pytest.approx(np.tile(expected, (int(early.sum()), 1)), abs=1e-6)
+
+
+def test_a_stream_that_says_when_it_is_loud_has_no_spikes_then():
+    rng = np.random.default_rng(0)
+    time = np.arange(0.0, 400.0, 0.2)
+    std = np.where(time > 270.0, 0.5, 0.02)[:, None] * np.ones(3)
+    velocity = std * rng.standard_normal(std.shape)
+    dvl = (time, 0.01 * rng.standard_normal(std.shape))
+    said, silent = (make_recording("run", dvl, (time, velocity), reference_std=each) for each in (std, None))
+    assert len(said.reference.time) == len(time)
+    assert len(silent.reference.time) < len(time) - 100
+
+
+def test_a_noisy_stretch_is_no_reason_to_refuse_clocks_that_agree():
+    """At a lag of one lap it lies outside what overlaps."""
+    time, rng = np.arange(0.0, 500.0, 0.5), np.random.default_rng(0)
+    course = np.exp(2j * np.sin(2.0 * np.pi * time / 200.0)) + 0.005 * rng.standard_normal(len(time))
+    noisy = course + np.where(time < 150.0, 1.0, 0.005) * rng.standard_normal(len(time))
+    late, is_far = lag(course, 0.0, noisy, 0.0)
+    assert not is_far and abs(late) <= 1.0
+
+
+# ------------------------------------------------------------------ spikes of slow streams
+
+
+def spiked(given: Streams, every: int) -> tuple[Streams, np.ndarray]:
+    """DVL samples off by metres per second, now and then two side by side; which."""
+    time, velocity = given["dvl"]
+    rng = np.random.default_rng(3)
+    wild = np.zeros(len(time), dtype=bool)
+    wild[10 : len(time) - 10 : every] = True
+    wild[11] = True
+    return given | {"dvl": (time, velocity + wild[:, None] * rng.choice([-1.5, 1.5], velocity.shape))}, wild
+
+
+def slow(*effects: str) -> Streams:
+    given = streams(*effects, seconds=600.0, trajectory="lawnmower", dvl_rate=1.0, gnss_rate=5.0, seed=2)
+    time, velocity = given["reference"]
+    return given | {"reference": (time, velocity + 0.03 * np.random.default_rng(2).standard_normal(velocity.shape))}
+
+
+@pytest.mark.slow
+def test_wild_samples_at_1_hz_are_left_out_and_make_no_effect():
+    given, wild = spiked(slow(), 100)
+    diagnosis = diagnose_recordings([recorded(given)], Parameters())
+    assert diagnosis.verdict not in CLAIMS
+    kept = diagnosis.selection.fitter.problem.recordings[0]
+    assert not np.isin(given["dvl"][0][wild], kept.dvl.time).any()
+    assert kept.spikes == int(wild.sum())
+    assert "outliers" in [each.name for each in diagnosis.noise]
+
+
+@pytest.mark.slow
+def test_what_turns_do_to_a_dvl_at_1_hz_is_no_spike():
+    given = slow("lever_arm:x_m=-1.9,y_m=0.5")
+    diagnosis = diagnose_recordings([recorded(given)], Parameters())
+    assert [effect.name for effect in diagnosis.effects] == ["lever_arm"]
+    assert diagnosis.selection.fitter.problem.recordings[0].spikes == 0
+
+
+def test_a_sample_that_only_its_neighbours_contradict_is_kept():
+    """Both streams show it: the vehicle did that."""
+    time = np.arange(0.0, 300.0, 1.0)
+    velocity = np.column_stack([1.0 + 0.3 * np.sin(0.02 * time), 0.1 * np.cos(0.03 * time), 0.0 * time])
+    velocity = velocity + 0.005 * np.random.default_rng(1).standard_normal(velocity.shape)
+    jerked = velocity.copy()
+    jerked[150] += [0.5, 0.5, 0.0]
+    problem, wild = (
+        make_problem(
+            [make_recording("run", (time, jerked), (time, reference), frame=VelocityFrame.BODY)],
+            np.eye(3), np.zeros(3), [Offsets()],
+        )
+        for reference in (jerked, velocity)
+    )  # fmt: skip
+    assert without_contradicted(problem, no_effect()) is None
+    (kept,) = without_contradicted(wild, no_effect())
+    assert sorted(set(time) - set(kept.dvl.time)) == [150.0]
+
+
+# ------------------------------------------------------------------ colour
+
+
+@pytest.mark.slow
+def test_white_noise_of_two_streams_is_not_called_coloured_for_how_they_are_compared():
+    given = streams(seconds=300.0, dvl_rate=5.0, gnss_rate=5.0, seed=7)
+    rng = np.random.default_rng(7)
+    for stream, std in (("dvl", [0.03, 0.03, 0.008]), ("reference", [0.02, 0.02, 0.02])):
+        time, velocity = given[stream]
+        given[stream] = time, velocity + np.array(std) * rng.standard_normal(velocity.shape)
+    diagnosis = diagnose_recordings([recorded(given)], Parameters())
+    assert "coloured_reference_noise" not in [each.name for each in diagnosis.noise]
+
+
+@pytest.mark.slow
+def test_noise_with_a_memory_is_still_called_coloured():
+    given = streams(seconds=400.0, dvl_rate=5.0, gnss_rate=5.0, seed=8)
+    time, velocity = given["reference"]
+    slow_noise, rng = np.zeros_like(velocity), np.random.default_rng(8)
+    for i in range(1, len(time)):
+        slow_noise[i] = 0.95 * slow_noise[i - 1] + 0.03 * np.sqrt(1 - 0.95**2) * rng.standard_normal(3)
+    diagnosis = diagnose_recordings([recorded(given | {"reference": (time, velocity + slow_noise)})], Parameters())
+    assert "coloured_reference_noise" in [each.name for each in diagnosis.noise]
+    assert diagnosis.selection.fit.noise.is_coloured
