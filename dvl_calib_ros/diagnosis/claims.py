@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
+from ..calibration.distributions import normal_isf
 from ..calibration.frames import Array
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Claims:
     @property
     def sure(self) -> NDArray[np.bool_]:
         """(c,) whether the noise follows the claim at all."""
-        return np.asarray(self.exponents > norm.isf(SURE) * self.stds)
+        return np.asarray(self.exponents > normal_isf(SURE) * self.stds)
 
 
 def differ(log_claims: Array) -> bool:

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
 
+from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn
@@ -94,4 +94,4 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
 
 def _scatter(values: Array) -> Array:
     """(3,) standard deviation of values (N, 3), robustly."""
-    return np.maximum(np.asarray(median_abs_deviation(values, axis=0, scale="normal")), 1e-9)
+    return np.maximum(robust_std(values), 1e-9)

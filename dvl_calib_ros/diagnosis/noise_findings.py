@@ -97,7 +97,7 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
     constant = _time_constant(clearest, interval)
     if constant < 2.0 * interval:
         return None  # neighbours share samples of the reference by interpolation
-    if chi2.sf(drop, dof) < LEVEL:
+    if float(chi2_sf(drop, dof)) < LEVEL:
         drop = min(drop, _made_by_comparing(problem, fit).deviance(residual) - noise.deviance(residual))
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
     parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
@@ -176,5 +176,5 @@ def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFindin
     parameters, p_values = {}, []
     for name, value, std in zip(found.names, found.exponents.tolist(), found.stds.tolist(), strict=True):
         parameters[f"{name}_exponent"] = value, value - 1.96 * std, value + 1.96 * std
-        p_values.append(2.0 * norm.sf(abs(value - (0.0 if value > HALF else 1.0)) / std))
+        p_values.append(2.0 * float(normal_sf(abs(value - (0.0 if value > HALF else 1.0)) / std)))
     return NoiseFinding("reported_covariance", parameters, float(min(1.0, len(p_values) * min(p_values))))
