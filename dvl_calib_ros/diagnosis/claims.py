@@ -128,16 +128,18 @@ def claims_of(problem: Problem, seen: Sequence[Seen], rotation: Array | None) ->
 
 
 def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, name: str) -> Array | None:
-    """(M, A) log standard deviation, None where a recording has none."""
+    """(M, A) log standard deviation; None where a recording has none, or all claim the same."""
+    given = [(each.dvl if name == "dvl" else each.reference).claims for each in problem.recordings]
+    claims = [each for each in given if each is not None and len(each)]
+    if len(claims) < len(given) or all(bool((each == claims[0][0]).all()) for each in claims):
+        return None
     parts = []
     start = 0
-    for recording, grid, each in zip(problem.recordings, problem.grids, seen, strict=True):
+    for recording, grid, each, own in zip(problem.recordings, problem.grids, seen, claims, strict=True):
         curve, stamps = (
             (recording.dvl, each.dvl_stamps) if name == "dvl" else (recording.reference, each.reference_stamps)
         )
-        if curve.claims is None:
-            return None
-        variance = np.stack([np.interp(stamps, curve.time, column) for column in (curve.claims**2).T], axis=1)
+        variance = np.stack([np.interp(stamps, curve.time, column) for column in (own**2).T], axis=1)
         variance = grid.averaged(variance)
         at = slice(start, start + len(variance))
         start = at.stop

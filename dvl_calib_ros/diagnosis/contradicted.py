@@ -52,7 +52,6 @@ def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> Recording:
         dvl=recording.dvl.part(dvl),
         reference=recording.reference.part(reference),
         spikes=recording.spikes + int(np.count_nonzero(~dvl)),
-        _kept={},
     )
 
 
