@@ -14,6 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 import rclpy
+import yaml
 from drawn import Drawn
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from rclpy.logging import LoggingSeverity
@@ -68,7 +69,7 @@ def run_live(data: bytes, folder: Path) -> None:
             node._on_reset(Trigger.Request(), Trigger.Response())
             received = dict.fromkeys(_TOPICS, 0)
         elif step < 252:
-            assert _saved(node, folder)
+            assert _saved(node, folder, read_back=step == 250 and len(data) % 8 == 0)
         elif step < 254:
             name = drawn.one_of(_AT_RUN_TIME)
             spec = SCHEMA[name]
@@ -80,15 +81,19 @@ def run_live(data: bytes, folder: Path) -> None:
     counts = node._calibrator.counts
     assert [counts[stream]["received"] for stream in ("dvl", "reference", "imu")] == list(received.values())
     node._publish_diagnostics()
-    assert_sound(node._calibrator.result())
+    assert_sound(node._calibrator)
 
 
-def _saved(node: CalibrationNode, folder: Path) -> bool:
-    """Whether the node saves a file that can be loaded, or says why it saves none."""
+def _saved(node: CalibrationNode, folder: Path, read_back: bool) -> bool:
+    """Whether the node saves a file that can be loaded, or says why it saves none.
+
+    Reading YAML takes as long as a hundred messages, so not every file is read back.
+    """
     for each in folder.glob("live.yaml*"):  # a save reads the backups, which takes longer than all the rest
         each.unlink()
-    response = node._on_save(Trigger.Request(), Trigger.Response())
-    if not response.success:
+    with patch("yaml.SafeDumper", yaml.CSafeDumper):  # the same bytes in a tenth of the time
+        response = node._on_save(Trigger.Request(), Trigger.Response())
+    if not response.success or not read_back:
         return bool(response.message)
     _, states = load_result(folder / "live.yaml")
     return all(np.isfinite(state.x).all() and np.isfinite(state.p).all() for state in states.values())

@@ -12,8 +12,8 @@ from drawn import Drawn
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
-from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.atomic import backup_of, check_writable, save_bytes
@@ -36,12 +36,12 @@ def parameters_of(drawn: Drawn) -> Parameters | None:
         return None
 
 
-def assert_sound(result: Result) -> None:
-    """Numbers that may be published and saved."""
-    for name, estimate in result.estimates.items():
-        assert np.isfinite(estimate.state).all() and np.isfinite(estimate.covariance).all(), name
-        assert (np.diag(estimate.covariance) >= 0.0).all(), name
-        np.testing.assert_array_equal(estimate.covariance, estimate.covariance.T, err_msg=name)
+def assert_sound(calibrator: Calibrator) -> None:
+    """Numbers that may be published and saved, of every model."""
+    for name in MODELS:
+        state, covariance = calibrator.published(name)
+        assert np.isfinite(state).all() and np.isfinite(covariance).all(), name
+        assert (covariance.diagonal() >= 0.0).all() and (covariance == covariance.T).all(), name
 
 
 def run_settings(data: bytes) -> None:
@@ -51,7 +51,7 @@ def run_settings(data: bytes) -> None:
     if parameters is None:
         return
     try:
-        calibrator = Calibrator(parameters, block_size=drawn.one_of((1, 7, 64)))
+        calibrator = Calibrator(parameters, block_size=drawn.one_of((64, 1, 64, 7)))
     except (ParameterError, InputError) as error:
         assert str(error)
         return
@@ -81,9 +81,9 @@ def run_settings(data: bytes) -> None:
     calibrator.finish()
     for stream, count in received.items():
         assert calibrator.counts[stream.value]["received"] == count
-    result = calibrator.result()
-    assert_sound(result)
-    assert result_document(result, "dvl_link")
+    assert_sound(calibrator)
+    if len(data) % 4 == 0:  # what is said about the numbers takes as long as finding them
+        assert result_document(calibrator.result(), "dvl_link")
 
 
 def settings_seeds() -> Iterator[bytes]:
