@@ -115,7 +115,12 @@ def _imu(drawn: Drawn) -> Imu:
     message.header.frame_id = "base_link"
     half = drawn.near(0.0) * math.pi
     q, w = message.orientation, message.angular_velocity
-    q.x, q.y, q.z, q.w = drawn.near(0.0), drawn.near(0.0), math.sin(half), drawn.near(1.0)
+    q.x, q.y, q.z, q.w = (
+        drawn.near(0.0),
+        drawn.near(0.0),
+        (math.sin(half) if math.isfinite(half) else half),
+        drawn.near(1.0),
+    )
     w.x, w.y, w.z = drawn.near(0.0), drawn.near(0.0), drawn.near(0.1)
     if drawn.byte() > 250:
         message.orientation_covariance[0] = drawn.number()
