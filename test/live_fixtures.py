@@ -170,4 +170,11 @@ class Live:
 
     def wait_until_it_says(self, words: str) -> DiagnosticStatus:
         """The first status from now on with these words in its message."""
-        return until(lambda: words in (status := self.status()).message and status, f"/diagnostics to say {words!r}")
+        return until(
+            lambda: words in (status := self.status()).message and status,
+            lambda: f"/diagnostics to say {words!r}; it says {self.diagnostics[-1].status[0].message!r}",
+        )
+
+    def has_said(self, words: str, since: int) -> bool:
+        """Whether these words were in a message of /diagnostics, of which there have been so many before."""
+        return any(words in each.status[0].message for each in self.diagnostics[since:])

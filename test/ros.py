@@ -26,11 +26,12 @@ RETRY_S = 3.0
 NODE = "dvl_calibration"
 
 
-def until(condition: Callable[[], Any], what: str) -> Any:
+def until(condition: Callable[[], Any], what: str | Callable[[], str]) -> Any:
     """Wait for a condition; fail, saying for what, if it does not come."""
     deadline = time.monotonic() + PATIENCE_S
     while not (value := condition()):
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S:.0f} s in vain for {what}"
+        late = time.monotonic() > deadline
+        assert not late, f"waited {PATIENCE_S:.0f} s in vain for {what if isinstance(what, str) else what()}"
         time.sleep(0.01)
     return value
 

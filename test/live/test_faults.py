@@ -46,6 +46,7 @@ pytestmark = pytest.mark.faults
 
 SECOND = 1_000_000_000
 HOUR_S = 3600.0
+TRIES = 3  # of a machine that is busy for seconds now and then
 END_OF_TIME_NS = (2**31 - 2) * SECOND
 NAN, INF = math.nan, math.inf
 # Sent as fast as possible: on a machine that stalls, one topic may lag another by all of a run; max_latency is longer.
@@ -252,7 +253,25 @@ def as_messages(part: Sequence[Any]) -> list[Sent]:
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_survived_counted_and_named(name, node):
-    fault, replay = FAULTS[name], Offline(PARAMETERS)
+    fault = FAULTS[name]
+    for _ in range(TRIES):
+        since = len(node.diagnostics)
+        assert_survived(fault, node)
+        if fault.named is None:
+            return
+        # it may have been said while data still came; of a sensor nothing is said where the machine was too busy to run
+        # the node for seconds
+        said = (fault.named, "PROCESS_PAUSED")
+        until(lambda since=since, said=said: any(node.has_said(words, since) for words in said), f"one of {said}")
+        if node.has_said(fault.named, since):
+            return
+        node.reset()
+    pytest.fail(f"this machine is too busy: the node was never told of {name} without a pause")
+
+
+def assert_survived(fault: Fault, node: Live) -> None:
+    """Estimates and counts are those of a replay, and what they are to be."""
+    replay = Offline(PARAMETERS)
     for part in map(as_messages, fault.parts):
         node.publish(part)
         saved = node.when_like(replay.feed(part))
@@ -266,8 +285,6 @@ def test_a_fault_is_survived_counted_and_named(name, node):
             np.testing.assert_allclose(saved["models"][model]["state"], clean.state(model).x, rtol=0, atol=1e-12)
     else:
         assert_near_truth(saved)
-    if fault.named:
-        node.wait_until_it_says(fault.named)
 
 
 def assert_near_truth(saved: dict) -> None:
