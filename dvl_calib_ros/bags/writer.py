@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
@@ -18,6 +19,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
 
 from ..errors import InputError
+from ..files.atomic import NO_SPACE
 from ..files.yaml_files import load_yaml
 from .attachments import attach
 from .channels import Channel
@@ -47,7 +49,6 @@ _COMPRESSION = {
     Compression.FILE: CompressionMode.FILE,
 }
 UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
-_NO_SPACE = "free some space, or name another place"
 
 
 class _Sqlite3Writer(Sqlite3Writer):
@@ -76,6 +77,7 @@ class BagWriter:
             raise InputError("compression chunk is MCAP's; with sqlite3 use message or file")
         self.typestore = get_typestore(Stores.ROS2_JAZZY)
         self._path, self._storage, self._compression = path, storage, compression
+        self._made_for_it = [folder for folder in path.parents if not folder.exists()]  # the deepest first
         self._attachments: list[tuple[str, str, bytes]] = []
         # a file holds one definition of each type: rosbag2 and rosbags look it up by the type's name
         self._parts: list[_Part] = []
@@ -94,7 +96,7 @@ class BagWriter:
         except WriterError as error:  # made by another since it was looked at
             raise InputError(f"{self._path}: {error}; give another name") from error
         except BaseException as error:  # an interrupt among them
-            shutil.rmtree(self._path, ignore_errors=True)
+            self._remove()
             if isinstance(error, OSError | sqlite3.Error):
                 raise self._unwritable(error) from error
             raise
@@ -116,7 +118,7 @@ class BagWriter:
         except (OSError, sqlite3.Error) as failure:
             error = failure
         if error is not None:  # half a bag would pass for a whole one
-            shutil.rmtree(self._path, ignore_errors=True)
+            self._remove()
         if isinstance(error, OSError | sqlite3.Error):
             raise self._unwritable(error) from error
 
@@ -181,7 +183,17 @@ class BagWriter:
 
     def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:
         why = getattr(error, "strerror", None) or error
-        return InputError(f"{self._path}: cannot be written ({why}); {_NO_SPACE}")
+        # SQLite tells of a full disk in words only, and of a file that may not grow as of any failure
+        full = isinstance(error, sqlite3.Error) or error.errno in NO_SPACE
+        remedy = "free some space, or name another place" if full else "name another place"
+        return InputError(f"{self._path}: cannot be written ({why}); {remedy}")
+
+    def _remove(self) -> None:
+        """Leave nothing behind, nor the folders that were made for it."""
+        shutil.rmtree(self._path, ignore_errors=True)
+        for folder in self._made_for_it:
+            with suppress(OSError):  # another writes there, too
+                folder.rmdir()
 
 
 class _Part:

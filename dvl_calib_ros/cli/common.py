@@ -128,7 +128,7 @@ def check_outputs(
     is read. also_read: what is read beside. also_written: files that are made beside, by how an error calls them.
     """
     from ..errors import InputError
-    from ..files.atomic import check_writable
+    from ..files.atomic import check_folder_writable, check_writable
     from ..files.outputs import check_outputs as check_apart
 
     given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
@@ -145,6 +145,8 @@ def check_outputs(
     for name in folders:
         if name in given and os.path.islink(given[name]) and not given[name].exists():
             raise InputError(f"{given[name]}: is a link that leads nowhere; give another name, or remove it first")
+        if name in given:
+            check_folder_writable(given[name])
     as_options = [{f"--{name}": given[name] for name in names if name in given} for names in (files, folders)]
     check_apart(as_options[0] | dict(also_written or {}), read, as_options[1])
 

@@ -41,15 +41,16 @@ def run(arguments: argparse.Namespace) -> None:
     from ..export.simulators import SIMULATORS
     from ..files.atomic import own_stream, save_text
 
-    is_file = own_stream(arguments.output) is None
-    if is_file:
-        arguments.missing = arguments.output.with_name(f"{arguments.output.name}.missing.json")
-    common.check_outputs(arguments, "output", "missing")
+    missing = None
+    if own_stream(arguments.output) is None:
+        missing = arguments.output.with_name(f"{arguments.output.name}.missing.json")
+    beside = {} if missing is None else {"--output, for what is missing,": missing}
+    common.check_outputs(arguments, "output", also_written=beside)
     description = load_description(arguments.source)
     exported = export(arguments.simulator, SIMULATORS[arguments.simulator], description)
     save_text(arguments.output, exported.settings.text)
-    if is_file:
-        common.write_json(arguments.missing, export_document(exported, description, __version__))
+    if missing is not None:
+        common.write_json(missing, export_document(exported, description, __version__))
         _print(exported, arguments)
 
 

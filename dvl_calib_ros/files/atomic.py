@@ -23,7 +23,7 @@ from ..errors import InputError
 PATIENCE_S = 5.0
 _PREFIX = ".dvl_calib."
 _TEMPORARY, _STRANDED = ".tmp", ".bak"
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Keep = Callable[[Sequence[Path]], Sequence[Path]]
 """Which of the files before, newest first, are kept as backups, in the same order."""
@@ -62,7 +62,7 @@ def save_bytes(path: Path, content: bytes, keep: Keep = newest_only) -> None:
         else:
             _replace(_target(path), content, keep)
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        full = isinstance(error, OSError) and error.errno in _FULL
+        full = isinstance(error, OSError) and error.errno in NO_SPACE
         remedy = "free some space, or name a file on another disk" if full else "name another place"
         raise InputError(f"{path}: could not be written ({_why(error)}); {remedy}") from error
 
@@ -83,6 +83,18 @@ def check_writable(path: Path) -> None:
             f"the folder {Path(os.path.realpath(path)).parent} is not writable" if "\0" not in str(path) else "no name"
         )
         raise InputError(f"{path}: {where} ({_why(error)}); name another") from error
+
+
+def check_folder_writable(path: Path) -> None:
+    """Raise InputError if a folder could not be made there, with those that it lies in, before work is done for it."""
+    above = path.parent
+    try:
+        while not above.exists() and above != above.parent:
+            above = above.parent
+        with tempfile.TemporaryFile(dir=above):
+            pass
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: the folder {above} is not writable ({_why(error)}); name another") from error
 
 
 def backup_of(path: Path) -> Path:

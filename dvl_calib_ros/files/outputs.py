@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,8 +22,8 @@ _RECORDED = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Mapping[str, Path] | None = None) -> None:
     """Raise InputError if an output, or the backup of what it replaces, is an input or another output.
 
-    Links of every kind are seen through. Nor may an output lie in a folder that is read; a new folder may, in one
-    that is no recording.
+    Links of every kind are seen through, and folders that are mounted in two places. Nor may an output lie in a folder
+    that is read; a new folder may, in one that is no recording.
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ class _Written:
         return [os.path.realpath(self.path), *backups]
 
     @cached_property
-    def files(self) -> set[tuple[int, int]]:
+    def files(self) -> set[_Identity]:
         """Identities of what is in these places now."""
         return {identity for place in self.places if (identity := _identity(place)) is not None}
 
@@ -67,33 +68,58 @@ class _Written:
         """Whether an input would be changed."""
         real = os.path.realpath(path)
         read = {os.path.realpath(f"{name}{end}") for name in (path, real) for end in ("", *_BESIDE)}
-        if not read.isdisjoint(self.places):
+        if not {_slot(name) for name in read}.isdisjoint(map(_slot, self.places)):
             return True
         if self.files and not self.files.isdisjoint(_identities(read)):
             return True
         return os.path.isdir(real) and any(self._is_in(place, real) for place in self.places[:1])
 
     def _is_in(self, place: str, folder: str) -> bool:
-        if not place.startswith(folder.rstrip(os.sep) + os.sep):
+        if _identity(folder) not in {_identity(above) for above in _above(place)}:
             return False
         return not self.is_folder or os.path.lexists(place) or _is_recording(folder)
 
     def meets(self, other: _Written) -> bool:
-        """Whether both would change one file, or one be in the other."""
-        mine, others = self.places, other.places
+        """Whether both would change one file, or one be in the other.
+
+        Names that differ in case only are one to many file systems, and so are two forms of an accented letter.
+        """
+        mine, others = ([_slot(_folded(place)) for place in each.places] for each in (self, other))
         if not set(mine).isdisjoint(others) or not self.files.isdisjoint(other.files):
             return True
-        return any(a.startswith(b + os.sep) or b.startswith(a + os.sep) for a in mine[:1] for b in others[:1])
+        below = [{_slot(_folded(above)) for above in _above(each.places[0])} for each in (self, other) if each.places]
+        return len(below) == 2 and (mine[0] in below[1] or others[0] in below[0])
 
 
-def _identity(path: str) -> tuple[int, int] | None:
+_Identity = tuple[int, int]
+
+
+def _slot(path: str) -> tuple[_Identity | str, str]:
+    """A name in its folder, whichever of the folder's names led there: mounted elsewhere it has another."""
+    folder, name = os.path.split(path)
+    return _identity(folder) or folder, name
+
+
+def _folded(path: str) -> str:
+    folder, name = os.path.split(path)
+    return os.path.join(folder, unicodedata.normalize("NFC", name).casefold())
+
+
+def _above(path: str) -> Iterator[str]:
+    """The folders that a path lies in, the nearest first."""
+    while (folder := os.path.dirname(path)) != path:
+        yield folder
+        path = folder
+
+
+def _identity(path: str) -> _Identity | None:
     with suppress(OSError, ValueError):
         found = os.stat(path)
         return found.st_dev, found.st_ino
     return None
 
 
-def _identities(paths: Iterable[str]) -> Iterator[tuple[int, int]]:
+def _identities(paths: Iterable[str]) -> Iterator[_Identity]:
     """Of files, and of folders and all that is in them, links followed to files and not to folders."""
     for path in paths:
         inside = (os.path.join(folder, name) for folder, _, names in os.walk(path) for name in names)

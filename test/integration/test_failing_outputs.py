@@ -102,9 +102,9 @@ def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
     rows = "".join(f"{0.01 * i},1.5,{i % 7},0\n" for i in range(5000))
     Path("T.csv").write_text(rows)
     arguments = {
-        "salvage": ("salvage", bag, "-o", "new"),
+        "salvage": ("salvage", bag, "-o", "made/for/it"),
         "simulate": ("simulate", "new", "--duration", 100),
-        "import": ("import", "T.csv", "-o", "new"),
+        "import": ("import", "T.csv", "-o", "made/for/it"),
     }[command]
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -115,6 +115,20 @@ def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
     assert "free some space" in error
+    assert os.listdir(tmp_path) == ["T.csv"]
+
+
+@pytest.mark.parametrize("place", ["/proc/new", "T.csv/new", "T.csv/new/deeper"])
+@pytest.mark.parametrize(
+    "words", [("salvage", "BAG", "-o"), ("import", "T.csv", "-o"), ("simulate",), ("diagnose", "BAG", "--twin")]
+)
+def test_a_folder_that_cannot_be_made_is_said_before_any_work_with_a_remedy_that_helps(
+    bag, tmp_path, monkeypatch, capsys, words, place
+):
+    monkeypatch.chdir(tmp_path)
+    Path("T.csv").write_text("")  # who reads it finds no rows
+    error = fail(capsys, *(bag if word == "BAG" else word for word in words), place)
+    assert place in error and "is not writable" in error and "name another" in error and "space" not in error
     assert os.listdir(tmp_path) == ["T.csv"]
 
 

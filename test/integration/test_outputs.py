@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -248,6 +249,55 @@ def test_no_two_outputs_can_be_one_file_by_any_name(scratch, capsys, name):
                 error = refused(capsys, [*command.arguments.split(), one, "out", other, str(second)])
                 assert "names of their own" in error
                 assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize(("one", "other"), [("out.json", "OUT.json"), ("é.json", "e\u0301.json"), ("a/x", "A/y")])
+def test_names_that_are_one_on_other_file_systems_are_not_written_both(scratch, capsys, one, other):
+    """macOS and Windows know no case; macOS knows one form of an accented letter."""
+    folder = scratch()
+    for name in ("a", "A"):
+        (folder / name).mkdir()
+    before = snapshot(folder)
+    words = ["compare", "result.yaml", "bag", "--json", one, "--report", other]
+    if one == "a/x":  # other folders, other names
+        assert main(words) == 0
+        return
+    assert "names of their own" in refused(capsys, words)
+    assert snapshot(folder) == before
+
+
+@pytest.fixture
+def mounted(scratch):
+    """The folder, with its bag at a second place."""
+    folder = scratch()
+    (folder / "twice").mkdir()
+    done = subprocess.run(["mount", "--bind", folder / "bag", folder / "twice"], capture_output=True)
+    if done.returncode:
+        pytest.skip("who may not mount cannot try what is mounted twice")
+    yield folder
+    subprocess.run(["umount", folder / "twice"], check=True)
+
+
+def test_a_bag_that_is_mounted_in_two_places_is_written_into_by_neither_name(mounted, capsys):
+    before = snapshot(mounted)
+    for words in (
+        "compare result.yaml bag --json twice/new.json", "replay bag --save twice/metadata.yaml",
+        "salvage bag -o twice/new", "simulate --motion-of bag twice/new", "diagnose bag --twin twice/new",
+        "replay twice --json bag/new.json",
+    ):  # fmt: skip
+        assert "the input" in refused(capsys, words.split())
+    words = "replay loose/run.db3 --json bag/new.json --save twice/new.json"
+    assert "names of their own" in refused(capsys, words.split())
+    assert snapshot(mounted) == before
+
+
+def test_what_export_writes_beside_is_no_input_and_is_called_by_its_option(scratch, capsys):
+    folder = scratch()
+    (folder / "result.yaml").rename(folder / "dvl.sdf.missing.json")
+    before = snapshot(folder)
+    error = refused(capsys, ["export", "gazebo", "dvl.sdf.missing.json", "-o", "dvl.sdf"])
+    assert "--output, for what is missing," in error
+    assert snapshot(folder) == before
 
 
 @pytest.mark.parametrize("how", ["the_same", "link", "hard_link"])
