@@ -8,6 +8,7 @@ import numpy as np
 
 from ..calibration.findings import Finding
 from ..calibration.frames import Array
+from ..calibration.parameters import SCHEMA
 from ..messages.drivers import VELOCITY_TYPES
 from .columns import Recorded
 from .kinds import named
@@ -86,6 +87,19 @@ def _reception(name: str, steps: Array, log_steps: Array) -> list[Finding]:
     return [named("DOCTOR_STAMP_RECEPTION", topic=name, jitter_ms=1e3 * jitter, period_ms=1e3 * period)]
 
 
+def apart_findings(dvl: Recorded, reference: Recorded) -> list[Finding]:
+    """Whether DVL and reference are never measured at one time, by their stamps."""
+    ours, theirs = (np.sort(topic.stamps_ns[topic.stamps_ns != 0]) for topic in (dvl, reference))
+    if not len(ours) or not len(theirs):
+        return []
+    after = np.searchsorted(theirs, ours)
+    near = np.minimum(
+        np.abs(ours - theirs[np.minimum(after, len(theirs) - 1)]), np.abs(ours - theirs[np.maximum(after - 1, 0)])
+    )
+    share = float((near <= GAP * SECOND_NS).mean())
+    return [named("DOCTOR_APART", topic=dvl.topic, other=reference.topic, share=share)] if share <= MANY else []
+
+
 def clock_offset_s(topic: Recorded) -> float | None:
     """How far the stamps are ahead of the log, s; None without stamps."""
     stamped = topic.stamps_ns != 0
@@ -106,13 +120,17 @@ def clock_findings(topics: Mapping[str, Recorded]) -> list[Finding]:
         if role != other and abs(offset - middle) > SAME_CLOCK:
             late = offset - middle
             parameter = {"dvl": "dvl", "reference": "reference", "imu": "imu"}[role] + "_time_offset"
-            fields = {"seconds": abs(late), "side": "after" if late > 0.0 else "before", "offset": late}
+            can_be_taken_off = abs(late) <= SCHEMA[parameter].high
+            fields = {
+                "seconds": abs(late),
+                "side": "after" if late > 0.0 else "before",
+                "here": f"for this bag: -p {parameter}:={late:.2f}" if can_be_taken_off else "correct the stamps",
+            }
             found.append(
                 named(
                     "DOCTOR_CLOCKS",
                     topic=topics[role].topic,
                     other=topics[other].topic,
-                    parameter=parameter,
                     **fields,
                 )
             )

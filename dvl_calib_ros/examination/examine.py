@@ -174,9 +174,12 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     found: list[Finding] = []
     for topic in streams.values():
         found += checks.stamp_findings(topic) + checks.gap_findings(topic)
-    found += checks.clock_findings(streams)
+    clocks = checks.clock_findings(streams)
+    found += clocks
     found += checks.velocity_findings(dvl, True)
     if reference is not None:
+        if not clocks:
+            found += checks.apart_findings(dvl, reference)
         found += checks.velocity_findings(reference, False)
         if len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
             rate_hz = 1.0 / checks.interval_s(reference)

@@ -34,7 +34,14 @@ _KINDS = (
         "DOCTOR_CLOCKS",
         "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
         "Two drivers stamp by different clocks, so that velocities of different times are compared.",
-        "synchronise clocks (PTP, NTP or GNSS); for this bag: -p {parameter}:={offset:.2f}",
+        "synchronise clocks (PTP, NTP or GNSS); {here}",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_APART",
+        "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
+        "One of them came only while the other did not, or a clock is off by more than the recording is long.",
+        "record both at once; if they were, check the clocks, and for import the times of both files",
         Severity.ERROR,
     ),
     FindingKind(

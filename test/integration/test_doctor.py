@@ -19,7 +19,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.examination.examine import Examination, examine
 from dvl_calib_ros.examination.kinds import KINDS
-from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
 SECOND = 1_000_000_000
@@ -153,11 +153,18 @@ def body_called_enu(log: int, message: Any, _: int) -> int:
     return log
 
 
+def one_after_the_other(topic: str, log: int, message: Any, i: int) -> int | None:
+    seconds = (log - START_NS) / SECOND
+    is_off = {"dvl/twist": seconds > 50.0, "gnss/twist": seconds < 55.0}
+    return None if is_off.get(topic) else log
+
+
 FAULTS: dict[str, tuple[str, Callable[[str, int, Any, int], int | None]]] = {
     "stamps of reception": ("DOCTOR_STAMP_RECEPTION", dvl_only(reception)),
     "stamps of zero": ("DOCTOR_STAMP_ZERO", reference_only(zero_stamps)),
     "a clock set back": ("DOCTOR_STAMP_BACK", dvl_only(clock_set_back)),
     "another clock": ("DOCTOR_CLOCKS", dvl_only(other_clock)),
+    "a DVL that is off while there is a fix": ("DOCTOR_APART", one_after_the_other),
     "a dropout": ("DOCTOR_GAPS", dvl_only(dropout)),
     "zeros without bottom lock": ("DOCTOR_ZEROS", dvl_only(zeros_without_lock)),
     "a driver that repeats itself": ("DOCTOR_FROZEN", dvl_only(frozen([]))),
