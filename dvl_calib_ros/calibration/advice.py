@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from .findings import Finding, finding
+from .heave_waves import Heave
 from .results import Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
@@ -13,6 +17,9 @@ SUSPICIOUS_GATED = 0.2
 ENOUGH_SAMPLES = 20
 # Share of DVL velocities that repeat the one before exactly above which its driver hangs.
 SUSPICIOUS_REPEATED = 0.05
+# A constant error of the reference is said if it is larger than this, m/s (twice what is allowed for by default), and
+# than so many σ.
+OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
 # So many losses of GNSS are flapping.
 FLAPPING = 3
 
@@ -90,3 +97,22 @@ def consistency_advice(estimate: Estimate) -> list[Finding]:
     if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
+
+
+def heave_advice(heave: Heave | None) -> list[Finding]:
+    """Whether the vehicle heaves in waves, by more than is assumed."""
+    return [] if heave is None else [finding("HEAVE_WAVES", std=heave.std, period=heave.period)]
+
+
+def reference_advice(estimate: Estimate) -> list[Finding]:
+    """Whether the reference is wrong by a constant that several headings have shown."""
+    names = "reference_east", "reference_north"
+    std = estimate.std_of(*names)
+    if std is None:
+        return []
+    offset = np.array([estimate.state_of(name) for name in names])
+    size = float(np.linalg.norm(offset))
+    if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * std).all():
+        return []
+    course = math.degrees(math.atan2(*offset)) % 360.0
+    return [finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course)]

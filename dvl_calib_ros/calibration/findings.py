@@ -356,6 +356,20 @@ _KINDS = (
         Severity.ERROR,
     ),
     FindingKind(
+        "HEAVE_WAVES",
+        "the vehicle heaves as in waves, {std:.2f} m/s every {period:.0f} s",
+        "G1 and G2 take heave to be nearly none (motion_std). In waves sway goes with it and bends the roll by more "
+        "than its σ says; pitch, yaw and scale are as good as they say.",
+        "calibrate in calm water or deeper down, or set motion_std to {std:.2f}",
+    ),
+    FindingKind(
+        "REFERENCE_OFFSET",
+        "the reference is off by {millimetres:.0f} mm/s towards {course:.0f}° all along",
+        "An error of an inertial navigation that stays, or a current, where the DVL tracks the water. G1 and G2 have "
+        "it among their states, so they are none the worse; errors and drift against this reference hold it.",
+        "judge the drift by another reference",
+    ),
+    FindingKind(
         "INNOVATIONS_LARGE",
         "{model}: innovations are larger than R and P allow (mean NIS {nis:.1f}, at most {limit:.1f}), σ is too small",
         "Noise above what is assumed, or an effect that the model does not have.",

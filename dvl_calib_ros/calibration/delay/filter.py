@@ -17,6 +17,7 @@ from ..bank import ModelCounts
 from ..coarse_mounting import CoarseFits
 from ..folds import FOLDS, folds_of
 from ..frames import ENU_FROM_NED, Array
+from ..heave_waves import HeaveWaves
 from ..kalman import GaussianState
 from ..observations import Assumptions, Observations
 from ..parameters import Parameters
@@ -65,8 +66,9 @@ class _Dvl(Table):
 class DelayFilter:
     """Feeds a `DelayBank` from an aligner; tells the aligner which past of its tracks is still wanted.
 
-    coarse: of the same samples, what configuration they fit. restarted: how often what was found was not finite, and
-    that of before is kept. n_taken: number of the first row of the aligner that it has not copied yet.
+    coarse, heave: of the same samples, what configuration they fit, and whether they are of waves. restarted: how often
+    what was found was not finite, and that of before is kept. n_taken: number of the first row of the aligner that it
+    has not copied yet.
     """
 
     def __init__(
@@ -101,6 +103,7 @@ class DelayFilter:
             assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
         )
         self.coarse = CoarseFits(parameters.rotation_dvl_from_body)
+        self.heave = HeaveWaves(parameters.rotation_dvl_from_body)
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
         self._dvl = _Dvl()
@@ -267,6 +270,7 @@ class DelayFilter:
         dvl, noise_dvl = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         self._compare_coarsely(block_ns, end_ns, dvl, imu)
+        self.heave.add(*dvl, noise_dvl)
         if self._kept is not None:
             from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
             self._kept.append(Kept.between(from_s, to_s, dvl, noise_dvl, reference, imu))

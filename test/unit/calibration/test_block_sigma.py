@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
 import pytest
 from runs import START_NS, MatchedRun, calibrate, make_samples
 
+from dvl_calib_ros.calibration.advice import reference_advice
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -80,6 +82,14 @@ def test_a_constant_error_of_the_reference_is_found_over_several_headings():
     assert estimate.state_of("reference_east") == pytest.approx(0.012, abs=0.003)
     assert estimate.state_of("reference_north") == pytest.approx(-0.009, abs=0.003)
     assert abs(estimate.state[2]) < 2.5 * estimate.std[2] < np.radians(0.25)
+
+
+def test_a_reference_that_is_off_is_said_with_size_and_course_and_one_that_is_not_is_not():
+    (found,) = reference_advice(calibrate(level_course((0.03, 0.0), True), CLAIMED).estimate("G1"))
+    assert re.match(r"the reference is off by (2[789]|3[0123]) mm/s towards (8[6-9]|9[0-4])° all along", found.says)
+    assert not reference_advice(calibrate(level_course((0.0, 0.0), True), CLAIMED).estimate("G1"))
+    assert not reference_advice(calibrate(level_course((0.03, 0.0), False), CLAIMED).estimate("G1"))
+    assert not reference_advice(calibrate(level_course((0.03, 0.0), True), CLAIMED).estimate("M3"))
 
 
 def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may_be_wrong():
