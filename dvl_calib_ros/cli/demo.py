@@ -127,11 +127,11 @@ def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
 def _compare(out: Any, saved: Path, offline: Result) -> bool:
     import numpy as np
 
-    from ..files.result_file import load_initial_calibration
+    from ..files.result_file import load_result
     from ..files.yaml_files import load_yaml
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
-    live = load_initial_calibration(saved)
+    _, live = load_result(saved)
     numbers = ("model", *common.ESTIMATE_COLUMNS, "max |live - replay|")
     table = titled("Live node against replay and truth", (), numbers)
     table.add_row("[bold]truth[/]", *(f"{value:+.2f}" for value in _truth().values()), "")

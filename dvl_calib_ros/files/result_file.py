@@ -210,13 +210,23 @@ def _worth_keeping(new: _Worth, n_backups: int, before: Sequence[Path]) -> list[
 
 
 def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:
-    """States and covariances of a result file, by model name. Raises InputError naming what is wrong in it.
+    """States and covariances of a result file to begin with, by model name. Raises InputError naming what is wrong.
 
-    mounting_rpy: the nominal mounting to go on with. The file's angles are relative to its own, which must be that.
+    What is of the day that it was made on (`Nuisance.of_the_day`) is as not known. mounting_rpy: the nominal mounting
+    to go on with. The file's angles are relative to its own, which must be that.
     """
     content, known = load_result(path)
     _check_mounting(path, content, mounting_rpy)
-    return known
+    return {name: _another_day(name, state) for name, state in known.items()}
+
+
+def _another_day(name: str, state: GaussianState) -> GaussianState:
+    model, (x, p) = MODELS[name], (state.x.copy(), state.p.copy())
+    start = prior(model, Parameters())
+    n_errors = model.n_errors
+    for index in (n_errors + i for i, each in enumerate(model.nuisance) if each.of_the_day):
+        x[index], p[index], p[:, index] = start.x[index], start.p[index], start.p[index]
+    return GaussianState(x, p)
 
 
 def load_result(path: Path) -> tuple[dict[str, Any], dict[str, GaussianState]]:

@@ -37,12 +37,14 @@ class Needs(Enum):
 class Nuisance(NamedTuple):
     """A state that is estimated only because it would else be taken for misalignment or scale.
 
-    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it.
+    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. of_the_day: another on
+    another day, so what was found is not gone on with from a result file.
     """
 
     name: str
     unit: str
     std: float | str
+    of_the_day: bool = False
 
 
 @dataclass(frozen=True)

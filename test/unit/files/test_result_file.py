@@ -26,6 +26,7 @@ from dvl_calib_ros.files.atomic import save_text
 from dvl_calib_ros.files.result_file import (
     NothingUsedError,
     load_initial_calibration,
+    load_result,
     result_document,
     result_text,
     save_result,
@@ -51,11 +52,22 @@ def saved(tmp_path, result) -> Path:
 
 
 def test_every_model_comes_back_bit_for_bit(saved, result):
-    loaded = load_initial_calibration(saved, MOUNTING)
+    _, loaded = load_result(saved)
     assert list(loaded) == list(MODELS)
     for name, estimate in result.estimates.items():
         assert loaded[name].x.tobytes() == estimate.state.tobytes()
         assert loaded[name].p.tobytes() == np.ascontiguousarray(estimate.covariance).tobytes()
+
+
+def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
+    loaded = load_initial_calibration(saved, MOUNTING)
+    for name, estimate in result.estimates.items():
+        x, p = estimate.state.copy(), estimate.covariance.copy()
+        if name in ("G1", "G2"):  # the constant error of the reference
+            x[6:8] = p[6:8] = p[:, 6:8] = 0.0
+            p[[6, 7], [6, 7]] = Parameters().reference_offset_std ** 2
+        np.testing.assert_array_equal(loaded[name].x, x)
+        np.testing.assert_array_equal(loaded[name].p, p)
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
