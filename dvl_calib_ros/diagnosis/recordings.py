@@ -312,7 +312,7 @@ class Recording:
         """(M, 3) rad/s, body: of the IMU's own rates, or of its attitude where these are too slow."""
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
-            own = rates
+            own = rates.quiet
             return np.asarray(own.kept.at("values", at, lambda: own(at)))
         if attitude is None:
             raise ValueError(f"{self.name}: no angular velocity")

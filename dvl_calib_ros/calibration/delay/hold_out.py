@@ -40,7 +40,9 @@ class Kept(NamedTuple):
         own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
         first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
         at = first + _thinned_seconds(imu.times[first:last])
-        turning = ImuColumns(imu.times[at], imu.orientation[at], imu.angular_velocity[at])
+        # a sample of a fast stream is noisier than what the vehicle turns by until the next one that is kept
+        rates = _mean_around(imu.times, imu.angular_velocity, imu.times[at], 0.5 * KEPT_EVERY_S)
+        turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
         return Kept(own, noise_dvl, reference, turning)
 
 
@@ -190,3 +192,13 @@ def _thinned_seconds(times: Array) -> Index:
         return np.arange(len(times))
     bins = np.floor(times / KEPT_EVERY_S)
     return np.flatnonzero(np.diff(bins, prepend=bins[0] - 1.0))
+
+
+def _mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
+    """Means (M, c) of the finite values (N, c) within reach (s) of each time (M,) s; nan where there is none."""
+    first, end = np.searchsorted(times, at - reach), np.searchsorted(times, at + reach, side="right")
+    finite = np.isfinite(values)
+    sums = np.pad(np.cumsum(np.where(finite, values, 0.0), axis=0), ((1, 0), (0, 0)))
+    counts = np.pad(np.cumsum(finite, axis=0), ((1, 0), (0, 0)))
+    number = counts[end] - counts[first]
+    return np.where(number > 0, (sums[end] - sums[first]) / np.maximum(number, 1), np.nan)
