@@ -33,7 +33,7 @@ def test_turn_rates_are_without_the_noise_of_frequencies_that_hold_no_motion():
     true = np.column_stack([0.5 * waves, 0.3 * waves, 0.1 * np.sin(0.05 * time)])
     level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
     noise = np.gradient(rng.normal(0.0, np.deg2rad(0.05), true.shape), time, axis=0) * 2.0
-    velocity = (time[::4], rng.normal(0.0, 0.01, (len(time[::4]), 3)) + [1.0, 0.0, 0.0])
+    velocity = (time[::4], rng.normal((1.0, 0.0, 0.0), 0.01, (len(time[::4]), 3)))
     recording = make_recording("run", velocity, velocity, attitude=(time, level), rates=(time, true + noise))
     inside = slice(20, -20)
     used = recording.angular_velocity(time)[inside]
