@@ -120,7 +120,8 @@ def clock_findings(topics: Mapping[str, Recorded]) -> list[Finding]:
         if role != other and abs(offset - middle) > SAME_CLOCK:
             late = offset - middle
             parameter = {"dvl": "dvl", "reference": "reference", "imu": "imu"}[role] + "_time_offset"
-            can_be_taken_off = abs(late) <= SCHEMA[parameter].high
+            bound = SCHEMA[parameter].high
+            can_be_taken_off = bound is not None and abs(late) <= bound
             fields = {
                 "seconds": abs(late),
                 "side": "after" if late > 0.0 else "before",
