@@ -43,9 +43,10 @@ def test_noise_that_lasts_raises_sigma_and_noise_as_claimed_hardly_does(name):
 
 @pytest.mark.parametrize("block_size", [1, 500])
 def test_how_samples_are_gathered_changes_nothing(block_size):
+    one, other = (calibrate(run(0.1), CLAIMED, block_size=size) for size in (64, block_size))
     for name in ("M3", "G1", "F1", "A1"):
-        one, other = (calibrate(run(0.1), CLAIMED, block_size=size).estimate(name) for size in (64, block_size))
-        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-7, atol=1e-12)
+        found = one.estimate(name).covariance, other.estimate(name).covariance
+        np.testing.assert_allclose(*found, rtol=1e-7, atol=1e-12)
 
 
 def test_a_random_walk_is_left_as_the_filter_has_it():

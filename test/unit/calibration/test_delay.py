@@ -161,8 +161,7 @@ def test_how_samples_are_gathered_changes_nothing(block_size):
 def test_after_a_restart_the_state_is_that_of_a_calibration_that_began_there():
     samples = late(-1.4)
     again = shifted(samples, -400_000_000_000)
-    both = feed(Calibrator(NOISE), [*samples, *again])
-    alone = feed(Calibrator(NOISE), again)
+    both, alone = calibrate([*samples, *again], NOISE), calibrate(again, NOISE)
     assert both.restarts == 1
     a, b = both.estimate("G2"), alone.estimate("G2")
     # streams that had not gone back yet cost a sample or two of the first block
