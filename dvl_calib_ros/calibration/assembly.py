@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.special import chdtr, gammaincinv, ndtri
 
 from . import kalman
+from .chi_square import chi2_cdf, chi2_isf
 from .correction_parameters import PriorOnErrors, to_correction, to_errors
 from .frames import Array
 from .kalman import GaussianState
@@ -152,7 +153,7 @@ def gate_of(rows: float, parameters: Parameters) -> float:
     """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
     if parameters.gate_probability in (0.0, 1.0):
         return float("inf")
-    return 2.0 * float(gammaincinv(0.5 * rows, parameters.gate_probability))
+    return chi2_isf(1.0 - parameters.gate_probability, rows)
 
 
 def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
@@ -162,8 +163,8 @@ def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float
     E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal.
     """
     m, gate = rows, gate_of(rows, parameters)
-    inside = chdtr(m, gate)
-    mean = m * chdtr(m + 2, gate) / inside
-    variance = m * (m + 2) * chdtr(m + 4, gate) / inside - mean**2
-    half = float(ndtri(0.5 + 0.5 * confidence) * np.sqrt(variance / max(used, 1)))
-    return float(mean) - half, float(mean) + half
+    inside = chi2_cdf(gate, m)
+    mean = m * chi2_cdf(gate, m + 2) / inside
+    variance = m * (m + 2) * chi2_cdf(gate, m + 4) / inside - mean**2
+    half = math.sqrt(chi2_isf(1.0 - confidence, 1.0) * variance / max(used, 1))  # as many σ as a normal one's
+    return mean - half, mean + half

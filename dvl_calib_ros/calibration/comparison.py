@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from ..errors import InputError
+from .chi_square import chi2_sf
 from .extrinsics import (
     COMPONENTS,
     LEVER_ARM,
@@ -55,7 +55,7 @@ class ChiSquare(NamedTuple):
     @staticmethod
     def of(value: float, freedom: int) -> ChiSquare:
         """With the probability."""
-        return ChiSquare(value, freedom, float(chdtrc(freedom, value)) if freedom else math.nan)
+        return ChiSquare(value, freedom, chi2_sf(value, freedom) if freedom else math.nan)
 
 
 @dataclass(frozen=True)

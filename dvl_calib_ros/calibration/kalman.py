@@ -15,14 +15,14 @@ with the small dense algebra of one of them.)
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from .frames import Array
 
@@ -157,9 +157,18 @@ def _recursion_of_one(
     return Updated(x[None], p[None], np.array([used]), np.array([nis]), at)
 
 
+@cache
+def _dposv() -> Callable[[Array, Array], tuple[Array, Array, int]]:
+    """LAPACK's, imported when the first sample comes by itself: it takes 0.2 s, which recordings need not wait for."""
+    from scipy.linalg.lapack import dposv
+
+    solver: Callable[[Array, Array], tuple[Array, Array, int]] = dposv
+    return solver
+
+
 def _solve_definite(s: Array, b: Array) -> Array:
     """S⁻¹b for one symmetric positive definite S (m, m). Raises LinAlgError where it is not."""
-    _, solution, failed = dposv(s, b)
+    _, solution, failed = _dposv()(s, b)
     if failed:
         raise np.linalg.LinAlgError("S is not positive definite")
     return solution

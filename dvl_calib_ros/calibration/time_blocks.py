@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
+from .chi_square import chi2_isf
 from .frames import Array
 
 # Blocks kept; when they are full, neighbours are joined and blocks are twice as long. So memory is bounded, and effects
@@ -66,7 +66,7 @@ class TimeBlocks:
             scatter = p @ scores.T
             found = (scatter**2).sum(axis=1) * (m / (m - 1.0))
             ratio = found / np.maximum(claimed, 1e-300)
-            beyond_chance = ratio > float(chdtri(m - 1, CHANCE)) / (m - 1)
+            beyond_chance = ratio > chi2_isf(CHANCE, m - 1) / (m - 1)
             # the prior's part of P is not the data's to judge
             total = 1.0 + (found - claimed) / np.diag(p)
             factor = np.maximum(factor, np.where(beyond_chance, np.sqrt(np.maximum(total, 1.0)), 1.0))

@@ -14,8 +14,8 @@ from enum import Enum
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
 
+from .chi_square import chi2_isf
 from .coarse_mounting import Suggestion
 from .error_model import CORRECTION_JACOBIAN, correction_matrix
 from .folds import Moments
@@ -221,7 +221,7 @@ def _error_finding(held_out: HeldOutError | None, parameters: Parameters) -> Fin
             "alone"
         )
     dof = 3 * held_out.samples
-    by_chance = math.sqrt(float(chdtri(dof, CHANCE)) / dof)
+    by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)
     if corrected > predicted * parameters.max_error_ratio * by_chance:
         return Word.MARGINAL, f"{found}: the reference is noisier than it says, or an effect is missing from the model"
     return Word.ACCEPT, found

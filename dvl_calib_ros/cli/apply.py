@@ -14,10 +14,6 @@ from . import common
 if TYPE_CHECKING:
     from ..files.mounting import CalibratedMounting
 
-NAME = "apply"
-HELP = "write a saved calibration into URDF, parameters, TF or robot_localization, or take it back"
-EXAMPLE = "dvl-calib apply calibration.yaml --urdf robot.urdf --launch dvl_tf.launch.xml --fusion dvl_ekf.yaml"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

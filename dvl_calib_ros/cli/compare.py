@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from ..calibration.comparison import Comparison, Difference
     from ..calibration.extrinsics import Extrinsics
 
-NAME = "compare"
-HELP = "compare calibrations: has the mounting moved?"
-EXAMPLE = "dvl-calib compare monday.yaml tuesday.yaml --report compared.html"
 # More pairs than these are in --json; printed are the neighbours in time.
 MOST_PAIRS = 10
 BAG_SUFFIXES = (".mcap", ".db3")

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from ..calibration.results import Result
     from ..replay.replay import Replayed
 
-NAME = "demo"
-HELP = "live node, replay and truth side by side on a shipped bag"
-EXAMPLE = "dvl-calib demo --speed 20"
 BAG = "harbour_box"
 # What the bag was simulated with, see bags/README.md
 MISALIGNMENT_DEG = (1.0, -1.5, 3.0)

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
     from ..diagnosis.results import Diagnosis
 
-NAME = "diagnose"
-HELP = "name what causes the velocity error that calibration leaves in recorded bags"
-EXAMPLE = "dvl-calib diagnose my_bag --apply compensated.yaml"
 COLOURS = {"no_gap": "green", "known": "green", "ambiguous": "yellow", "unknown": "red"}
 # At rest a bias shows that looks like scale at speed
 DEFAULTS = {"min_speed": 0.0}

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 
     from ..examination.examine import Examination
 
-NAME = "doctor"
-HELP = "say what is in a bag, what is wrong with it, and whether it can calibrate"
-EXAMPLE = "dvl-calib doctor my_bag"
 BAR = 20
 ANSWERS = {
     "yes": ("green", "This recording can calibrate the DVL."),

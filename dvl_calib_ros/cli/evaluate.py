@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from ..evaluation.results import Coverage, EachStudy, ErrorsInVariables, Evaluation
     from ..parallel import Workers
 
-NAME = "evaluate"
-HELP = "run the published validation procedure, or check bags against each other"
-EXAMPLE = "dvl-calib evaluate snapir --seeds 5 --jobs 0 --json evaluation.json --report evaluation.html"
 MAX_SEEDS = 10_000
 
 

@@ -17,10 +17,6 @@ from .tables import titled
 if TYPE_CHECKING:
     from ..export.simulator import Export
 
-NAME = "export"
-HELP = "write what was found of a DVL as the settings of another simulator"
-EXAMPLE = "dvl-calib export gazebo diagnosis.json -o dvl.sdf"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

@@ -16,10 +16,6 @@ from pathlib import Path
 
 from . import common
 
-NAME = "import"
-HELP = "turn CSV or NPY trajectories, or logs of a DVL (Water Linked JSON, RDI PD0), into bags"
-EXAMPLE = "dvl-calib import T12_dvl.csv --gnss T12_gnss.csv --attitude T12_attitude.csv -o T12"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

@@ -14,39 +14,7 @@ from typing import NoReturn
 
 from .. import __version__
 from ..streams import give_up_stdout, open_streams, say
-from . import (
-    apply,
-    compare,
-    demo,
-    diagnose,
-    doctor,
-    evaluate,
-    export,
-    import_,
-    parameters,
-    replay,
-    run,
-    salvage,
-    simulate,
-    watch,
-)
-
-COMMANDS = (
-    run,
-    watch,
-    doctor,
-    replay,
-    salvage,
-    apply,
-    compare,
-    diagnose,
-    export,
-    evaluate,
-    simulate,
-    import_,
-    parameters,
-    demo,
-)
+from .commands import COMMANDS
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -70,7 +38,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser with all commands; only the one that is called gets its arguments, which may import much."""
+    """The parser with all commands; only the one that is called is imported and gets its arguments."""
     parser = _Parser(
         prog="dvl-calib",
         description="Calibrate a Doppler velocity log (DVL): live on ROS 2, or over recorded bags.",
@@ -78,17 +46,15 @@ def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"dvl-calib {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
-    for module in COMMANDS:
-        command = commands.add_parser(
-            module.NAME,
-            help=module.HELP,
-            description=(module.__doc__ or "").strip(),
-            epilog=f"example: {module.EXAMPLE}",
-            formatter_class=_Formatter,
+    for command in COMMANDS:
+        of_it = commands.add_parser(
+            command.name, help=command.help, epilog=f"example: {command.example}", formatter_class=_Formatter
         )
-        if module.NAME in argv:
-            module.add_arguments(command)
-        command.set_defaults(run=module.run)
+        if command.name in argv:
+            module = command.load()
+            of_it.description = (module.__doc__ or "").strip()
+            of_it.set_defaults(run=module.run)
+            module.add_arguments(of_it)
     return parser
 
 
@@ -114,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         name = (error.name or "").partition(".")[0]
         if name in ("", __name__.partition(".")[0]):
             raise
-        called = next(module.NAME for module in COMMANDS if module.NAME in argv)
+        called = next(command.name for command in COMMANDS if command.name in argv)
         return _fail(called, f"needs the Python package {name}, which is not installed; pip install {name}")
 
 

@@ -5,10 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-NAME = "parameters"
-HELP = "list every parameter, model, effect, driver, warning or command, or write a parameter file"
-EXAMPLE = "dvl-calib parameters --yaml > calibration.yaml"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
@@ -66,8 +62,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def command_table() -> str:
     """Every command with an example, in Markdown."""
-    from .main import COMMANDS
+    from .commands import COMMANDS
 
     lines = ["| command | does | example |", "|---|---|---|"]
-    lines += [f"| `{module.NAME}` | {module.HELP} | `{module.EXAMPLE}` |" for module in COMMANDS]
+    lines += [f"| `{command.name}` | {command.help} | `{command.example}` |" for command in COMMANDS]
     return "\n".join(lines) + "\n"

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from ..discovery.discover import Discovery
     from ..replay.replay import Replayed
 
-NAME = "replay"
-HELP = "calibrate with recorded bags"
-EXAMPLE = "dvl-calib replay my_bag --save calibration.yaml"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

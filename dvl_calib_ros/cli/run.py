@@ -10,10 +10,6 @@ from pathlib import Path
 
 from . import common
 
-NAME = "run"
-HELP = "run the calibration node, live"
-EXAMPLE = "dvl-calib run --params calibration.yaml --dvl-topic /dvl/velocity -p result_file:=/data/calibration.yaml"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""

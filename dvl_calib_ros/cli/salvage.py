@@ -8,10 +8,7 @@ from pathlib import Path
 
 from . import common
 
-NAME = "salvage"
-HELP = "recover damaged recordings into a new bag"
 PROGRESS_EVERY = 1000
-EXAMPLE = "dvl-calib salvage cut_off_bag -o whole_bag"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -14,10 +14,7 @@ from . import common, simulate_live
 if TYPE_CHECKING:
     from ..simulation.scenario import Scenario
 
-NAME = "simulate"
-HELP = "write a bag from a motion, an error model and any effects"
 GNSS_FRAMES = ("from_frame_id", "body", "enu", "ned")
-EXAMPLE = "dvl-calib simulate my_bag --misalignment 1.5 -2 3 --scale 0.5 --effect lever_arm:x_m=0.3,z_m=-0.1"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

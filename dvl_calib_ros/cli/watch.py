@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from ..node.ending import Ending
     from ..node.listener import Listener
 
-NAME = "watch"
-HELP = "watch a node that runs elsewhere, in the terminal"
-EXAMPLE = "dvl-calib watch --node /port/dvl_calibration"
 # How long a node may take to save, s.
 PATIENCE_S = 60.0
 

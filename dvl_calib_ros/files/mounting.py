@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -270,6 +269,8 @@ def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -
 
 def launch_file(calibrated: CalibratedMounting) -> str:
     """A launch file (XML) that publishes the calibrated mounting as a static transform."""
+    from xml.sax.saxutils import quoteattr  # imports what reads files over the net
+
     arguments = quoteattr(calibrated.static_transform)
     return f"""<launch>
   <!-- {_origin(calibrated)}. A transform holds no scale. Not beside a robot_state_publisher with the same joint. -->

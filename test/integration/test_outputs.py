@@ -16,7 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import replayed, run, write_bag
 
-from dvl_calib_ros.cli.main import COMMANDS, build_parser, main
+from dvl_calib_ros.cli.commands import COMMANDS
+from dvl_calib_ros.cli.main import build_parser, main
 from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.files.urdf import numbers
 
@@ -228,12 +229,12 @@ APART = {("diagnose", "--out"), ("diagnose", "--page"), ("demo", "--report")}
 
 def test_every_option_that_writes_is_tried_here():
     tried = {(c.arguments.split()[0], option) for c in COMMAND.values() for option in c.files + c.folders}
-    for module in COMMANDS:
-        parser = build_parser([module.NAME])._subparsers._group_actions[0].choices[module.NAME]
+    for command in COMMANDS:
+        parser = build_parser([command.name])._subparsers._group_actions[0].choices[command.name]
         for action in parser._actions:
             option = next(iter(action.option_strings), "")
             if action.type is Path and option and option not in READ:
-                assert (module.NAME, option) in tried | APART
+                assert (command.name, option) in tried | APART
 
 
 @pytest.mark.parametrize("name", [name for name, command in COMMAND.items() if len(command.files) > 1])

@@ -1,0 +1,89 @@
+"""Every command of ``dvl-calib``, in the order of its help, without importing any.
+
+A command is a module of this package with `add_arguments` and `run`, whose documentation is its description; it is
+imported when it is called, so what it imports at its top costs the others nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+
+class Command(NamedTuple):
+    """One command: its name, what it does in one line, a line to copy, and the module here that holds it."""
+
+    name: str
+    help: str
+    example: str
+    module: str = ""
+
+    def load(self) -> ModuleType:
+        """Import its module."""
+        return import_module(f".{self.module or self.name}", __package__)
+
+
+COMMANDS = (
+    Command(
+        "run",
+        "run the calibration node, live",
+        "dvl-calib run --params calibration.yaml --dvl-topic /dvl/velocity -p result_file:=/data/calibration.yaml",
+    ),
+    Command(
+        "watch",
+        "watch a node that runs elsewhere, in the terminal",
+        "dvl-calib watch --node /port/dvl_calibration",
+    ),
+    Command(
+        "doctor",
+        "say what is in a bag, what is wrong with it, and whether it can calibrate",
+        "dvl-calib doctor my_bag",
+    ),
+    Command("replay", "calibrate with recorded bags", "dvl-calib replay my_bag --save calibration.yaml"),
+    Command("salvage", "recover damaged recordings into a new bag", "dvl-calib salvage cut_off_bag -o whole_bag"),
+    Command(
+        "apply",
+        "write a saved calibration into URDF, parameters, TF or robot_localization, or take it back",
+        "dvl-calib apply calibration.yaml --urdf robot.urdf --launch dvl_tf.launch.xml --fusion dvl_ekf.yaml",
+    ),
+    Command(
+        "compare",
+        "compare calibrations: has the mounting moved?",
+        "dvl-calib compare monday.yaml tuesday.yaml --report compared.html",
+    ),
+    Command(
+        "diagnose",
+        "name what causes the velocity error that calibration leaves in recorded bags",
+        "dvl-calib diagnose my_bag --apply compensated.yaml",
+    ),
+    Command(
+        "export",
+        "write what was found of a DVL as the settings of another simulator",
+        "dvl-calib export gazebo diagnosis.json -o dvl.sdf",
+    ),
+    Command(
+        "evaluate",
+        "run the published validation procedure, or check bags against each other",
+        "dvl-calib evaluate snapir --seeds 5 --jobs 0 --json evaluation.json --report evaluation.html",
+    ),
+    Command(
+        "simulate",
+        "write a bag from a motion, an error model and any effects",
+        "dvl-calib simulate my_bag --misalignment 1.5 -2 3 --scale 0.5 --effect lever_arm:x_m=0.3,z_m=-0.1",
+    ),
+    Command(
+        "import",
+        "turn CSV or NPY trajectories, or logs of a DVL (Water Linked JSON, RDI PD0), into bags",
+        "dvl-calib import T12_dvl.csv --gnss T12_gnss.csv --attitude T12_attitude.csv -o T12",
+        module="import_",
+    ),
+    Command(
+        "parameters",
+        "list every parameter, model, effect, driver, warning or command, or write a parameter file",
+        "dvl-calib parameters --yaml > calibration.yaml",
+    ),
+    Command("demo", "live node, replay and truth side by side on a shipped bag", "dvl-calib demo --speed 20"),
+)
