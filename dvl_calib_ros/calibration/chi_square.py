@@ -7,6 +7,7 @@ quarter of a second of CPU to import, a third of what a short replay may take.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 _EPSILON = 4e-16
 # Passes for a quantile, of which Newton takes about ten; terms of a fraction, which takes about √dof
@@ -23,6 +24,7 @@ def chi2_sf(x: float, dof: float) -> float:
     return _tails(0.5 * x, 0.5 * dof)[1]
 
 
+@lru_cache
 def chi2_isf(p: float, dof: float) -> float:
     """x that chi-square exceeds with probability p, 0 < p < 1: Newton's method between bounds that close in."""
     a, x, low, high = 0.5 * dof, 0.5 * dof, 0.0, math.inf
