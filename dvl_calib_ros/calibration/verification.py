@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -118,6 +118,11 @@ class Verification:
     verdict: Word
     reasons: tuple[str, ...]
     mounting: str = ""
+
+    def with_objections(self, objections: Sequence[tuple[Word, str]]) -> Verification:
+        """With what else is known of it, as said first; the verdict is the worst of all."""
+        worst = min((self.verdict, *(word for word, _ in objections)), key=_SEVERITY.index)
+        return replace(self, verdict=worst, reasons=(*(sentence for _, sentence in objections), *self.reasons))
 
 
 def verify(

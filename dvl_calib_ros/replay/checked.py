@@ -19,7 +19,7 @@ from ..calibration.extrinsics import Extrinsics
 from ..calibration.findings import Finding, finding
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
-from ..calibration.verification import Verification, Word
+from ..calibration.verification import Word
 from ..errors import InputError
 from ..files.extrinsics import load_extrinsics
 from ..messages.drivers import KNOWN_DEFINITIONS
@@ -205,7 +205,7 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
         objections = recordings.objections(name)
         if name == result.selected and merge:
             notes += [f"merged as asked: {sentence}" for _, sentence in objections]
-        verifications[name] = verification if merge else _with_objections(verification, objections)
+        verifications[name] = verification if merge else verification.with_objections(objections)
     if recordings.unchecked:
         names = ", ".join(recordings.unchecked)
         notes.append(f"{names}: too little to be calibrated alone, so whether its mounting is the others' is not known")
@@ -221,15 +221,6 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
         recordings=recordings.comparison,
         pause_s=1e-9 * sum(recordings.pauses_ns),
     )
-
-
-def _with_objections(verification: Verification, objections: Sequence[tuple[Word, str]]) -> Verification:
-    if not objections:
-        return verification
-    order = (Word.REJECT, Word.MARGINAL, Word.ACCEPT)
-    worst = min((verification.verdict, *(word for word, _ in objections)), key=order.index)
-    said = tuple(sentence for _, sentence in objections)
-    return replace(verification, verdict=worst, reasons=(*said, *verification.reasons))
 
 
 def _without_pauses(

@@ -20,6 +20,7 @@ from ..calibration.folds import folds_of
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import Index
+from ..calibration.verification import Word
 
 # Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
@@ -28,6 +29,8 @@ ENOUGH = 3
 SHORTEST_M = 20.0
 # Where samples are further apart than this many of their usual intervals, and than this, s, nothing is known between.
 GAP_INTERVALS, GAP_S = 5.0, 2.0
+# By chance the drift over few stretches is not so many times larger with a calibration than without.
+WORSE = 1.5
 # Points of a track that are kept for a map.
 POINTS = 1500
 # Median of chi-square with one degree of freedom.
@@ -210,6 +213,22 @@ def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
         "end_error_m": {"before": navigation.before.end, "after": navigation.after.end},
         "noise_m_per_km": navigation.noise_per_km,
     }
+
+
+def objections(navigation: Navigation | None) -> list[tuple[Word, str]]:
+    """What the drift says against a calibration: velocities may fit better and the track worse."""
+    if navigation is None or navigation.stretches < ENOUGH:
+        return []
+    before, after, noise = navigation.before.per_km, navigation.after.per_km, navigation.noise_per_km
+    if after < WORSE * before or after**2 - before**2 < (2.0 * noise) ** 2:
+        return []
+    return [
+        (
+            Word.REJECT,
+            f"on data held out dead reckoning drifts by {_figure(after)} m per km with it, by {_figure(before)} as "
+            "mounted: an effect is missing from the model (dvl-calib diagnose looks for it)",
+        )
+    ]
 
 
 def in_words(navigation: Navigation) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from ..files.result_file import estimate_document, load_initial_calibration
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
-from .navigation import Navigation, navigation_of
+from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
@@ -63,8 +63,8 @@ class Replayed:
     dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
     recordings: what several recordings say, each for itself; None where they were not looked at so (`checked`).
     pause_s: how much of the time from the first to the last sample is between two recordings.
-    navigation: dead reckoning without and with the selected model's correction, on data that it had not seen; with a
-    history only, and None without a reference.
+    navigation: dead reckoning without and with the selected model's correction, on data that it had not seen; None
+    without a reference.
     """
 
     result: Result
@@ -133,8 +133,11 @@ def replay(
     result = calibrator.result()
     found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator) if recorder else None
+    navigation = navigation_of(calibrator, result.selected, calibrator.parameters)
+    verifications = dict(result.verifications)
+    verifications[result.selected] = verifications[result.selected].with_objections(objections(navigation))
     return Replayed(
-        result,
+        replace(result, verifications=verifications),
         (*bag.notes, *events, *map(str, found)),
         tuple(found),
         decoder.dvl_frame or "dvl_link",
@@ -142,7 +145,7 @@ def replay(
         decoder.frame_of_reference,
         decoder.dvl_type.name,
         decoder.turns_dvl,
-        navigation=navigation_of(calibrator, result.selected, calibrator.parameters) if recorder else None,
+        navigation=navigation,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 
 import numpy as np
@@ -12,8 +13,9 @@ from dvl_calib_ros.calibration.delay.hold_out import NO_TERMS, Recording, Terms
 from dvl_calib_ros.calibration.delay.rows import DvlColumns, ImuColumns, ReferenceColumns
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.cli.terminal_map import terminal_map
-from dvl_calib_ros.replay.navigation import Navigation, dead_reckoned, in_words
+from dvl_calib_ros.replay.navigation import Navigation, dead_reckoned, in_words, objections
 
 YAW = math.radians(1.0)
 
@@ -127,3 +129,15 @@ def test_the_map_on_a_terminal_fits_and_names_its_tracks(width):
     assert "reference" in rows[-1] and "corrected" in rows[-1]
     straight = navigated(recording(100.0))
     assert straight is not None and terminal_map(straight, 80).plain
+
+
+def test_a_correction_that_makes_the_track_worse_is_rejected_however_well_velocities_fit():
+    data = recording(1500.0, phi=(0.0, 0.0, 0.2 * YAW))
+    worse = navigated(data, Terms(np.array([0.0, 0.0, -0.5 * YAW, 0.0, 0.0, 0.0]), np.zeros(3), 0.0))
+    ((word, sentence),) = objections(worse)
+    assert word is Word.REJECT
+    assert re.search(r"drifts by 12 m per km with it, by 3.5 as mounted", sentence), sentence
+    better = navigated(data, Terms(np.array([0.0, 0.0, 0.2 * YAW, 0.0, 0.0, 0.0]), np.zeros(3), 0.0))
+    assert not objections(better) and not objections(navigated(data)) and not objections(None)
+    too_short = navigated(recording(60.0), Terms(0.01 * np.ones(6), np.zeros(3), 0.0))
+    assert too_short.after.per_km > 10.0 and not objections(too_short)
