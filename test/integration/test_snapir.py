@@ -87,7 +87,7 @@ def vector_rmse(error) -> float:
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
-# Yaw of the vehicle's DVL, deg: what G2 says with the INS as reference on T01 T03 T05 T13, 0.01 to 0.22.
+# Yaw of the vehicle's DVL, deg: what G2 says with the INS as reference on T01 T03 T05 T13, -0.02 to 0.22.
 YAW_DEG = 0.1
 
 
