@@ -130,7 +130,7 @@ def lag(
         near.any() and not near[best]
     ):  # on the same samples: a stretch that is noisy may be out of the far one's overlap
         index = np.arange(m) + best - (m - 1)
-        nearest = float(means(np.where((index >= 0) & (index < n), weight, 0.0))[near].min())
+        nearest = min(nearest, float(means(np.where((index >= 0) & (index < n), weight, 0.0))[near].min()))
     # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then it
     # agrees there, too, to what one step of the grid makes
     both = weight[1:] * weight[:-1]

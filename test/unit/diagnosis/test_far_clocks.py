@@ -78,3 +78,13 @@ def test_a_clock_that_is_too_far_off_is_refused_in_one_line_whatever_is_common_t
 def test_a_diagnosis_of_such_clocks_ends_in_that_line_and_not_in_an_answer(recording, seconds):
     with pytest.raises(InputError, match="set that clock right"):
         diagnose_recordings([late(recording, "dvl", seconds)], Parameters())
+
+
+def test_a_speed_that_hardly_changes_refuses_no_clock():
+    """Near and far lags agree as well; the near one is worse on the few samples that the far one has."""
+    time, rng = np.arange(0.0, 600.0, STEP_S), np.random.default_rng(0)
+    speed = 1.5 + 0.05 * (np.mod(time, 100.0) < 8.0)
+    one, other = (np.asarray(speed + 0.01 * rng.standard_normal(len(time)), dtype=complex) for _ in range(2))
+    other[time < 150.0] += 0.2 * rng.standard_normal(int((time < 150.0).sum()))
+    for late in (0.0, 300.0, -300.0):
+        assert not lag(one, late, other, 0.0)[1]
