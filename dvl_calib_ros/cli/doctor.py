@@ -62,7 +62,12 @@ def _print(examined: Examination) -> None:
         table.add_column(column, justify="right" if column == "Hz" else "left", overflow="fold")
     for content in examined.contents:
         cells = [escape(printable(cell)) for cell in (content.topic, content.frame_id)]
-        table.add_row(content.role, *cells, f"{content.rate_hz:.3g}", content.covariance.removesuffix(" always"))
+        table.add_row(
+            content.role,
+            *cells,
+            f"{content.rate_hz:.3g}" if content.rate_hz else "-",
+            content.covariance.removesuffix(" always"),
+        )
     out.print(table)
     for sentence in (*examined.discovery.found[1:], *examined.discovery.notes):
         out.print(f"[dim]{escape(printable(sentence))}[/]")

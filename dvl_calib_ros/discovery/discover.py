@@ -155,7 +155,7 @@ class _Search:
                 parts.append(f"no {role}")
                 continue
             look = self._seen.looks.get(name)
-            rate = "" if look is None else f", {look.rate_hz:.3g} Hz"
+            rate = f", {look.rate_hz:.3g} Hz" if look is not None and look.rate_hz else ""
             frame = ""
             if role == "reference" and look is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame

@@ -38,10 +38,10 @@ MOVING_TYPES = frozenset({*VELOCITY_TYPES, IMU_TYPE})
 class Look:
     """Some messages of one topic, N of them.
 
-    count: messages in the recording. rate_hz: over the whole of it. frame_id: of the velocity or of the IMU's data, the
-    first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the log where it is zero.
-    values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and
-    acceleration m/s², nan where not given.
+    count: messages in the recording. rate_hz: over the whole of it, 0 if that is an instant. frame_id: of the velocity
+    or of the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the
+    log where it is zero. values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular
+    velocity rad/s and acceleration m/s², nan where not given.
     """
 
     topic: str
@@ -86,7 +86,7 @@ def survey(bag: BagReader) -> Survey:
     static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
     start_ns = bag.span_ns[0] if types else 0
     spans_ns = bag.recorded_spans_ns if types else [(0, 0)]
-    seconds = max(1e-9 * sum(end - start for start, end in spans_ns), 1e-9)
+    seconds = 1e-9 * sum(end - start for start, end in spans_ns)
     taken: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in moving}
     transforms: list[Any] = []
     descriptions: list[str] = []
@@ -102,7 +102,9 @@ def survey(bag: BagReader) -> Survey:
             descriptions.append(message.data)
     looks = {}
     for topic, messages in taken.items():
-        look = _look(topic, types[topic], counts[topic], counts[topic] / seconds, start_ns, messages)
+        look = _look(
+            topic, types[topic], counts[topic], counts[topic] / seconds if seconds else 0.0, start_ns, messages
+        )
         if look is not None:
             looks[topic] = look
     return Survey(types, counts, looks, tuple(transforms), tuple(dict.fromkeys(descriptions)))

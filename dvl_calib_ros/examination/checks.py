@@ -18,6 +18,8 @@ SECOND_NS = 1_000_000_000
 ENOUGH = 20
 # Shares of messages that are worth a word: a single outlier is not.
 SOME, MANY = 0.005, 0.05
+# Of stamps that repeat so often not one in twenty is used
+MOST = 0.95
 # Stamps that jitter by more than this share of their interval ...
 JITTER = 0.05
 # ... against the rhythm of the sensor: an interval too long is followed by one too short (white jitter gives -0.5)
@@ -42,10 +44,9 @@ def interval_s(topic: Recorded) -> float:
 
 
 def stamp_findings(topic: Recorded) -> list[Finding]:
-    """Zero stamps, stamps of reception, stamps that go back, jump or repeat."""
-    n = len(topic)
-    if n < ENOUGH:
-        return []
+    """Too few messages, zero stamps, stamps of reception, stamps that go back, jump or repeat."""
+    if len(topic) < ENOUGH:
+        return [named("DOCTOR_TOO_FEW", topic=topic.topic, count=len(topic))]
     found = []
     zero = topic.stamps_ns == 0
     if zero.any():
@@ -63,7 +64,8 @@ def stamp_findings(topic: Recorded) -> list[Finding]:
         found.append(named("DOCTOR_STAMP_JUMP", topic=topic.topic, seconds=float(ahead.max())))
     repeated = float((steps == 0.0).mean())
     if repeated > SOME:
-        found.append(named("DOCTOR_REPEATED_STAMP", topic=topic.topic, share=repeated))
+        code = "DOCTOR_REPEATED_STAMP" if repeated < MOST else "DOCTOR_STANDING_STAMP"
+        found.append(named(code, topic=topic.topic, share=repeated))
     return found + _reception(topic.topic, steps, log_steps)
 
 

@@ -80,7 +80,7 @@ class Examination:
     @property
     def verdict(self) -> str:
         """Whether it can calibrate: yes, partly, or no."""
-        if any(found.severity is Severity.ERROR for found in self.findings):
+        if _has_error(self.findings):
             return "no"
         needed = [each for each in self.shown if each.name in ("pitch", "yaw")]  # what turns a track and lifts it
         return "yes" if needed and not any(each.needs for each in needed) else "partly"
@@ -125,14 +125,17 @@ def examine(paths: Sequence[Path], parameters: Parameters, given: Given | None =
         counts = bag.message_counts
         notes = tuple(bag.notes)
     streams = {role: columns[name] for role, name in there.items()}
-    seconds = max(1e-9 * (end_ns - start_ns), 1e-9)
+    seconds = 1e-9 * (end_ns - start_ns)
     velocity = _body_velocity(streams["dvl"], discovery)
     findings = _findings(streams, discovery, velocity)
     usable = not any(found.code == "DOCTOR_NO_ORIENTATION" for found in findings)
     return Examination(
         tuple(paths),
         seconds,
-        tuple(_content(role, topic, discovery, counts[topic.topic] / seconds) for role, topic in streams.items()),
+        tuple(
+            _content(role, topic, discovery, counts[topic.topic] / seconds if seconds else 0.0)
+            for role, topic in streams.items()
+        ),
         discovery,
         tuple(findings),
         float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
@@ -174,11 +177,11 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     found: list[Finding] = []
     for topic in streams.values():
         found += checks.stamp_findings(topic) + checks.gap_findings(topic)
-    clocks = checks.clock_findings(streams)
-    found += clocks
+    if not _has_error(found):
+        found += checks.clock_findings(streams)
     found += checks.velocity_findings(dvl, True)
     if reference is not None:
-        if not clocks:
+        if not _has_error(found):  # which would be why
             found += checks.apart_findings(dvl, reference)
         found += checks.velocity_findings(reference, False)
         if len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
@@ -197,6 +200,10 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     elif reference is not None:
         found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
     return sorted(found, key=lambda each: each.severity is not Severity.ERROR)
+
+
+def _has_error(found: Sequence[Finding]) -> bool:
+    return any(each.severity is Severity.ERROR for each in found)
 
 
 def _units(dvl: Recorded, reference: Recorded) -> list[Finding]:

@@ -51,6 +51,20 @@ _KINDS = (
         "stop the second publisher (ros2 topic info -v {topic})",
     ),
     FindingKind(
+        "DOCTOR_STANDING_STAMP",
+        "{topic}: {share:.0%} of the stamps repeat the one before, so hardly a message can be used",
+        "The driver fills header.stamp once, or from a clock that stands still.",
+        "let the driver stamp every message with its time of measurement",
+        Severity.ERROR,
+    ),
+    FindingKind(
+        "DOCTOR_TOO_FEW",
+        "{topic}: {count} messages are too few",
+        "It was hardly recorded; nothing can be said of it, nor learnt from it.",
+        "record all topics for some minutes",
+        Severity.ERROR,
+    ),
+    FindingKind(
         "DOCTOR_GAPS",
         "{topic}: silent for {seconds:.1f} s in {count} gaps, the longest at {at_s:.0f} s",
         "The sensor, its cable, its fix or its driver dropped out.",

@@ -94,7 +94,7 @@ def load_description(path: Path) -> DvlDescription:
         )
     try:
         return _of_diagnosis(path, document)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: damaged diagnosis ({type(error).__name__}: {error}); diagnose again") from error
 
 
@@ -110,7 +110,7 @@ def _document(path: Path) -> Any:
         raise InputError(f"{path}: is not text; give what dvl-calib diagnose --json writes") from error
     if text.lstrip().startswith("{"):
         try:
-            return json.loads(text)
+            return json.loads(text, parse_float=_finite, parse_constant=_finite)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: no valid JSON ({error}); diagnose again") from error
     for kind, mark in ((RESULT, f"format: {FORMAT}"), (PARAMETERS, "ros__parameters")):
@@ -119,6 +119,14 @@ def _document(path: Path) -> Any:
     raise InputError(
         f"{path}: neither a diagnosis (JSON) nor a result or parameter file (YAML); see dvl-calib diagnose --json"
     )
+
+
+def _finite(word: str) -> float:
+    """A number of JSON, which knows none that is not finite; what is without a limit is written as null."""
+    number = float(word)
+    if not math.isfinite(number):
+        raise ValueError(f"{word} is not finite")
+    return number
 
 
 def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:

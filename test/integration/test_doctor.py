@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from io_fixtures import TOPICS, write_bag
+from io_fixtures import TOPICS, mcap_bytes, write_bag
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
 from dvl_calib_ros.examination.kinds import KINDS
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
@@ -159,12 +160,23 @@ def one_after_the_other(topic: str, log: int, message: Any, i: int) -> int | Non
     return None if is_off.get(topic) else log
 
 
+def standing_stamp(log: int, message: Any, _: int) -> int:
+    stamp(message, START_NS)
+    return log
+
+
+def hardly_recorded(log: int, message: Any, i: int) -> int | None:
+    return log if i < 7 else None
+
+
 FAULTS: dict[str, tuple[str, Callable[[str, int, Any, int], int | None]]] = {
     "stamps of reception": ("DOCTOR_STAMP_RECEPTION", dvl_only(reception)),
     "stamps of zero": ("DOCTOR_STAMP_ZERO", reference_only(zero_stamps)),
     "a clock set back": ("DOCTOR_STAMP_BACK", dvl_only(clock_set_back)),
     "another clock": ("DOCTOR_CLOCKS", dvl_only(other_clock)),
     "a DVL that is off while there is a fix": ("DOCTOR_APART", one_after_the_other),
+    "a stamp that stands still": ("DOCTOR_STANDING_STAMP", dvl_only(standing_stamp)),
+    "seven messages": ("DOCTOR_TOO_FEW", reference_only(hardly_recorded)),
     "a dropout": ("DOCTOR_GAPS", dvl_only(dropout)),
     "zeros without bottom lock": ("DOCTOR_ZEROS", dvl_only(zeros_without_lock)),
     "a driver that repeats itself": ("DOCTOR_FROZEN", dvl_only(frozen([]))),
@@ -242,3 +254,15 @@ def test_a_bag_without_a_dvl_is_refused_in_one_line(tmp_path, capsys):
 def test_every_finding_of_the_doctor_can_be_put_in_words():
     for kind in KINDS.values():
         assert kind.code.startswith("DOCTOR_") and kind.means.endswith(".")
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_of_messages_at_one_instant_no_rate_is_told(tmp_path, capsys, count):
+    dvl = [sample for sample in simulate(scenario()).dvl][:count]
+    with BagReader([write_bag(tmp_path / "source", dvl)]) as bag:
+        messages = [("dvl/twist", START_NS, data) for _, _, data in bag.raw_messages(["dvl/twist"])]
+    (tmp_path / "one.mcap").write_bytes(mcap_bytes(messages))
+    for command in ("doctor", "replay"):
+        main([command, str(tmp_path / "one.mcap")])
+        out = capsys.readouterr().out
+        assert "one.mcap" in out and "Hz)" not in out and "e+" not in out

@@ -241,7 +241,10 @@ def test_a_parameter_file_is_exported_as_what_calibration_compensates(tmp_path, 
         (json.dumps(document(dvl={"sizes_mps": {}})), "damaged"),
         (json.dumps(document(effects=[{"name": "lever_arm"}])), "damaged"),
         (json.dumps(document(dvl={**document()["dvl"], "rate_hz": 0.0})), "0 Hz"),
-        (json.dumps(document(dvl={**document()["dvl"], "lever_arm_m": [1e999, 0, 0]})), "not finite"),
+        (json.dumps(document(dvl={**document()["dvl"], "lever_arm_m": [1e999, 0, 0]})), "Infinity is not finite"),
+        (json.dumps(document(dvl={**document()["dvl"], "speed_mps": [0, math.nan, 0]})), "NaN is not finite"),
+        (json.dumps(document(dvl={**document()["dvl"], "rate_hz": 5.5})).replace("5.5", "1e400"), "1e400 is not"),
+        (json.dumps(document(dvl={**document()["dvl"], "rate_hz": 10**400})), "damaged"),
     ],
 )
 def test_what_is_no_diagnosis_is_refused_in_one_line_and_nothing_is_written(content, said, tmp_path, capsys):
