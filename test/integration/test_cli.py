@@ -326,7 +326,7 @@ def test_bad_options_of_simulate_are_refused_and_nothing_is_written(capsys, tmp_
 def test_simulate_never_overwrites(capsys, tmp_path):
     assert "exists already" in fail(capsys, "simulate", tmp_path)
     (tmp_path / "file").touch()
-    assert "cannot be written" in fail(capsys, "simulate", tmp_path / "file" / "bag", "--duration", 1)
+    assert "is not writable" in fail(capsys, "simulate", tmp_path / "file" / "bag", "--duration", 1)
 
 
 # ------------------------------------------------------------------ import
