@@ -1,6 +1,7 @@
 """Speed and memory as ratios against a peer in the same run; about nine minutes for all. Linux.
 
 batch     the batch path against filterpy
+commands  CPU of help, doctor, replay and diagnosis as they are typed, against an interpreter that does nothing
 evaluate  the published procedure against a loop with filterpy (set DVL_CALIB_SNAPIR to a folder of trajectories)
 replay    an hour's bag against reading and deserialising it with rosbags
 node      the node's CPU against a subscriber that only republishes
@@ -24,7 +25,7 @@ from dvl_calib_ros.errors import InputError
 
 from . import Measurement
 
-WHAT = ("batch", "evaluate", "replay", "node", "latency", "rate", "soak")
+WHAT = ("batch", "commands", "evaluate", "replay", "node", "latency", "rate", "soak")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -79,9 +80,10 @@ def _measure(name: str, minutes: float) -> list[Measurement]:
         if name == "soak":
             return node.measure_soak(minutes)
         return {"node": node.measure_cpu, "latency": node.measure_latency, "rate": node.measure_rate}[name]()
-    from . import batch, evaluate, replay
+    from . import batch, commands, evaluate, replay
 
-    measure: Callable[[], list[Measurement]] = {"batch": batch, "evaluate": evaluate, "replay": replay}[name].measure
+    modules = {"batch": batch, "commands": commands, "evaluate": evaluate, "replay": replay}
+    measure: Callable[[], list[Measurement]] = modules[name].measure
     return measure()
 
 
