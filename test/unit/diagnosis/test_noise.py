@@ -13,7 +13,7 @@ from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.contradicted import without_contradicted
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.far_clocks import lag
-from dvl_calib_ros.diagnosis.recordings import Recording, make_recording
+from dvl_calib_ros.diagnosis.recordings import Curve, Recording, make_recording
 from dvl_calib_ros.diagnosis.results import Verdict
 from dvl_calib_ros.diagnosis.selection import blocks_of
 from dvl_calib_ros.simulation.injection import injection
@@ -258,3 +258,12 @@ def test_noise_with_a_memory_is_still_called_coloured():
     diagnosis = diagnose_recordings([recorded(given | {"reference": (time, velocity + slow_noise)})], Parameters())
     assert "coloured_reference_noise" in [each.name for each in diagnosis.noise]
     assert diagnosis.selection.fit.noise.is_coloured
+
+
+def test_of_two_spikes_with_a_good_sample_between_the_spikes_are_left_out():
+    time = np.arange(0.0, 100.0, 0.2)
+    velocity = np.column_stack([1.0 + 0.3 * np.sin(0.1 * time), 0.2 * np.cos(0.2 * time), 0.0 * time])
+    velocity = velocity + 0.01 * np.random.default_rng(1).standard_normal(velocity.shape)
+    velocity[[100, 102, 300]] += [[-1.0, 0.9, -0.9], [-0.2, 0.1, -1.0], [1.0, 0.0, 0.0]]
+    kept = Curve(time, velocity).without_spikes().time
+    assert sorted(set(time) - set(kept)) == pytest.approx(time[[100, 102, 300]])
