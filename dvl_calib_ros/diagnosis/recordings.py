@@ -181,10 +181,12 @@ class Curve:
                 return curve
             off = curve.from_neighbours
             scale = np.maximum(robust_std(off), 1e-9)
-            among = np.lib.stride_tricks.sliding_window_view(np.pad(curve.values, ((2, 2), (0, 0)), mode="edge"), 5, 0)
-            alone = np.abs(curve.values - np.median(among, axis=-1)) / curve.loudness
+            far = (np.abs(off) / scale).max(axis=1)
+            at = np.flatnonzero(far >= SPIKE)
             # the good one between two spikes is far from where these tell it to be, and among the five about it
-            far = (np.minimum(np.abs(off), alone) / scale).max(axis=1)
+            about = np.clip(at[:, None] + np.arange(-2, 3), 0, len(far) - 1)
+            alone = np.abs(curve.values[at] - np.median(curve.values[about], axis=1)) / curve.loudness[at]
+            far[at] = (np.minimum(np.abs(off[at]), alone) / scale).max(axis=1)
             beside = np.maximum(np.append(far[1:], 0.0), np.append(0.0, far[:-1]))
             kept = (far < SPIKE) | (far < beside)  # what a spike does to its neighbours is not theirs
             if kept.all():
