@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import suppress
+from typing import TextIO
 
 
 def open_streams() -> None:
@@ -31,9 +32,9 @@ def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
-def give_up_stdout() -> None:
-    """Let what is still to be written to standard output, and cannot be, lead to nowhere."""
+def give_up(stream: TextIO) -> None:
+    """Let what is still to be written to a standard stream, and cannot be, lead to nowhere."""
     handle = os.open(os.devnull, os.O_WRONLY)
     with suppress(OSError, ValueError):
-        os.dup2(handle, sys.stdout.fileno())
+        os.dup2(handle, stream.fileno())
     os.close(handle)

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from ..streams import give_up
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -164,7 +166,12 @@ def console(stderr: bool = False) -> Console:
 
         def print(self, *objects: Any, **options: Any) -> None:
             shown = (Folding(each) if isinstance(each, RichTable) else each for each in objects)
-            super().print(*shown, **options)
+            try:
+                super().print(*shown, **options)
+            except OSError:
+                if not self.stderr:
+                    raise
+                give_up(sys.stderr)  # who does not read warnings gets the result all the same
 
     return Console(stderr=stderr, width=_width(sys.stderr if stderr else sys.stdout), highlight=False, emoji=False)
 

@@ -10,11 +10,13 @@ Exit code 0: the same mounting within σ. 1: it has moved. 2: bad usage or input
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..streams import give_up
 from . import common
 from .reporting import add_report_option, report_writer
 
@@ -57,7 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
         common.write_json(arguments.json, comparison_document(comparison))
     if write_report is not None:
         write_report(arguments.report, comparison)
-    _print(comparison)
+    try:
+        _print(comparison)
+        sys.stdout.flush()
+    except BrokenPipeError:  # | head: the answer is the exit code all the same
+        give_up(sys.stdout)
     return 0 if comparison.same_mounting else 1
 
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 from .. import __version__
-from ..streams import give_up_stdout, open_streams, say
+from ..streams import give_up, open_streams, say
 from .commands import COMMANDS
 
 
@@ -111,10 +111,10 @@ def _run(argv: Sequence[str]) -> int:
     except (InputError, ParameterError) as error:
         return _fail(arguments.command, str(error))
     except BrokenPipeError:  # | head
-        give_up_stdout()
+        give_up(sys.stdout)
         return 0
     except OSError as error:
-        give_up_stdout()  # if that is what cannot be written
+        give_up(sys.stdout)  # if that is what cannot be written
         name = "" if error.filename is None else f"{error.filename}: "
         return _fail(arguments.command, f"{name}{error.strerror or error}; check names, permissions and space")
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import IO, TYPE_CHECKING
 
 from ..node.main import ENDS_WITH_STDIN
+from ..streams import say
 from . import common
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
         finally:
             code = _ended(process)
         for text in log.finished()[said:]:
-            print(text, file=sys.stderr)
+            say(text)
     return code
 
 
@@ -96,7 +97,7 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
     try:
         return process.wait(PATIENCE_S)
     except subprocess.TimeoutExpired:
-        print(f"the node did not end within {PATIENCE_S:.0f} s and is killed; it may not have saved", file=sys.stderr)
+        say(f"the node did not end within {PATIENCE_S:.0f} s and is killed; it may not have saved")
         process.kill()
         return process.wait()
 

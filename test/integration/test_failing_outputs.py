@@ -19,6 +19,8 @@ from command_line import fail
 from conftest import ROOT
 from io_fixtures import run, write_bag
 
+from dvl_calib_ros.calibration.samples import DvlSample
+
 PATIENCE_S = 60.0
 
 
@@ -47,6 +49,32 @@ def test_closed_streams_are_as_good_as_nowhere(bag, tmp_path, closed):
     document = json.loads((tmp_path / "out.json").read_text())  # nothing that was said is in it
     assert "models" in document and os.listdir(tmp_path) == ["out.json"]
     assert (">&-" in closed.replace("2>&-", "")) == (done.stdout == "")
+
+
+@pytest.fixture(scope="module")
+def warned_of(tmp_path_factory) -> Path:
+    """A bag that a replay warns of."""
+    still = [each._replace(velocity=(1.5, 0.0, 0.0)) if isinstance(each, DvlSample) else each for each in run(40.0)]
+    return write_bag(tmp_path_factory.mktemp("warned") / "bag", still)
+
+
+@pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full", "2</dev/null", "2> >(true)"])
+def test_warnings_that_nobody_can_read_cost_no_result(warned_of, tmp_path, stream):
+    assert "warning: " in shell("", "replay", warned_of).stderr
+    done = shell(stream, "replay", warned_of, "--json", tmp_path / "o.json")
+    assert done.returncode == 0 and "samples used" in done.stdout
+    assert "models" in json.loads((tmp_path / "o.json").read_text())
+
+
+def test_a_comparison_of_which_only_the_first_line_is_read_still_says_by_its_code_that_the_mounting_moved(tmp_path):
+    for name, yaw in (("before", 0.0), ("after", 5.0)):
+        options = ("--trajectory", "figure8", "--duration", 120, "--misalignment", 0, 0, yaw)
+        assert shell("", "simulate", tmp_path / name, *options).returncode == 0
+        assert shell("", "replay", tmp_path / name, "--save", tmp_path / f"{name}.yaml").returncode == 0
+    results = (tmp_path / "before.yaml", tmp_path / "after.yaml")
+    assert shell("", "compare", *results).returncode == 1
+    done = shell("> >(true)", "compare", *results)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full", ">&- 2>&-"])
