@@ -55,14 +55,16 @@ def fuzz_apart(name: str, inputs: int, corpus: Path) -> bool:
     command += [f"-artifact_prefix={corpus}/{name}-"]
     log = corpus / f"{name}.log"
     with log.open("w") as errors:
-        subprocess.run(command, stderr=errors, env=_environment(), check=False)
+        code = subprocess.run(command, stderr=errors, env=_environment(), check=False).returncode
     text = log.read_text(errors="replace")
     tried = re.findall(r"^(?:#|stat::number_of_executed_units: )(\d+)", text, re.MULTILINE)
     rate = re.findall(r"^stat::average_exec_per_sec:\s+(\d+)", text, re.MULTILINE)
     found = sorted(corpus.glob(f"{name}-*"))
     outcome = f"FOUND {', '.join(map(str, found))}" if found else "nothing found"
+    if code < 0:  # libFuzzer tells of crashes; this is what it could not
+        outcome += f", KILLED by signal {-code}"
     print(f"{name}: {max(map(int, tried), default=0)} inputs, {' '.join(rate) or '?'} per s, {outcome}", flush=True)
-    return not found
+    return not found and code >= 0
 
 
 def _environment() -> dict[str, str]:
