@@ -85,6 +85,8 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
     discovery = common.discovered(arguments, [path], common.load(arguments))
     with common.progress(f"replaying {name}") as on_progress:
         replayed = replay([path], discovery.parameters, discovery.topics, on_progress)
+    known = {str(each) for each in replayed.findings}
+    common.print_warnings([note for note in replayed.notes if note not in known])  # what is damaged or missing
     found = extrinsics_of_replay(replayed, name)
     if found is None:
         raise InputError(f"{path}: no sample of it could be used to calibrate; ask dvl-calib doctor {path}")

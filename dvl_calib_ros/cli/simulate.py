@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.writer import Compression, Storage
     from ..calibration.samples import VelocityFrame
     from ..simulation.injection import injection
-    from ..simulation.recorded import Recording
+    from ..simulation.recorded import Recording, notes_of
     from ..simulation.scenario import Scenario, write_bag
     from ..simulation.sensors import DvlErrors, ImuErrors
     from ..simulation.waves import Waves
@@ -115,6 +115,8 @@ def run(arguments: argparse.Namespace) -> None:
     recording = arguments.motion_of and Recording(
         arguments.motion_of, gnss_topic, imu_topic, arguments.motion_frame, arguments.motion_smoothing
     )
+    if recording:
+        common.print_warnings(notes_of(recording))
     scenario = Scenario(
         trajectory=arguments.trajectory,
         seconds=arguments.duration,

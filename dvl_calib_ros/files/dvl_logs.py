@@ -74,7 +74,7 @@ def _read_json(path: Path, content: bytes) -> Log:
             continue
         try:
             report = json.loads(line[start:])
-        except (json.JSONDecodeError, RecursionError):
+        except (ValueError, RecursionError):  # no JSON, or a number of thousands of digits
             left_out["not valid JSON"] += 1
             continue
         if isinstance(report, dict) and "vx" in report:
@@ -91,17 +91,18 @@ def _json_sample(path: Path, report: dict[str, Any], left_out: Counter[str]) -> 
     if "time_of_validity" not in report:
         raise InputError(f"{path}: reports have no time_of_validity; it comes with the DVL's software 2.2 and later")
     try:
-        velocity = FLU_FROM_FRD @ np.array([float(report[name]) for name in ("vx", "vy", "vz")])
+        velocity = np.array([float(report[name]) for name in ("vx", "vy", "vz")])
         stamp_ns = int(report["time_of_validity"]) * 1000
         given = report.get("covariance")
         covariance = np.array(given, dtype=float).reshape(3, 3) if given else float(report["fom"]) ** 2 * np.eye(3)
     except (KeyError, TypeError, ValueError, OverflowError):
         left_out["damaged"] += 1
         return None
-    if not np.isfinite(velocity).all() or not 0 < stamp_ns < 2**31 * 1_000_000_000:
+    is_finite = np.isfinite(velocity).all() and np.isfinite(covariance).all()
+    if not is_finite or not 0 < stamp_ns < 2**31 * 1_000_000_000:
         left_out["damaged"] += 1
         return None
-    x, y, z = velocity.tolist()
+    x, y, z = (FLU_FROM_FRD @ velocity).tolist()
     return DvlSample(stamp_ns, (x, y, z), FLU_FROM_FRD @ covariance @ FLU_FROM_FRD)
 
 

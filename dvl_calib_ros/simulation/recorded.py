@@ -76,6 +76,14 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
     return Motion(time, on_grid, rotation.as_matrix(), spline(at, 1))
 
 
+def notes_of(recording: Recording) -> list[str]:
+    """What of the recording is damaged or missing, in words."""
+    with BagReader([recording.path]) as bag:
+        for _ in bag.raw_messages(bag.topics):
+            pass
+        return list(bag.notes)
+
+
 def _read(recording: Recording) -> _Samples:
     with BagReader([recording.path], KNOWN_DEFINITIONS) as bag:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)

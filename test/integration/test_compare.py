@@ -113,3 +113,13 @@ def test_in_python_result_files_and_replays_are_compared_alike(place):
     assert not dc.compare(place / "a.yaml", place / "b.yaml", str(place / "c.yaml")).same_mounting
     with pytest.raises(dc.InputError, match="no such result file"):
         dc.compare(place / "a.yaml", place / "nothing.yaml")
+
+
+@pytest.mark.parametrize("words", [("compare", "RESULT", "BAG"), ("simulate", "new", "--motion-of", "BAG")])
+def test_what_is_missing_of_a_damaged_bag_is_said(place, tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    content = (place / "b" / "b.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(content[: 9 * len(content) // 10])
+    assert main([{"RESULT": str(place / "a.yaml"), "BAG": "cut.mcap"}.get(word, word) for word in words]) == 0
+    errors = capsys.readouterr().err
+    assert errors.count("cut.mcap: damaged or cut off") == 1 and "whole messages" in errors

@@ -129,3 +129,15 @@ def test_import_writes_a_bag_of_either_log(tmp_path, capsys):
     assert "no velocity that can be used (1 without bottom lock)" in fail(
         capsys, "import", empty, "-o", tmp_path / "none"
     )
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_that_are_none_are_damage_and_no_warning(tmp_path):
+    lines = [report(i, v) for i, v in enumerate(VELOCITIES)]
+    spoilt = [
+        lines[0].replace("1.5", "9" * 100_000), lines[0].replace("1.5", "1e400"), lines[0].replace("1.5", "NaN"),
+        report(0, VELOCITIES[0], covariance=[[float("inf")] * 3] * 3), report(0, VELOCITIES[0], covariance=[1.0]),
+        report(0, VELOCITIES[0], time_of_validity=float("inf")), report(0, VELOCITIES[0], time_of_validity=10**30),
+    ]  # fmt: skip
+    log = read_dvl_log(water_linked(tmp_path / "a50.log", *lines, *spoilt))
+    assert len(log.samples) == 3 and sum(log.left_out.values()) == len(spoilt)
