@@ -14,7 +14,7 @@ from pathlib import Path
 
 from . import Measurement
 
-ROUNDS = 3
+ROUNDS = 2
 _DVL_CALIB = ["-m", "dvl_calib_ros.cli.main"]
 _EFFECTS = ["--effect", "lever_arm:x_m=-1.2", "--effect", "dvl_time_offset:seconds=0.25"]
 RECORDINGS = 5
