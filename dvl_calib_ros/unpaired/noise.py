@@ -31,7 +31,7 @@ WORTH_TELLING = 1.15
 TAIL = 3.7
 # A vehicle that goes astern so often shows what its noise does then
 ASTERN_SHARE, ASTERN_MPS = 0.05, 0.1
-# Growth of the noise is of the logarithm: these are compared where one side shows them at this level
+# Growth of the noise is of the logarithm: it is compared where one side shows it at this level, and so is its colour
 GROWS = 1e-4
 # Standard deviations of speed, m/s, turn rate, rad/s, and speed astern, m/s, over which a growth can be seen
 SPREAD = {"speed": 0.1, "turn_rate": 0.01, "astern": 0.05}
@@ -266,8 +266,13 @@ def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidat
 
 
 def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Slow noise: means over blocks, against what white noise of the same level would have."""
+    """Slow noise: means over blocks, against what white noise of the same level would have.
+
+    Where one side surely has any: what reaches these means of the reference's noise, or of its motion between samples,
+    differs between the sides as well.
+    """
     findings = [_finding(log, "coloured_reference_noise") for log in (vehicle, simulator)]
+    findings = [each if each is not None and each.p < GROWS else None for each in findings]
     if findings[0] is None and findings[1] is None:
         return None
     slow = [_slow(log) for log in (vehicle, simulator)]
