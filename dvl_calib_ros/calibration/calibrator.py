@@ -18,6 +18,7 @@ import numpy as np
 from .alignment import Aligner
 from .assembly import gate_of, nis_bounds, prior
 from .bank import Group, ModelCounts, groups_of
+from .days import day_covariance
 from .delay.filter import DelayFilter
 from .delay.hold_out import Recording, Terms
 from .frames import Array, Vector
@@ -368,7 +369,12 @@ class Calibrator:
         return factor
 
     def published(self, name: str) -> GaussianState:
-        """As `state`, with σ worth believing: the larger of what the filter claims and what blocks of time show."""
+        """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""
+        state = self.of_recording(name)
+        return GaussianState(state.x, state.p + day_covariance(MODELS[name], self.parameters))
+
+    def of_recording(self, name: str) -> GaussianState:
+        """As `state`, with σ as of the same day: the larger of what the filter claims and what blocks of time show."""
         state = self.state(name)
         if self._source(MODELS[name]) is None:  # its own has been raised
             return state
@@ -404,12 +410,13 @@ class Calibrator:
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
         model = MODELS[name or self.selected]
-        state, covariance = self.published(model.name)
+        state, covariance = self.of_recording(model.name)
         used, gated, mean_nis, rows, _ = self._counts(model)
         return Estimate(
             model=model.name,
             state=state,
-            covariance=covariance,
+            covariance=covariance + day_covariance(model, self.parameters),
+            recording_covariance=covariance,
             filter_std=np.sqrt(np.diag(covariance)) / self.inflation(model.name),
             used=used,
             gated=gated,

@@ -2,9 +2,7 @@
 
 A model's angles are relative to the mounting that it was given, and its states are its own. What two calibrations can
 be compared in is the whole: the corrected mounting in the body, the lever arm, the scale of motion ahead and the delay.
-A calibration is right for its own day. What is constant on that day and another on the next, the error of the heading
-reference (in yaw, one to one) and the speed of sound (in scale), no scatter within a recording shows: it is in the
-covariance here, by `day_std_heading` and `day_std_scale`, and nowhere else.
+A calibration is right for its own day: what another day makes of it (`days`) is in the covariance here.
 """
 
 from __future__ import annotations
@@ -15,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .days import day_covariance
 from .error_model import corrected_mounting
 from .frames import Array, skew
 from .kalman import GaussianState
@@ -92,8 +91,8 @@ def extrinsics_of(
 ) -> Extrinsics:
     """What a state (n,) of a model says of the DVL, with the parameters that it was found with.
 
-    span_ns: stamps of the first and last sample. A component counts as shown if its σ is at most half of what the
-    parameters say is known without data, as for observability.
+    state: with σ of its recording, by which a component is shown: if that is at most half of what the parameters say is
+    known without data, as for observability. span_ns: stamps of the first and last sample.
     """
     found = _components(model, state.x, parameters)
     jacobian = np.empty((N_COMPONENTS, len(state.x)))
@@ -106,8 +105,7 @@ def extrinsics_of(
     covariance = jacobian @ state.p @ jacobian.T
     std = np.sqrt(np.diag(covariance))
     shown = jacobian.any(axis=1) & (std <= OBSERVED_SHARE * _unknown(parameters))
-    covariance[TURN, TURN][2, 2] += parameters.day_std_heading**2
-    covariance[SCALE, SCALE] += parameters.day_std_scale**2
+    covariance += jacobian @ day_covariance(model, parameters) @ jacobian.T
     covariance[~shown] = 0.0
     covariance[:, ~shown] = 0.0
     rotation, rest = found

@@ -358,16 +358,16 @@ class Parameters:
     )
     day_std_heading: float = _parameter(
         math.radians(0.1),
-        "By how much the heading reference is off on a day, constantly: where calibrations of different days are "
-        "compared, in the σ of yaw (0.1°: a fibre-optic gyrocompass; a magnetic compass: 1° and more).",
+        "By how much the heading reference is off on a day, constantly: in the σ of yaw, which is that of the next "
+        "recording (0.1°: a fibre-optic gyrocompass; a magnetic compass: 1° and more).",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     day_std_scale: float = _parameter(
         0.003,
-        "By how much the scale differs from day to day: where calibrations of different days are compared, in the σ of "
-        "scale (0.3 %: 4.5 m/s of the speed of sound, as of 1.5 °C).",
+        "By how much the scale differs from day to day: in the σ of scale, which is that of the next recording (0.3 %: "
+        "4.5 m/s of the speed of sound, as of 1.5 °C).",
         low=0.0,
         high=0.5,
     )

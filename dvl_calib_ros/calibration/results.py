@@ -19,16 +19,18 @@ from .verification import Verification
 
 @dataclass(frozen=True)
 class Estimate:
-    """State of one model. filter_std (n,): standard deviations that its filter claims; those of covariance are what
-    blocks of time show, where that is more.
+    """State of one model.
 
-    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n). used, gated:
+    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n), of the next
+    recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
+    more than the filter claims. filter_std: (n,) standard deviations that the filter claims. used, gated:
     samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
     """
 
     model: str
     state: Array
     covariance: Array
+    recording_covariance: Array
     filter_std: Array
     used: int
     gated: int
@@ -44,8 +46,13 @@ class Estimate:
 
     @property
     def std(self) -> Array:
-        """Standard deviations (n,)."""
+        """Standard deviations (n,), of the next recording."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def recording_std(self) -> Array:
+        """Standard deviations (n,) of this recording."""
+        return np.sqrt(np.diag(self.recording_covariance))
 
     @property
     def misalignment(self) -> Array:

@@ -16,7 +16,7 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
     name: what it is called. Raises InputError for what is no result file, is damaged, or holds no sample.
     """
     calibrated = load_calibrated_mounting(path)
-    content, states = load_result(path)
+    content, states = load_result(path, of_recording=True)
     model = calibrated.model
     try:
         used = int(content["models"][model.name]["used"])

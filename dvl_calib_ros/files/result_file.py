@@ -40,6 +40,7 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
         "state_names": list(estimate.state_names),
         "state": estimate.state.tolist(),
         "covariance": estimate.covariance.tolist(),
+        "covariance_of_recording": estimate.recording_covariance.tolist(),
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
@@ -72,6 +73,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         "model": result.selected,
         **estimate_document(estimate),
         "std": _std_in_words(estimate, estimate.std),
+        "std_of_recording": _std_in_words(estimate, estimate.recording_std),
         "std_by_filter": _std_in_words(estimate, estimate.filter_std),
         **({} if verification is None else {"verification": verification_document(verification)}),
         **({"suggestion": result.suggestion} if result.suggestion else {}),
@@ -215,7 +217,7 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
     What is of the day that it was made on (`Nuisance.of_the_day`) is as not known. mounting_rpy: the nominal mounting
     to go on with. The file's angles are relative to its own, which must be that.
     """
-    content, known = load_result(path)
+    content, known = load_result(path, of_recording=True)
     _check_mounting(path, content, mounting_rpy)
     return {name: _another_day(name, state) for name, state in known.items()}
 
@@ -229,8 +231,11 @@ def _another_day(name: str, state: GaussianState) -> GaussianState:
     return GaussianState(x, p)
 
 
-def load_result(path: Path) -> tuple[dict[str, Any], dict[str, GaussianState]]:
-    """A result file's document, and its states and covariances by model name. Raises InputError."""
+def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any], dict[str, GaussianState]]:
+    """A result file's document, and its states and covariances by model name. Raises InputError.
+
+    of_recording: covariances of the recording, without what another day makes of them.
+    """
     content = load_yaml(path, "result file")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
@@ -240,7 +245,9 @@ def load_result(path: Path) -> tuple[dict[str, Any], dict[str, GaussianState]]:
     if "parameters" not in content:  # the last that is written
         raise InputError(f"{path}: damaged, its end is missing")
     known = {
-        name: _gaussian(f"{path}: models: {name}", name, saved) for name, saved in models.items() if name in MODELS
+        name: _gaussian(f"{path}: models: {name}", name, saved, of_recording)
+        for name, saved in models.items()
+        if name in MODELS
     }
     if not known:
         raise InputError(f"{path}: none of its models {', '.join(map(str, models))} is one of {', '.join(MODELS)}")
@@ -275,11 +282,20 @@ def _with_new_states(name: str, names: tuple[str, ...], x: Array, p: Array) -> t
     return model.state_names, *start
 
 
-def _gaussian(where: str, name: str, saved: Any) -> GaussianState:
+def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> GaussianState:
+    published = _with_covariance(where, name, saved, "covariance")
+    key = "covariance_of_recording"
+    if key not in saved:  # of before the two were told apart
+        return published
+    own = _with_covariance(where, name, saved, key)
+    return own if of_recording else published
+
+
+def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianState:
     model = MODELS[name]
     try:
         x = np.array(saved["state"], dtype=float)
-        p = np.array(saved["covariance"], dtype=float)
+        p = np.array(saved[key], dtype=float)
         names = tuple(saved["state_names"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: damaged ({type(error).__name__}: {error})") from error

@@ -171,12 +171,13 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     units = {each.name: each.unit for each in model.nuisance}
     for entry in estimate.observability:
         name = entry.name
-        value = estimate.state[estimate.state_names.index(name)]
+        index = estimate.state_names.index(name)
+        value = estimate.state[index]
         factor, unit = (math.degrees(1.0), "deg") if name.startswith("phi") else (100.0, "%")
         if name in units:
             factor, unit = 1.0, units[name]
         values[f"{name} [{unit}]"] = f"{factor * value:.4f}"
-        values[f"std {name} [{unit}]"] = f"{factor * entry.std:.4f}"
+        values[f"std {name} [{unit}]"] = f"{factor * std[index]:.4f}"
         values[f"filter std {name} [{unit}]"] = f"{factor * by_filter[name]:.4f}"
         values[f"progress {name} [%]"] = f"{100.0 * entry.progress:.1f}"
         values[f"observed {name}"] = "yes" if entry.observed else f"no ({entry.axis}); needs {entry.missing}"

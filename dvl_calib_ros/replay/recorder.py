@@ -143,7 +143,7 @@ def _model_history(
 ) -> ModelHistory:
     estimate = calibrator.estimate(name)
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
-    states, stds, sums = [estimate.state[None]], [estimate.std[None]], [[(nis_sum, estimate.used)]]
+    states, stds, sums = [estimate.state[None]], [estimate.recording_std[None]], [[(nis_sum, estimate.used)]]
     if len(numbers):
         state, used, nis_sums = calibrator.states_at(name, trace, numbers, stamps_ns)
         states.insert(0, state.x)

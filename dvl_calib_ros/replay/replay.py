@@ -158,7 +158,7 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
     return extrinsics_of(
         name,
         MODELS[estimate.model],
-        GaussianState(estimate.state, estimate.covariance),
+        GaussianState(estimate.state, estimate.recording_covariance),
         Parameters.from_mapping(result.parameters),
         (result.first_ns, result.last_ns),
         estimate.used,

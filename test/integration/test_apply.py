@@ -291,6 +291,7 @@ def test_the_fusion_file_makes_the_node_publish_what_was_calibrated(tmp_path, sa
     kept = np.arange(6)  # beside them a constant error of the reference, which is of the day
     np.testing.assert_allclose(estimate.state[kept], selected.state[kept], rtol=1e-9)
     np.testing.assert_allclose(estimate.covariance[:6, :6], selected.covariance[:6, :6], rtol=1e-9)
+    np.testing.assert_allclose(estimate.recording_std[:6], selected.recording_std[:6], rtol=1e-9)
 
 
 def test_the_advised_speed_of_sound_takes_the_scale_error_out(saved):

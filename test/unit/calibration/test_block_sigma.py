@@ -10,12 +10,16 @@ import pytest
 from runs import START_NS, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.advice import reference_advice
+from dvl_calib_ros.calibration.days import day_covariance
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.files.result_file import result_document
 
-CLAIMED = Parameters(gnss_aided_std=0.03)
+# σ of the recording itself: what another day makes of it is no matter of noise
+OF_THE_DAY = {"day_std_heading": 0.0, "day_std_scale": 0.0}
+CLAIMED = Parameters(gnss_aided_std=0.03, **OF_THE_DAY)
 
 
 @cache
@@ -110,3 +114,18 @@ def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed
     estimate = calibrate(samples, CLAIMED).estimate("G1")
     assert estimate.state_of("reference_east") == estimate.state_of("reference_north") == 0.0
     assert estimate.std[2] < np.radians(0.1)
+
+
+def test_the_sigma_that_is_published_is_that_of_the_next_recording_and_the_recordings_own_stands_beside():
+    """0.1 degrees of heading about the body's vertical, 0.3 per cent of scale: no length of data takes them out."""
+    mounted = Parameters(gnss_aided_std=0.03, mounting_rpy=(0.0, 0.0, 0.6))
+    calibrator = calibrate(run(0.0), CLAIMED), calibrate(run(0.0), CLAIMED.replace(day_std_heading=np.radians(0.1)))
+    alone, another_day = (each.estimate("G1") for each in calibrator)
+    np.testing.assert_array_equal(alone.covariance, alone.recording_covariance)
+    np.testing.assert_array_equal(another_day.recording_covariance, alone.covariance)
+    assert another_day.std[2] ** 2 == pytest.approx(alone.std[2] ** 2 + np.radians(0.1) ** 2)
+    np.testing.assert_array_equal(np.delete(another_day.std, 2), np.delete(alone.std, 2))
+    assert another_day.convergence is alone.convergence and another_day.observability == alone.observability
+    assert not day_covariance(MODELS["M7"], mounted).any()
+    scales = day_covariance(MODELS["G1"], mounted)[3:5, 3:5]
+    np.testing.assert_allclose(scales, 0.003**2)  # sound is as fast along all axes

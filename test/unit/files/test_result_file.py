@@ -59,10 +59,16 @@ def test_every_model_comes_back_bit_for_bit(saved, result):
         assert loaded[name].p.tobytes() == np.ascontiguousarray(estimate.covariance).tobytes()
 
 
+def test_the_recordings_own_covariances_come_back_as_well(saved, result):
+    _, loaded = load_result(saved, of_recording=True)
+    for name, estimate in result.estimates.items():
+        assert loaded[name].p.tobytes() == np.ascontiguousarray(estimate.recording_covariance).tobytes()
+
+
 def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
     loaded = load_initial_calibration(saved, MOUNTING)
     for name, estimate in result.estimates.items():
-        x, p = estimate.state.copy(), estimate.covariance.copy()
+        x, p = estimate.state.copy(), estimate.recording_covariance.copy()
         if name in ("G1", "G2"):  # the constant error of the reference
             x[6:8] = p[6:8] = p[:, 6:8] = 0.0
             p[[6, 7], [6, 7]] = Parameters().reference_offset_std ** 2
@@ -250,7 +256,7 @@ def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_pri
     def as_before(content):
         g1 = content["models"]["G1"]
         g1["state_names"], g1["state"] = g1["state_names"][:6], g1["state"][:6]
-        g1["covariance"] = [row[:6] for row in g1["covariance"][:6]]
+        g1["covariance"] = [row[:6] for row in g1.pop("covariance_of_recording")[:6]]
 
     before = load_initial_calibration(change(saved, as_before))["G1"]
     np.testing.assert_array_equal(before.x, [*now.x[:6], 0.0, 0.0])
