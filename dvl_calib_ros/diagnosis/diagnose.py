@@ -93,11 +93,11 @@ def diagnose_recordings(
         gap = measure_gap(selection, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
-    verdict = _verdict(selection, rest, len(visible) / len(testable))
+    verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
     covariance = selection.fit.covariance(blocks_of(selection.fitter.problem))
     found = tuple(_found(selection, each, covariance, len(testable), gap) for each in selection.selected)
     columns = rest.columns
-    if selection.selected and verdict is not Verdict.UNKNOWN:
+    if selection.selected and not (verdict is Verdict.UNKNOWN and rest.found):
         columns = selection.fit.columns[:, :, 6:]
     is_gap = verdict in (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
     hypothesis = selection.fit.hypothesis
@@ -189,8 +189,11 @@ def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
     )
 
 
-def _verdict(selection: Selection, rest: Unexplained, visible_share: float) -> Verdict:
+def _verdict(selection: Selection, rest: Unexplained, gap: Gap, visible_share: float) -> Verdict:
     if matters(selection.fitter.problem, selection.fit, rest):
+        return Verdict.UNKNOWN
+    # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
+    if selection.selected and gap.not_explained > gap.noise_floor:
         return Verdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
@@ -325,9 +328,9 @@ def _sentence(
         return f"The gap is explained by {names}: {falls}{left}; this data cannot tell between them."
     if verdict is Verdict.UNKNOWN:
         if found:
+            follows = f"what is left follows {rest.about}" if rest.found else "what it follows does not show"
             return (
-                f"Beside {names} there is something that no effect of the library explains: {falls}{left}; what is "
-                f"left follows {rest.about}."
+                f"Beside {names} there is something that no effect of the library explains: {falls}{left}; {follows}."
             )
         return (
             f"There is an error of {1e3 * gap.before:.1f} mm/s, over noise of {1e3 * gap.noise_floor:.1f}, that no "
