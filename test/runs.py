@@ -20,8 +20,8 @@ SECOND = 1_000_000_000
 
 def claimed_covariance(estimate: Estimate) -> np.ndarray:
     """What the filter alone claims (n, n), before blocks of time raise it."""
-    lowered = estimate.filter_std / estimate.std
-    return estimate.covariance * np.outer(lowered, lowered)
+    lowered = estimate.filter_std / estimate.recording_std
+    return estimate.recording_covariance * np.outer(lowered, lowered)
 
 
 @dataclass(frozen=True)

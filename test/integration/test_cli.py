@@ -176,7 +176,8 @@ def test_replay_json_has_the_documented_structure(document, bag):
     assert list(document["models"]) == list(MODELS)
     for name, model in MODELS.items():
         entry = document["models"][name]
-        assert set(entry) == {"state_names", "state", "covariance", "used", "gated", "convergence"}
+        covariances = {"covariance", "covariance_of_recording"}
+        assert set(entry) == {"state_names", "state", *covariances, "used", "gated", "convergence"}
         scales, nuisance = [scale for scale, _ in model.scale_axes], [state.name for state in model.nuisance]
         assert entry["state_names"] == ["phi_x", "phi_y", "phi_z", *scales, *nuisance]
         assert [*entry["state"], *np.ravel(entry["covariance"])] == estimates(bag)[name]
