@@ -100,8 +100,8 @@ def test_a_reference_that_says_when_it_is_noisy_is_worth_what_the_best_weights_m
 def test_an_effect_is_found_by_what_samples_claim_that_is_not_without():
     given, std = floating(streams("lever_arm:x_m=0.12", seed=3, trajectory="figure8"), seed=3)
     with_claims, without = (diagnose_recordings([recorded(given, each)], Parameters()) for each in (std, None))
-    assert "lever_arm" in [effect.name for effect in with_claims.effects]
-    assert "lever_arm" not in [effect.name for effect in without.effects]
+    assert [effect.name for effect in with_claims.effects] == ["lever_arm"]
+    assert [effect.name for effect in without.effects] != ["lever_arm"]
 
 
 @pytest.mark.slow

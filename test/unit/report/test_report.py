@@ -257,7 +257,7 @@ def test_the_history_ends_with_the_result_and_holds_what_the_models_saw(tmp_path
     history, result = replayed.history, replayed.result
     for name, estimate in result.estimates.items():
         np.testing.assert_allclose(history.models[name].state[-1], estimate.state, atol=1e-12)
-        np.testing.assert_allclose(history.models[name].std[-1], estimate.std, atol=1e-12)
+        np.testing.assert_allclose(history.models[name].std[-1], estimate.recording_std, atol=1e-12)
     assert len(history.dvl_ns) == result.counts["dvl"]["usable"]
     assert len(history.paired_ns) == result.counts["pairing"]["paired"]
     assert np.abs(history.paired_velocity - history.reference_velocity).max() < 0.6
