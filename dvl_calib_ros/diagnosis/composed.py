@@ -27,8 +27,9 @@ from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, MountingEffect, Needs, ParameterSpec
 from ..effects.composition import Injection, late, traces, turns
+from .curve import Curve
 from .noise import segments_of
-from .recordings import Curve, Recording
+from .recordings import Recording
 from .settings import SETTINGS
 
 Values = Mapping[str, float]

@@ -17,7 +17,8 @@ from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn
 from ..effects.composition import late
 from .composed import Hypothesis, Problem
-from .recordings import FAST_ENOUGH_S, Recording
+from .curve import FAST_ENOUGH_S
+from .recordings import Recording
 
 # Scatter about neighbours and about the other stream, beyond which both contradict
 FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0

@@ -15,7 +15,8 @@ from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..effects.registry import EFFECTS
 from .composed import Hypothesis, Problem, Values
-from .recordings import Curve, Recording
+from .curve import Curve
+from .recordings import Recording
 from .selection import Selection
 from .twin import simulated, with_quiet_reference
 

@@ -15,7 +15,8 @@ from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
 from ..effects.timing import LONGEST_OFFSET_S
 from ..errors import InputError
-from .recordings import Curve, Recording
+from .curve import Curve
+from .recordings import Recording
 from .settings import SETTINGS
 
 # A delay beyond what can be fitted is believed if it leaves no more than this share of the squares that the best of the
@@ -126,20 +127,19 @@ def lag(
     near = np.abs(late) <= LONGEST_OFFSET_S + STEP_S
     best = int(np.argmin(mean))
     nearest = float(mean[near].min()) if near.any() else np.inf
-    if (
-        near.any() and not near[best]
-    ):  # on the same samples: a stretch that is noisy may be out of the far one's overlap
+    if not near[best] and mean[best] < BELIEVED * nearest:
+        # on the same samples as well: a stretch that is noisy may be out of the far one's overlap
         index = np.arange(m) + best - (m - 1)
-        nearest = min(nearest, float(means(np.where((index >= 0) & (index < n), weight, 0.0))[near].min()))
-    # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then it
-    # agrees there, too, to what one step of the grid makes
-    both = weight[1:] * weight[:-1]
-    of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
-    if not near[best] and mean[best] < BELIEVED * nearest and nearest > of_a_step:
-        as_good = np.where(
-            mean <= 1.5 * mean[best], np.abs(late), np.inf
-        )  # legs that repeat agree at more than one lag
-        return float(late[int(np.argmin(as_good))]), True
-    if not np.isfinite(nearest):
+        overlap = np.where((index >= 0) & (index < n), weight, 0.0)
+        nearest = min(nearest, float(means(overlap)[near].min(initial=np.inf)))
+        # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then
+        # it agrees there, too, to what one step of the grid makes
+        both = weight[1:] * weight[:-1]
+        of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
+        if mean[best] < BELIEVED * nearest and nearest > of_a_step:
+            # legs that repeat agree at more than one lag
+            as_good = np.where(mean <= 1.5 * mean[best], np.abs(late), np.inf)
+            return float(late[int(np.argmin(as_good))]), True
+    if not np.isfinite(mean[near].min(initial=np.inf)):
         return 0.0, False
     return float(late[near][np.argmin(mean[near])]), False

@@ -19,8 +19,9 @@ from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn
 from ..effects.composition import late, traces
 from .composed import Hypothesis, Problem, Seen
+from .curve import FAST_ENOUGH_S, Curve
 from .fitting import Fit
-from .recordings import FAST_ENOUGH_S, Curve, Recording
+from .recordings import Recording
 
 # Passes in which the true time of a late stamp is found
 _PASSES = 3

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.frames import Array, cross
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import at_dvl, late, traces, turns
@@ -151,7 +151,7 @@ def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
         motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
     moved = at_dvl(injections, motion)
     if rates is not None:
-        moved = replace(moved, velocity_body=moved.velocity_body + np.cross(rates, problem.lever_arm))
+        moved = replace(moved, velocity_body=moved.velocity_body + cross(rates, np.asarray(problem.lever_arm)))
     calibration = np.linalg.inv(hypothesis.body_from_measured(nominal, turns(injections, moved)))
     measured = np.einsum("...ij,...j->...i", calibration, moved.velocity_body)
     return np.asarray(measured + traces(injections, moved, ActsOn.DVL) @ nominal.T)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_quaternion, rpy_from_rotation
+from ..calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, cross, rotation_from_quaternion, rpy_from_rotation
 from ..calibration.samples import VelocityFrame
 from .survey import Look, comparable
 
@@ -149,7 +149,7 @@ def fit(
             continue
         if position is not None and data.rates is not None and hypothesis.imu is not None:
             rates = data.rates @ hypothesis.imu.rotation_body_from_imu.T
-            body = body + np.where(np.isfinite(rates), np.cross(rates, position), 0.0)
+            body = body + np.where(np.isfinite(rates), cross(rates, np.asarray(position)), 0.0)
         dvl = data.dvl @ FLU_FROM_FRD if hypothesis.turned else data.dvl
         speed = _rms(dvl)
         known = rotation_dvl_from_body

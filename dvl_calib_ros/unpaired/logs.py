@@ -10,8 +10,9 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
+from ..diagnosis.curve import Curve
 from ..diagnosis.diagnose import diagnose_recordings
-from ..diagnosis.recordings import Curve, Recording, load_recordings
+from ..diagnosis.recordings import Recording, load_recordings
 from ..diagnosis.results import Diagnosis
 from ..diagnosis.selection import Selection
 from ..diagnosis.twin import simulated, with_quiet_reference

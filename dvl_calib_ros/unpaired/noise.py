@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
-from scipy.stats import median_abs_deviation, norm
+from scipy.stats import norm
 
+from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
+from ..diagnosis.curve import FAST_ENOUGH_S
 from ..diagnosis.noise_findings import NoiseFinding
-from ..diagnosis.recordings import FAST_ENOUGH_S
 from ..diagnosis.where import regimes
 from ..effects.base import EffectInput
 from .logs import Log
@@ -153,7 +154,7 @@ def levels_by_regime(log: Log) -> dict[str, float]:
     seen = [_AtSamples(each.motion) for each in scattered]
     masks = {"all": np.ones(len(values), dtype=bool)} | regimes(problem, seen, per_sample=True)  # type: ignore[arg-type]
     return {
-        name: float(np.linalg.norm(median_abs_deviation(values[mask], axis=0, scale="normal")))
+        name: float(np.linalg.norm(robust_std(values[mask])))
         for name, mask in masks.items()
         if np.count_nonzero(mask) > BLOCK
     }
@@ -235,7 +236,7 @@ def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
     if not columns:
         return {}
     values = np.concatenate([each.values for each in scattered])
-    scale = median_abs_deviation(values, axis=0, scale="normal")
+    scale = robust_std(values)
     log_square = np.log(np.maximum(((values / scale) ** 2).mean(axis=1), 1e-12))
     x = np.column_stack([np.ones(len(values)), *(column - column.mean() for column in columns.values())])
     inverse = np.linalg.pinv(x.T @ x)
@@ -258,7 +259,7 @@ def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidat
     for side in (vehicle, simulator):
         far = n = 0
         for each in side:
-            size = np.abs(each.values[:: each.thin]) / median_abs_deviation(each.values, axis=0, scale="normal")
+            size = np.abs(each.values[:: each.thin]) / robust_std(each.values)
             far += int(((size > TAIL) & (size < OUTLIER)).sum())
             n += size.size
         counts.append((far, n))
@@ -298,6 +299,6 @@ def _slow(log: Log) -> Array:
     for residual in log.residuals:
         size = max(BLOCK, 1)
         blocks = residual[: len(residual) // size * size].reshape(-1, size, 3)
-        level = median_abs_deviation(np.diff(residual, axis=0), axis=0, scale="normal") / np.sqrt(2.0)
+        level = robust_std(np.diff(residual, axis=0)) / np.sqrt(2.0)
         means.append((np.median(blocks, axis=1) / np.maximum(level, 1e-9) * np.sqrt(size / 1.57)).ravel())
     return np.concatenate(means) if means else np.zeros(0)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
 
+from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
 from ..diagnosis.closure import FOLD_STEPS
 from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
@@ -132,7 +132,7 @@ def _rms(values: Array) -> float:
 
 def _drawn_in(values: Array) -> Array:
     """Values (N, 3), no farther out than FAR standard deviations of most of them."""
-    far = FAR * np.maximum(median_abs_deviation(values, axis=0, scale="normal"), 1e-9)
+    far = FAR * np.maximum(robust_std(values), 1e-9)
     return np.clip(values, -far, far)
 
 
@@ -217,7 +217,7 @@ def features(values: Array, windows: Array) -> Array:
 def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generator) -> tuple[float, float, float]:
     """Energy distance of the windows of two series (N, 3), its 95 per cent quantile if both are alike, and p."""
     a, b = features(one, windows), features(other, windows)
-    scale = np.maximum(median_abs_deviation(np.concatenate([a, b]), axis=0, scale="normal"), 1e-9)
+    scale = np.maximum(robust_std(np.concatenate([a, b])), 1e-9)
     both = np.concatenate([a, b]) / scale
     apart = np.linalg.norm(both[:, None] - both[None], axis=2)
     w = len(a)

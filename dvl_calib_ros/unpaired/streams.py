@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.stats import median_abs_deviation
 
+from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
-from ..diagnosis.recordings import FAST_ENOUGH_S
+from ..diagnosis.curve import FAST_ENOUGH_S, beside, off_neighbours
 from .logs import DITHER_MPS, Log
 from .results import Triple
 from .stream_facts import DROPOUT_INTERVALS
@@ -35,7 +35,7 @@ def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
             if recording.dvl.interval <= FAST_ENOUGH_S:
                 far, n = far + _spikes(facts.values), n + len(facts.values)
             else:
-                size = np.abs(residual) / np.maximum(median_abs_deviation(residual, axis=0, scale="normal"), 1e-9)
+                size = np.abs(residual) / np.maximum(robust_std(residual), 1e-9)
                 far, n = far + int((size > 2.0 * OUTLIER).any(axis=1).sum()), n + len(residual)
                 far, n = far + recording.spikes, n + recording.spikes  # left out already
         counts.append((far, n))
@@ -46,13 +46,10 @@ def _spikes(values: Array) -> int:
     """Samples far from where four neighbours tell them to be, and farther than these."""
     if len(values) < 10:
         return 0
-    off = np.zeros_like(values)
-    x = values
-    off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
-    scale = np.maximum(median_abs_deviation(off, axis=0, scale="normal"), DITHER_MPS)
+    off = off_neighbours(values)
+    scale = np.maximum(robust_std(off), DITHER_MPS)
     size = (np.abs(off) / scale).max(axis=1)
-    beside = np.maximum(np.append(size[1:], 0.0), np.append(0.0, size[:-1]))
-    return int(np.count_nonzero((size > OUTLIER) & (size > beside)))
+    return int(np.count_nonzero((size > OUTLIER) & (size > beside(size))))
 
 
 def _exact(vehicle: Log, simulator: Log) -> Candidate | None:

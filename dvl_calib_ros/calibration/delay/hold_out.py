@@ -9,7 +9,7 @@ import numpy as np
 
 from ..error_model import CORRECTION_JACOBIAN, correction_matrix
 from ..folds import FOLDS, folds_of
-from ..frames import Array, skew
+from ..frames import Array, cross, skew
 from ..parameters import Parameters
 from ..samples import Index, Mask, Stamps
 from ..verification import HeldOutError, held_out_from_sums
@@ -167,7 +167,7 @@ class Recording(NamedTuple):
             rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
         lever = np.array(p.lever_arm) + terms.lever_arm
         matrix = correction_matrix(terms.errors[:3], terms.errors[3:], p.rotation_dvl_from_body)
-        error = body + (np.cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
+        error = body + (cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
         found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
         found &= (v**2).sum(axis=1) >= p.min_speed**2
         # axes are left out in the reference's own frame: tilted by 2°, a vertical that is not measured would still

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..frames import Array, Vector, rotation_from_quaternion, skew
+from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
 from ..models.own import g1_noise, linearise_g1
 from ..observations import Observations
 from ..samples import Index, Mask
@@ -198,7 +198,7 @@ def _rows(
 ) -> DelayedRows:
     n, k = velocity_dvl.shape[:2]
     body_from_dvl = template.rotation_dvl_from_body.T
-    lever = np.cross(turning, lever_arm) if any(lever_arm) else None
+    lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
     once = Observations(
         velocity_dvl=velocity_dvl[:, 0],
         reference_body=body,

@@ -17,11 +17,12 @@ from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
+from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _sentence, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
-from dvl_calib_ros.diagnosis.recordings import Curve, Recording, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.recordings import Recording, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import FoundEffect, Verdict, diagnosis_document
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS

@@ -9,9 +9,10 @@ import pytest
 from conftest import ROOT
 
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.far_clocks import STEP_S, check_clocks, lag
-from dvl_calib_ros.diagnosis.recordings import Curve, Recording, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.recordings import Recording, load_recordings, make_recording
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.replay.replay import Topics
 from dvl_calib_ros.simulation.injection import injection

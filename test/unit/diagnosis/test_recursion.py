@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, savgol_filter
 
+from dvl_calib_ros.diagnosis.curve import SMOOTH_SAMPLES, Curve
 from dvl_calib_ros.diagnosis.noise import Arma, Noise
-from dvl_calib_ros.diagnosis.recordings import SMOOTH_SAMPLES, Curve
 from dvl_calib_ros.diagnosis.recursion import recursion
 
 

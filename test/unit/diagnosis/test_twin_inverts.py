@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.diagnosis.composed import Offsets, is_time_of_run, make_problem, no_effect
-from dvl_calib_ros.diagnosis.recordings import Curve, make_recording
+from dvl_calib_ros.diagnosis.curve import Curve
+from dvl_calib_ros.diagnosis.recordings import make_recording
 from dvl_calib_ros.diagnosis.twin import simulated
 from dvl_calib_ros.effects.registry import EFFECTS
 
