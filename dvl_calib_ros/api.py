@@ -71,8 +71,11 @@ class Mounting:
         Their standard deviations (1σ), degrees.
     nominal_rpy_deg
         What the calibration began with.
-    xyz_m
-        Lever arm: position of the DVL in the body, m.
+    xyz_m, xyz_std_m
+        Lever arm: position of the DVL in the body, m, as it was found, else as it was given; its standard deviations,
+        nan where the model has no lever arm.
+    time_offset_s, time_offset_std_s
+        By how much the DVL's stamps are late, s, likewise.
     scale_percent, scale_std_percent
         How much too long a motion ahead is measured; nan where the model has no scale.
     base_frame, dvl_frame
@@ -83,6 +86,9 @@ class Mounting:
     std_deg: tuple[float, float, float]
     nominal_rpy_deg: tuple[float, float, float]
     xyz_m: tuple[float, float, float]
+    xyz_std_m: tuple[float, float, float]
+    time_offset_s: float
+    time_offset_std_s: float
     scale_percent: float
     scale_std_percent: float
     base_frame: str
@@ -90,9 +96,10 @@ class Mounting:
 
     @property
     def urdf(self) -> str:
-        """The origin of the DVL's joint, to paste into a URDF."""
-        xyz = " ".join(f"{value:g}" for value in self.xyz_m)
-        return f'<origin xyz="{xyz}" rpy="{" ".join(f"{math.radians(angle):.6f}" for angle in self.rpy_deg)}"/>'
+        """The origin of the DVL's joint, to paste into a URDF: of forward-left-up axes, as `mounting_rpy` is."""
+        from .files.urdf import origin_tag
+
+        return origin_tag(self.xyz_m, np.radians(self.rpy_deg))
 
     def __str__(self) -> str:
         angles = (
@@ -153,11 +160,16 @@ class Calibration:
         parameters = Parameters.from_mapping(result.parameters)
         rotation = parameters.rotation_dvl_from_body
         scale = scale_std_ahead(MODELS[estimate.model], estimate.covariance, parameters)
+        arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
+        offset_std = estimate.std_of("time_offset")
         return Mounting(
             _triple(np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(rotation)))),
             _triple(np.degrees(body_angle_std(estimate.covariance, parameters))),
             _triple(np.degrees(parameters.mounting_rpy)),
-            _triple(np.array(parameters.lever_arm)),
+            _triple(estimate.lever_arm(parameters.lever_arm)),
+            _triple(np.full(3, math.nan) if arm_std is None else arm_std),
+            estimate.dvl_time_offset(parameters.dvl_time_offset),
+            math.nan if offset_std is None else float(offset_std[0]),
             100.0 * float(rotation[:, 0] ** 2 @ estimate.scale) if len(scale) else math.nan,
             100.0 * float(scale[0]) if len(scale) else math.nan,
             parameters.base_frame,
@@ -165,7 +177,10 @@ class Calibration:
         )
 
     def correct(self, velocity_dvl: Array) -> Array:
-        """Measured velocities (..., 3) m/s, forward-left-up axes of the DVL, to corrected ones in the body."""
+        """Measured velocities (..., 3) m/s, forward-left-up axes of the DVL, to corrected ones in the body.
+
+        Of the place where the DVL is: the reference point moves by ``-ω × mounting.xyz_m`` beside it.
+        """
         rotation = self.discovery.parameters.rotation_dvl_from_body
         return self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
 

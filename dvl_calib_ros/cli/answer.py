@@ -35,7 +35,7 @@ def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[st
     ]
 
 
-def print_answer(out: Console, replayed: Replayed, discovery: Discovery) -> None:
+def print_answer(out: Console, replayed: Replayed) -> None:
     """One paragraph, one table, the mounting in the form to paste."""
     from rich.markup import escape
 
@@ -53,7 +53,7 @@ def print_answer(out: Console, replayed: Replayed, discovery: Discovery) -> None
     _print_navigation(out, replayed)
     for sentence in _not_shown(replayed):
         out.print(escape(sentence), soft_wrap=False)
-    out.print(f"\nURDF  {escape(origin(replayed, discovery))}", soft_wrap=True)
+    out.print(f"\nURDF  {escape(_origin(replayed))}", soft_wrap=True)
 
 
 def _headline(replayed: Replayed) -> str:
@@ -156,15 +156,21 @@ def _not_shown(replayed: Replayed) -> list[str]:
     ]
 
 
-def origin(replayed: Replayed, discovery: Discovery) -> str:
-    """The corrected mounting as a URDF joint's origin."""
-    from ..calibration.frames import rpy_from_rotation
-    from ..files.urdf import numbers
+def _origin(replayed: Replayed) -> str:
+    """The corrected mounting as a URDF joint's origin; for a driver of forward-right-down data with both axes."""
+    from ..calibration.frames import FLU_FROM_FRD, rpy_from_rotation
+    from ..calibration.parameters import Parameters
+    from ..files.urdf import origin_tag
 
-    result, parameters = replayed.result, discovery.parameters
-    rpy = rpy_from_rotation(result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body))
-    arm = [float(f"{value:.4g}") for value in result.estimate.lever_arm(parameters.lever_arm)]
-    return f'<origin xyz="{numbers(arm)}" rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
+    result = replayed.result
+    parameters = Parameters.from_mapping(result.parameters)
+    rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
+    arm = result.estimate.lever_arm(parameters.lever_arm)
+    tag = origin_tag(arm, rpy_from_rotation(rotation))
+    if not replayed.turned:
+        return tag
+    own = origin_tag(arm, rpy_from_rotation(rotation @ FLU_FROM_FRD))
+    return f"{tag}  (forward-left-up axes)\n      {own}  ({replayed.dvl_frame} of the driver: forward-right-down)"
 
 
 def next_commands(

@@ -92,7 +92,7 @@ def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discove
         [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
     )
     out.print()
-    print_answer(out, replayed, discovery)
+    print_answer(out, replayed)
     commands = next_commands(replayed, arguments.bags, arguments.save, _options(arguments), bool(findings))
     for word, command in zip(("next", *[""] * len(commands)), commands, strict=False):
         out.print(f"{word:5} {escape(command)}", soft_wrap=True)

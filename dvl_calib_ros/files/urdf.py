@@ -119,6 +119,12 @@ def numbers(values: Sequence[float] | Array) -> str:
     return " ".join(f"{float(value) + 0.0:.9g}" for value in values)
 
 
+def origin_tag(xyz: Sequence[float] | Array, rpy: Sequence[float] | Array) -> str:
+    """A joint's origin to paste: xyz (3,) m to four digits, rpy (3,) rad to a microradian."""
+    position = [float(f"{float(value):.4g}") for value in xyz]
+    return f'<origin xyz="{numbers(position)}" rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
+
+
 def _is_link(link: str, frame: str) -> bool:
     """Whether a frame id is a link's, with the namespace that robot_state_publisher may put before it."""
     return link == frame or link == frame.rsplit("/", 1)[-1]

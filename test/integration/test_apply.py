@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 import re
 import shlex
@@ -14,6 +15,7 @@ import yaml
 from io_fixtures import replayed, run, write_bag
 from scipy.spatial.transform import Rotation
 
+import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.rows import BEYOND
@@ -23,7 +25,7 @@ from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration, result_document, result_text
 from dvl_calib_ros.simulation.injection import injection
-from dvl_calib_ros.simulation.scenario import Scenario
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.scenario import write_bag as write_scenario
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
@@ -495,6 +497,42 @@ def test_the_joint_is_moved_to_the_lever_arm_that_was_found(tmp_path, displaced,
     assert urdf.read_bytes() == after
     assert apply("--rollback", "--urdf", urdf) == 0
     assert urdf.read_bytes() == before
+
+
+def test_python_and_the_terminal_paste_the_origin_that_apply_writes(tmp_path, displaced, capsys):
+    bag, _ = displaced
+    saved = tmp_path / "result.yaml"
+    assert main(["replay", str(bag), "--save", str(saved)]) == 0
+    mounting = dc.replay(bag).mounting
+    assert mounting.urdf in capsys.readouterr().out
+    document = yaml.safe_load(saved.read_text())["mounting"]
+    np.testing.assert_allclose(mounting.xyz_m, document["lever_arm"], atol=1e-12)
+    assert mounting.xyz_m[0] == pytest.approx(-1.2, abs=4.0 * mounting.xyz_std_m[0]) and mounting.xyz_std_m[0] < 0.1
+    assert mounting.time_offset_s == document["dvl_time_offset"] == pytest.approx(0.6, abs=0.05)
+    assert mounting.time_offset_std_s == document["dvl_time_offset_std"]
+    pasted = ElementTree.fromstring(mounting.urdf)
+    np.testing.assert_allclose([float(word) for word in pasted.get("xyz").split()], document["lever_arm"], atol=1e-3)
+    turned = Rotation.from_euler("xyz", [float(word) for word in pasted.get("rpy").split()])
+    assert difference(turned, Rotation.from_euler("xyz", document["corrected_rpy"])) < 2e-6
+
+
+def test_of_a_driver_that_is_forward_right_down_both_origins_are_said(tmp_path, capsys):
+    samples = simulate(Scenario("figure8", 60.0, mounting_rpy=(math.pi, 0.0, 0.0)))
+    ordered = heapq.merge(samples.imu, samples.gnss, samples.dvl, key=lambda sample: sample.stamp_ns)
+    bag, saved = write_bag(tmp_path / "bag", tuple(ordered)), tmp_path / "result.yaml"
+    assert main(["replay", str(bag), "-p", "dvl_axes:=frd", "--save", str(saved)]) == 0
+    out = capsys.readouterr().out
+    ours, drivers = [
+        Rotation.from_euler("xyz", [float(word) for word in rpy.split()])
+        for rpy in re.findall(r'<origin xyz="[^"]*" rpy="([^"]*)"/>', out)
+    ]
+    assert "(forward-left-up axes)" in out and "of the driver: forward-right-down)" in out
+    document = yaml.safe_load(saved.read_text())["mounting"]
+    assert difference(ours, Rotation.from_euler("xyz", document["corrected_rpy"])) < 2e-6
+    words_of = re.search(
+        r"--qx (\S+) --qy (\S+) --qz (\S+) --qw (\S+)", document["static_transform_publisher"]
+    ).groups()
+    assert difference(drivers, Rotation.from_quat([float(word) for word in words_of])) < 2e-6
 
 
 def test_a_urdf_with_another_position_is_moved_by_force_only_or_turned_alone(tmp_path, displaced, capsys):
