@@ -4,6 +4,7 @@ The calibration is linear about the nominal mounting; a mounting wrong by 45 deg
 frame it is said to be in, shows only as samples that are gated. Which rotation C fits Σ|g - C v|² best has a closed
 solution at any angle (Wahba's problem, by singular values: Markley, "Attitude determination using vector observations",
 1988), so it is found for the reference velocity g as if it were in the body, in ENU and in NED, and what fits is said.
+All of it at several delays of the DVL's stamps: in waves, and in turns, a second too late looks like axes turned round.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ CLEARLY = 40.0
 NOMINAL_SHARE = 1e-3
 # Fewer samples fit anything.
 ENOUGH = 20
+# By how much the DVL's stamps may be late, s: within G2's range, at a step that is short beside turns and waves.
+DELAYS_S = np.linspace(-3.0, 3.0, 13)
 _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
@@ -44,14 +47,14 @@ class Suggestion(NamedTuple):
 
 
 class CoarseFits:
-    """Sums over samples, from which any rotation of any frame can be judged. Memory is constant."""
+    """Sums over samples at each of `DELAYS_S`, from which any rotation of any frame can be judged. Memory is constant."""
 
     def __init__(self, rotation_dvl_from_body: Array) -> None:
         """rotation_dvl_from_body: (3, 3) nominal."""
         self._nominal = rotation_dvl_from_body.T
-        self._gv = np.zeros((len(_FRAMES), 3, 3))
-        self._gg = np.zeros(len(_FRAMES))
-        self._vv = np.zeros(len(_FRAMES))
+        self._gv = np.zeros((len(_FRAMES), len(DELAYS_S), 3, 3))
+        self._gg = np.zeros((len(_FRAMES), 1))
+        self._vv = np.zeros((len(_FRAMES), len(DELAYS_S)))
         self._count = np.zeros(len(_FRAMES), dtype=np.int64)
         self._declared = np.zeros(len(_FRAMES), dtype=np.int64)
         # of the axes given with a lever arm, and of those turned round without one
@@ -68,8 +71,8 @@ class CoarseFits:
         """Add N samples of one frame.
 
         reference: (N, 3) m/s as the messages have it, said to be in the frame `declared`. rotation_enu_from_body:
-        (N, 3, 3), None where there is no attitude. velocity: (N, 3) m/s at the same times, DVL frame. rates: (N, 3)
-        rad/s, body frame; None where they are not known.
+        (N, 3, 3), None where there is no attitude. velocity: (N, K, 3) m/s, DVL frame, as stamped later than those by
+        each of `DELAYS_S`. rates: (N, 3) rad/s, body frame; None where they are not known.
         """
         self._declared[_FRAMES.index(declared)] += len(reference)
         for index, frame in enumerate(_FRAMES):
@@ -82,9 +85,9 @@ class CoarseFits:
             if frame is declared and rates is not None:
                 for fit in self._fits:
                     fit.add(g, velocity, rates)
-            self._gv[index] += g.T @ velocity
+            self._gv[index] += np.tensordot(velocity, g, (0, 0)).swapaxes(1, 2)
             self._gg[index] += np.sum(g * g)
-            self._vv[index] += np.sum(velocity * velocity)
+            self._vv[index] += np.einsum("nka,nka->k", velocity, velocity)
             self._count[index] += len(g)
 
     def suggestion(self) -> Suggestion | None:
@@ -92,20 +95,18 @@ class CoarseFits:
         declared = int(np.argmax(self._declared))
         if self._count[declared] < ENOUGH:
             return None
-        given = self._misfit(declared, self._nominal)
+        given = float(self._misfits(declared, self._nominal).min())
         if given < WRONG_FROM:
             return self._flipped(given)
-        rotations = [self._rotation(index) for index in range(len(_FRAMES))]
-        misfits = [
-            self._misfit(index, rotation) if self._count[index] >= ENOUGH else math.inf
-            for index, rotation in enumerate(rotations)
-        ]
+        rotations = [self._rotations(index) for index in range(len(_FRAMES))]
+        misfits = np.stack([self._misfits(index, each) for index, each in enumerate(rotations)])
+        misfits[self._count < ENOUGH] = math.inf
         misfits[declared] *= 0.5  # of two that fit alike the frame given is the likelier
-        best = int(np.argmin(misfits))
-        misfit = self._misfit(best, rotations[best])
+        best, delay = np.unravel_index(int(np.argmin(misfits)), misfits.shape)
+        misfit = float(self._misfits(int(best), rotations[best])[delay])
         if misfit > FITS_BELOW or misfit > BETTER_BY * given:
             return None
-        return self._named(declared, best, rotations[best], misfit)
+        return self._named(declared, int(best), rotations[best][delay], misfit)
 
     def _flipped(self, misfit: float) -> Suggestion | None:
         """Whether y and z turned round explain more than the axes given do with any lever arm.
@@ -119,17 +120,17 @@ class CoarseFits:
             return None
         return Suggestion("the DVL's axes look forward-right-down (dvl_axes: frd)", {"dvl_axes": "frd"}, misfit)
 
-    def _rotation(self, index: int) -> Array:
-        """``rotation_body_from_dvl`` (3, 3) that fits best."""
-        towards = self._gv[index] + NOMINAL_SHARE * math.sqrt(self._gg[index] * self._vv[index]) * self._nominal
-        u, _, vt = np.linalg.svd(towards)
-        rotation: Array = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        return rotation
+    def _rotations(self, index: int) -> Array:
+        """``rotation_body_from_dvl`` (K, 3, 3) that fits best at each delay."""
+        size = NOMINAL_SHARE * np.sqrt(self._gg[index] * self._vv[index])
+        u, _, vt = np.linalg.svd(self._gv[index] + size[:, None, None] * self._nominal)
+        u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+        return np.asarray(u @ vt)
 
-    def _misfit(self, index: int, rotation: Array) -> float:
-        """Σ|g - C v|² / Σ|g|²."""
-        squares = self._gg[index] + self._vv[index] - 2.0 * float(np.sum(rotation * self._gv[index]))
-        return float(squares / self._gg[index]) if self._gg[index] > 0.0 else math.inf
+    def _misfits(self, index: int, rotation: Array) -> Array:
+        """Σ|g - C v|² / Σ|g|² (K,) of one rotation (3, 3), or one for each delay (K, 3, 3)."""
+        squares = self._gg[index] + self._vv[index] - 2.0 * np.sum(rotation * self._gv[index], axis=(1, 2))
+        return np.asarray(squares / self._gg[index]) if self._gg[index] > 0.0 else np.full(len(squares), math.inf)
 
     def _named(self, declared: int, best: int, rotation: Array, misfit: float) -> Suggestion:
         frame = _FRAMES[best].value
@@ -139,7 +140,7 @@ class CoarseFits:
         earth = best != 0 and declared != 0
         otherwise = ""
         if _angle(rotation, self._nominal) < SAME_WITHIN:  # the frame explains it
-            if earth and not same_frame and self._misfit(best, FLU_FROM_FRD @ self._nominal) < FITS_BELOW:
+            if earth and not same_frame and self._misfits(best, FLU_FROM_FRD @ self._nominal).min() < FITS_BELOW:
                 otherwise = ", or the IMU's orientation looks like NED (imu_frame: ned): only sway tells these apart"
         elif not same_frame and earth and _angle(rotation, FLU_FROM_FRD @ self._nominal) < SAME_WITHIN:
             about, parameters = ["the IMU's orientation looks like NED, forward-right-down"], {"imu_frame": "ned"}
@@ -159,26 +160,33 @@ class _AxesFit:
 
     def __init__(self, rotation_body_from_dvl: Array, with_lever_arm: bool) -> None:
         self._rotation = rotation_body_from_dvl
+        self._with_lever_arm = with_lever_arm
         n = 7 if with_lever_arm else 4
-        self._normal, self._vector, self._square = np.zeros((n, n)), np.zeros(n), 0.0
+        self._normal, self._vector = np.zeros((len(DELAYS_S), n, n)), np.zeros((len(DELAYS_S), n))
+        self._square = np.zeros(len(DELAYS_S))
         self.samples = 0
 
     def add(self, reference: Array, velocity: Array, rates: Array) -> None:
-        """Add N samples: reference (N, 3) m/s and rates (N, 3) rad/s in the body, velocity (N, 3) m/s of the DVL."""
+        """Add N samples: reference (N, 3) m/s and rates (N, 3) rad/s in the body, velocity (N, K, 3) m/s of the DVL."""
         known = np.isfinite(rates).all(axis=1)
         in_body = velocity[known] @ self._rotation.T
-        rest = reference[known] - in_body
-        columns = [skew(in_body), in_body[:, :, None], skew(rates[known])]
-        h = np.concatenate(columns[: 3 if len(self._vector) == 7 else 2], axis=2)
-        self._normal += np.einsum("nia,nib->ab", h, h)
-        self._vector += np.einsum("nia,ni->a", h, rest)
-        self._square += float(np.sum(rest**2))
+        rest = reference[known, None] - in_body
+        columns = [skew(in_body), in_body[..., None]]
+        if self._with_lever_arm:
+            columns.append(np.broadcast_to(skew(rates[known])[:, None], (*in_body.shape, 3)))
+        h = np.concatenate(columns, axis=3).transpose(1, 0, 2, 3).reshape(len(DELAYS_S), -1, self._vector.shape[1])
+        r = rest.swapaxes(0, 1).reshape(len(DELAYS_S), -1, 1)
+        turned = h.swapaxes(1, 2)
+        self._normal += turned @ h
+        self._vector += (turned @ r)[:, :, 0]
+        self._square += (r * r).sum(axis=(1, 2))
         self.samples += int(known.sum())
 
     def left(self) -> float:
-        """Sum of squares (m/s)² that is left."""
-        explained = float(self._vector @ np.linalg.lstsq(self._normal, self._vector, rcond=1e-9)[0])
-        return max(self._square - explained, 1e-12 * max(self._square, 1e-12))
+        """Sum of squares (m/s)² that is left at the best delay."""
+        found = np.linalg.pinv(self._normal, rcond=1e-9, hermitian=True) @ self._vector[:, :, None]
+        left = self._square - (self._vector * found[:, :, 0]).sum(axis=1)
+        return float(np.maximum(left, 1e-12 * np.maximum(self._square, 1e-12)).min())
 
 
 def _as_drawn(rotation: Array) -> Array:

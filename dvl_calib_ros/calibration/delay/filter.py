@@ -14,7 +14,7 @@ import numpy as np
 
 from ..alignment import Aligner
 from ..bank import ModelCounts
-from ..coarse_mounting import CoarseFits
+from ..coarse_mounting import DELAYS_S, CoarseFits
 from ..folds import FOLDS, folds_of
 from ..frames import ENU_FROM_NED, Array
 from ..heave_waves import HeaveWaves
@@ -305,13 +305,14 @@ class DelayFilter:
         times, raw = self._seconds(track.stamps_ns[at]), track.values[at, :3]
         if len(dvl.times) < 2:
             return
-        velocity = np.column_stack([np.interp(times, dvl.times, column) for column in dvl.velocity.T])
+        late = times[:, None] + DELAYS_S
+        velocity = np.stack([np.interp(late, dvl.times, column) for column in dvl.velocity.T], axis=2)
         rotation, oriented = attitude_at(imu, times, self._parameters.imu_timeout)
         rates = None
         if len(imu.times) > 1:
             rates = np.column_stack([np.interp(times, imu.times, column) for column in imu.angular_velocity.T])
-        inside = (times >= dvl.times[0]) & (times <= dvl.times[-1])
-        moving = inside & ((velocity**2).sum(axis=1) >= self._parameters.min_speed**2)
+        inside = (late[:, 0] >= dvl.times[0]) & (late[:, -1] <= dvl.times[-1])
+        moving = inside & ((raw**2).sum(axis=1) >= self._parameters.min_speed**2)
         unmeasured = track.unmeasured[at] != 0
         for code in np.unique(track.frames[at]).tolist():
             for has_attitude in (True, False):

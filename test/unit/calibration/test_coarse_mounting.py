@@ -74,6 +74,34 @@ def test_a_mounting_that_fits_is_named_in_rad():
     np.testing.assert_allclose([float(each) for each in named], [0.0, 0.0, 0.785], atol=0.02)
 
 
+def straight_in_waves(late_s, dvl=SAME):
+    """Verdict on a straight run in waves of 5 s, the DVL late by so much; dvl as in `verdict`."""
+    rng = np.random.default_rng(1)
+    time = np.arange(0.0, 200.0, 0.2)
+
+    def body(at):
+        wave = 2.0 * np.pi * at / 5.0
+        return np.stack([1.5 + 0.2 * np.sin(0.2 * at), 0.05 * np.sin(wave), 0.08 * np.cos(wave)], axis=-1)
+
+    rotation = rotation_from_rpy([0.0, 0.0, 0.3])
+    samples = []
+    for at in time.tolist():
+        stamp = START_NS + round(at * 1e9)
+        samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), tuple(rng.normal(0, 1e-3, 3).tolist())))
+        seen = rotation @ body(at) + rng.normal(0, 0.02, 3)
+        samples.append(ReferenceSample(stamp, tuple(seen.tolist()), None, VelocityFrame.ENU))
+        samples.append(DvlSample(stamp, tuple((dvl @ body(at - late_s) + rng.normal(0, 0.005, 3)).tolist())))
+    return calibrate(samples, PARAMETERS, verified=True).verification("G1")
+
+
+@pytest.mark.parametrize("late_s", [-2.5, 2.5])
+def test_a_dvl_that_is_late_by_half_a_wave_is_not_taken_for_one_that_points_down(late_s):
+    assert not any("forward-right-down" in reason for reason in straight_in_waves(late_s).reasons)
+    flipped = straight_in_waves(late_s, FLU_FROM_FRD)
+    assert flipped.verdict is Word.REJECT
+    assert any("the DVL's axes look forward-right-down (dvl_axes: frd)" in reason for reason in flipped.reasons)
+
+
 def judged(**changes):
     state = GaussianState(np.zeros(8), np.eye(8) * 1e-6)
     arguments = {"held_out": HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), "used_and_gated": (1000, 10)} | changes
