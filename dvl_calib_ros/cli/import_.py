@@ -59,7 +59,8 @@ def run(arguments: argparse.Namespace) -> None:
             raise InputError("--gnss and --attitude go with a file; in a folder they are found by their names")
         written = import_folder(arguments.dvl, arguments.output, options)
     else:
-        counts = import_recording(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
-        written = {arguments.output: counts}
-    for path, counts in written.items():
+        imported = import_recording(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
+        written = {arguments.output: imported}
+    common.print_warnings([note for imported in written.values() for note in imported.notes])
+    for path, (counts, _) in written.items():
         print(f"{path}: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count))

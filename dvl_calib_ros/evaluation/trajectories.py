@@ -108,7 +108,7 @@ def _check_missing(folder: Path, missing: list[str], partial: bool) -> None:
 
 def _load(folder: Path, name: str, shortest_s: float) -> Trajectory:
     path = folder / f"{name}_dvl.csv"
-    time, velocity = read_columns(path, "m/s")
+    time, velocity = _whole(path, "m/s")
     fast = np.linalg.norm(velocity, axis=1) > MAX_SPEED
     if fast.any():
         row = int(np.argmax(fast))
@@ -124,8 +124,16 @@ def _load(folder: Path, name: str, shortest_s: float) -> Trajectory:
     return _with_attitude(run, attitude) if attitude.is_file() else run
 
 
+def _whole(path: Path, unit: str) -> tuple[Array, Array]:
+    """Time and values of a file of which nothing is missing, or averages would not be those of the procedure."""
+    time, values, left_out = read_columns(path, unit)
+    if left_out:
+        raise InputError(f"{left_out[0]}; the procedure takes whole files, fetch it again")
+    return time, values
+
+
 def _with_attitude(run: Trajectory, path: Path) -> Trajectory:
-    time, rpy = read_columns(path, "rad")
+    time, rpy = _whole(path, "rad")
     wide = (np.abs(rpy) > LARGEST_ANGLES + 1e-9).any(axis=1)
     if wide.any():
         raise InputError(f"{path}: row {int(np.argmax(wide)) + 1} holds no roll, pitch, yaw in rad; convert the file")

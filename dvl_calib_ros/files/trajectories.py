@@ -7,11 +7,14 @@ the axes it names.
 from __future__ import annotations
 
 import csv
+import io
+import math
 import os
 import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,26 +27,45 @@ from .dvl_logs import is_dvl_log, read_dvl_log
 
 N_COLUMNS = 4
 SUFFIXES = ("csv", "npy")
+# What is written in a cell where there is no value, beside nan
+NO_VALUE = ("", "na", "n/a", "null", "none", "-")
 # How much of a bad row is shown, characters
 SHOWN = 200
 # Words of a header that tell which of the three values a column holds
 AXIS_NAMES = ({"x", "vx", "surge", "roll"}, {"y", "vy", "sway", "pitch"}, {"z", "vz", "heave", "yaw"})
 
 
-def read_columns(path: Path, unit: str) -> tuple[Array, Array]:
-    """Time (N,) s and values (N, 3) in `unit` of a CSV or NPY file. Raises InputError naming file and row."""
+class Columns(NamedTuple):
+    """Time (N,) s, values (N, 3), and in a sentence each what of the file is not among them."""
+
+    time: Array
+    values: Array
+    left_out: tuple[str, ...] = ()
+
+
+def read_columns(path: Path, unit: str) -> Columns:
+    """Rows of a CSV or NPY file, values in `unit`. Raises InputError naming file and row.
+
+    Left out, and said, are rows without a finite number in every column, as an invalid sample of a bag is, and of a
+    CSV file a last line without its end: its last number may be cut off.
+    """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    table = _read_npy(path) if path.suffix == ".npy" else _read_csv(path, unit)
+    table, left_out = (_read_npy(path), []) if path.suffix == ".npy" else _read_csv(path, unit)
     if table.ndim != 2 or table.shape[1] != N_COLUMNS or not len(table):
         raise InputError(f"{path}: expected rows of time and three values, found shape {table.shape}")
-    bad = ~np.isfinite(table).all(axis=1)
-    if bad.any():
-        raise InputError(f"{path}: row {int(np.argmax(bad)) + 1} holds a value that is not a finite number")
+    good = np.isfinite(table).all(axis=1)
+    rows = np.flatnonzero(good) + 1
+    if not len(rows):
+        raise InputError(f"{path}: row 1 holds a value that is not a finite number, and so does every other")
+    if n_bad := len(table) - len(rows):
+        first = f"the first is row {int(np.argmin(good)) + 1}"
+        left_out.insert(0, f"{path}: {n_bad} of {len(table)} rows hold no finite number somewhere, left out; {first}")
+    table = table[good]
     backwards = np.diff(table[:, 0]) <= 0.0
     if backwards.any():
-        raise InputError(f"{path}: time does not increase at row {int(np.argmax(backwards)) + 2}")
-    return table[:, 0], table[:, 1:]
+        raise InputError(f"{path}: time does not increase at row {rows[int(np.argmax(backwards)) + 1]}")
+    return Columns(table[:, 0], table[:, 1:], tuple(left_out))
 
 
 def _read_npy(path: Path) -> Array:
@@ -53,12 +75,18 @@ def _read_npy(path: Path) -> Array:
         raise InputError(f"{path}: not a NumPy array file of numbers ({error})") from error
 
 
-def _read_csv(path: Path, unit: str) -> Array:
+def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
+    """Rows of numbers, NaN where there is none, and what is said of the file."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row]
+        text = path.read_text(encoding="utf-8-sig")
+        is_finished = text.endswith("\n")
+        # what a power cut leaves may end in zeros
+        rows = [row for row in csv.reader(io.StringIO(text.rstrip("\0"))) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error})") from error
+        raise InputError(f"{path}: cannot be read as CSV ({error}); save it as such, in UTF-8") from error
+    left_out = []
+    if len(rows) > 1 and not is_finished:
+        left_out.append(f"{path}: its last line is not finished, and left out: {','.join(rows.pop())[:SHOWN]}")
     if rows and not _is_number(rows[0][0]):
         _check_header(path, rows.pop(0), unit)
     values = []
@@ -66,10 +94,10 @@ def _read_csv(path: Path, unit: str) -> Array:
         if len(row) != N_COLUMNS:
             raise InputError(f"{path}: data row {number} has {len(row)} columns, expected time and three values")
         try:
-            values.append([float(cell) for cell in row])
+            values.append([math.nan if cell.strip().lower() in NO_VALUE else float(cell) for cell in row])
         except ValueError:
             raise InputError(f"{path}: data row {number} is not all numbers: {','.join(row)[:SHOWN]}") from None
-    return np.array(values, dtype=float).reshape(-1, N_COLUMNS) if values else np.empty((0, N_COLUMNS))
+    return np.array(values, dtype=float).reshape(-1, N_COLUMNS), left_out
 
 
 def _is_number(text: str) -> bool:
@@ -110,9 +138,13 @@ def body_from(frame: str) -> Array:
     return FLU_FROM_FRD if frame == "frd" else np.eye(3)
 
 
-def read_dvl(path: Path, start_ns: int, frame: str, std: float) -> list[DvlSample]:
-    """Velocities in `frame` (flu, frd) as DVL samples in forward-left-up; std (m/s) 0: covariance not given."""
-    time, velocity = read_columns(path, "m/s")
+def read_dvl(path: Path, start_ns: int, frame: str, std: float, notes: list[str]) -> list[DvlSample]:
+    """Velocities in `frame` (flu, frd) as DVL samples in forward-left-up; std (m/s) 0: covariance not given.
+
+    notes: gets what is left out of the file, here and in the other readers.
+    """
+    time, velocity, left_out = read_columns(path, "m/s")
+    notes += left_out
     covariance = np.eye(3) * std**2 if std else None
     rows = (velocity @ body_from(frame).T).tolist()
     return [
@@ -121,9 +153,10 @@ def read_dvl(path: Path, start_ns: int, frame: str, std: float) -> list[DvlSampl
     ]
 
 
-def read_reference(path: Path, start_ns: int, frame: str, std: float) -> list[ReferenceSample]:
+def read_reference(path: Path, start_ns: int, frame: str, std: float, notes: list[str]) -> list[ReferenceSample]:
     """Reference velocities, in the body (frame flu, frd) or the earth (enu, ned)."""
-    time, velocity = read_columns(path, "m/s")
+    time, velocity, left_out = read_columns(path, "m/s")
+    notes += left_out
     covariance = np.eye(3) * std**2 if std else None
     earth = {"enu": VelocityFrame.ENU, "ned": VelocityFrame.NED}.get(frame, VelocityFrame.BODY)
     rows = (velocity @ body_from(frame).T).tolist()
@@ -133,12 +166,13 @@ def read_reference(path: Path, start_ns: int, frame: str, std: float) -> list[Re
     ]
 
 
-def read_attitude(path: Path, start_ns: int) -> list[ImuSample]:
+def read_attitude(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
     """Roll, pitch, yaw of a forward-right-down body in north-east-down, with the angular velocity they imply.
 
     The angular velocity is that of a smooth curve through the attitudes.
     """
-    time, rpy = read_columns(path, "rad")
+    time, rpy, left_out = read_columns(path, "rad")
+    notes += left_out
     rotations = attitude_enu_flu_from_ned_frd(rpy)
     rates = angular_velocities(time, rotations)
     return [
@@ -182,32 +216,44 @@ class ImportOptions:
                 raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
 
 
+class Imported(NamedTuple):
+    """What became of a recording. counts: topic -> number of messages, and of reports that gave none, by reason.
+
+    notes: in sentences, what of its files was left out.
+    """
+
+    counts: dict[str, int]
+    notes: tuple[str, ...] = ()
+
+
 def import_recording(
     dvl: Path, gnss: Path | None, attitude: Path | None, output: Path, options: ImportOptions
-) -> dict[str, int]:
-    """Write one recording to a new bag; topic -> number of messages. Raises InputError, and then writes nothing."""
+) -> Imported:
+    """Write one recording to a new bag. Raises InputError, and then writes nothing."""
     if os.path.lexists(output):
         raise InputError(f"{output}: exists already; give another name, or remove it first")
     start_ns = options.start_ns
     left_out: dict[str, int] = {}
+    notes: list[str] = []
     if dvl.is_file() and dvl.suffix not in (".csv", ".npy") and is_dvl_log(dvl):
         dvl_samples, left_out = read_dvl_log(dvl)
     else:
-        dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std)
-    references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std) if gnss else []
-    attitudes = read_attitude(attitude, start_ns) if attitude else []
+        dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes)
+    references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std, notes) if gnss else []
+    attitudes = read_attitude(attitude, start_ns, notes) if attitude else []
     with BagWriter(output, options.storage, options.compression) as bag:
         SampleWriter(bag).recording(attitudes, references, dvl_samples)
     written = {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
-    return written | {f"reports {reason}, left out": count for reason, count in left_out.items()}
+    written |= {f"reports {reason}, left out": count for reason, count in left_out.items()}
+    return Imported(written, tuple(notes))
 
 
-def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, dict[str, int]]:
+def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, Imported]:
     """Write every recording of a folder (NAME_dvl.csv or .npy, _gnss, _attitude) to output/NAME. Raises InputError."""
     names = sorted({path.stem.removesuffix("_dvl") for kind in SUFFIXES for path in folder.glob(f"*_dvl.{kind}")})
     if not names:
         raise InputError(f"{folder}: no recordings in it; they are named NAME_dvl.csv or NAME_dvl.npy")
-    written: dict[Path, dict[str, int]] = {}
+    written: dict[Path, Imported] = {}
     try:
         for name in names:
             dvl, gnss, attitude = (_file(folder, f"{name}_{role}") for role in ("dvl", "gnss", "attitude"))

@@ -188,7 +188,7 @@ def run_trajectory(data: bytes) -> None:
     """The first byte says whether it is CSV or NPY."""
     path = _file(f"fuzzed_dvl.{'csv' if data[:1] < b'a' else 'npy'}", data[1:])
     try:
-        time, values = read_columns(path, "m/s")
+        time, values, _ = read_columns(path, "m/s")
     except InputError as error:
         assert len(str(error)) < 10_000
         return

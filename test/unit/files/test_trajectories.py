@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import searched
+from hypothesis import given
+from hypothesis import strategies as st
 from io_fixtures import estimates, raw
 from scipy.spatial.transform import Rotation
 
@@ -53,15 +56,15 @@ def folder(tmp_path) -> Path:
 )
 def test_every_kind_of_file_gives_the_same_exact_numbers(tmp_path, write):
     name = "a.npy" if write is npy else "a.csv"
-    time, values = read_columns(write(tmp_path / name), "m/s")
-    assert np.array_equal(np.column_stack([time, values]), TABLE)
+    time, values, left_out = read_columns(write(tmp_path / name), "m/s")
+    assert np.array_equal(np.column_stack([time, values]), TABLE) and not left_out
 
 
 def test_forward_right_down_becomes_forward_left_up(tmp_path):
-    samples = read_dvl(csv(tmp_path / "a.csv"), 10**9, "frd", 0.0)
+    samples = read_dvl(csv(tmp_path / "a.csv"), 10**9, "frd", 0.0, [])
     assert [sample.velocity for sample in samples] == [(vx, -vy, -vz) for _, vx, vy, vz in TABLE]
     assert [sample.stamp_ns for sample in samples] == [10**9, 1_200_000_000, 1_400_000_000]
-    unchanged = read_dvl(csv(tmp_path / "a.csv"), 0, "flu", 0.0)
+    unchanged = read_dvl(csv(tmp_path / "a.csv"), 0, "flu", 0.0, [])
     assert [sample.velocity for sample in unchanged] == [tuple(row[1:]) for row in TABLE]
 
 
@@ -75,7 +78,7 @@ def test_forward_right_down_becomes_forward_left_up(tmp_path):
     ],
 )
 def test_a_reference_keeps_its_earth_frame_or_becomes_forward_left_up(tmp_path, frame, signs, expected):
-    (sample, *_) = read_reference(csv(tmp_path / "a.csv"), 0, frame, 0.3)
+    (sample, *_) = read_reference(csv(tmp_path / "a.csv"), 0, frame, 0.3, [])
     assert sample.frame is expected
     assert sample.velocity == pytest.approx(TABLE[0, 1:] * signs)
     assert np.array_equal(sample.covariance, np.eye(3) * 0.3**2)
@@ -84,7 +87,7 @@ def test_a_reference_keeps_its_earth_frame_or_becomes_forward_left_up(tmp_path, 
 def test_attitude_of_marine_instruments_becomes_that_of_ros(tmp_path):
     """Heading 30 degrees east of north, bow up by 10: ROS sees yaw 60 from east, pitch -10, no roll."""
     table = np.array([[0.0, 0.0, np.radians(10), np.radians(30)], [1.0, 0.0, np.radians(10), np.radians(32)]])
-    first, second = read_attitude(csv(tmp_path / "a.csv", table, ""), 0)
+    first, second = read_attitude(csv(tmp_path / "a.csv", table, ""), 0, [])
     yaw, pitch, roll = Rotation.from_quat(first.orientation).as_euler("ZYX", degrees=True)
     assert (yaw, pitch, roll) == pytest.approx((60.0, -10.0, 0.0), abs=1e-9)
     ahead = Rotation.from_quat(first.orientation).apply([1, 0, 0])
@@ -104,15 +107,17 @@ WRONG = {
     "round_brackets.csv": ("Time (s),Vx (knots),Vy (knots),Vz (knots)\n0,1,2,3\n", "'Vx (knots)' is not in m/s"),
     "milliseconds.csv": ("Time [ms],Vx [m/s],Vy [m/s],Vz [m/s]\n0,1,2,3\n", "'Time [ms]' is not in s"),
     "time_last.csv": ("Vx,Vy,Vz,Time\n1,2,3,0\n", "first column is 'Vx', expected time"),
-    "nan.csv": (HEADER + "0,1,2,3\n1,1,nan,3\n", "row 2 holds a value that is not a finite number"),
-    "inf.csv": (HEADER + "0,1,2,3\n1,1,2,-inf\n", "row 2 holds"),
+    "nan.csv": (HEADER + "0,1,nan,3\n1,1,,3\n", "row 1 holds a value that is not a finite number, and so does every"),
     "unsorted.csv": (HEADER + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "time does not increase at row 3"),
     "repeated.csv": (HEADER + "0,1,2,3\n0,1,2,3\n", "time does not increase at row 2"),
     "five.csv": (HEADER + "0,1,2,3,4\n", "data row 1 has 5 columns"),
     "five_header.csv": ("Time [s],a,b,c,d\n0,1,2,3\n", "has 5 columns"),
     "short.csv": (HEADER + "0,1,2,3\n1,2\n", "data row 2 has 2 columns"),
     "words.csv": (HEADER + "0,1,two,3\n", "data row 1 is not all numbers"),
-    "hole.csv": (HEADER + "0,1,,3\n", "data row 1 is not all numbers"),
+    "one_cut.csv": (HEADER + "0,1,2", "expected rows"),
+    "cut_and_short.csv": (HEADER + "0,1\n1,2", "data row 1 has 2 columns"),
+    "decimal_commas.csv": ("0,0,1,5,0,1,-0,05\n0,2,1,5,0,1,-0,05\n", "data row 1 has 8 columns"),
+    "utf16.csv": ("Time [s],a,b,c\n0,1,2,3\n".encode("utf-16"), "save it as such, in UTF-8"),
     "semicolons.csv": ("0;1;2;3\n", "has 1 columns"),
     "latin1.csv": ("Zeit [s],°,°,°\n0,1,2,3\n".encode("latin-1"), "cannot be read as CSV"),
     "binary.csv": (bytes(range(256)), "cannot be read as CSV"),
@@ -137,6 +142,46 @@ def test_what_is_wrong_in_a_file_is_said_with_file_and_row_and_nothing_is_writte
     assert not (tmp_path / "bag").exists()
 
 
+MISSING = ["nan", "NaN", "inf", "-inf", "", " ", "NA", "n/a", "null", "None", "-", "1e999"]
+
+
+@pytest.mark.parametrize("word", MISSING)
+@pytest.mark.parametrize("column", range(4))
+def test_a_row_without_a_number_is_left_out_counted_and_named_as_an_invalid_sample_of_a_bag_is(tmp_path, word, column):
+    rows = [[repr(float(cell)) for cell in row] for row in TABLE]
+    rows[1][column] = word
+    (tmp_path / "a.csv").write_text(HEADER + "".join(f"{','.join(row)}\n" for row in rows))
+    imported = import_recording(tmp_path / "a.csv", None, None, tmp_path / "bag", ImportOptions())
+    assert imported.counts["dvl/twist"] == 2
+    (note,) = imported.notes
+    assert "a.csv: 1 of 3 rows hold no finite number somewhere, left out; the first is row 2" in note
+    assert read_columns(tmp_path / "a.csv", "m/s").values.tolist() == TABLE[[0, 2], 1:].tolist()
+
+
+def test_rows_of_an_array_that_are_not_finite_are_left_out_too_and_the_order_of_time_is_that_of_the_others(tmp_path):
+    table = np.vstack([TABLE, TABLE[1]])
+    table[1] = np.nan
+    with pytest.raises(InputError, match="time does not increase at row 4"):
+        read_columns(npy(tmp_path / "a.npy", table), "m/s")
+    time, _, left_out = read_columns(npy(tmp_path / "a.npy", table[:3]), "m/s")
+    assert time.tolist() == [0.0, 0.4] and "1 of 3 rows" in left_out[0]
+
+
+@searched(40)
+@given(data=st.data())
+def test_of_a_file_that_is_cut_anywhere_no_number_is_taken_that_was_not_in_it(tmp_path_factory, data):
+    """A copy that was interrupted, with the zeros that a power cut may leave behind it."""
+    path = csv(tmp_path_factory.mktemp("cut") / "a.csv", np.vstack([TABLE, TABLE[-1] + [10.25, 0.5, 0.25, 0.125]]))
+    whole = path.read_text()
+    at = data.draw(st.integers(whole.index("\n0.2") + 1, len(whole)))
+    path.write_text(whole[:at] + data.draw(st.sampled_from(["", "\0" * 7])))
+    time, values, left_out = read_columns(path, "m/s")
+    lines = whole[: whole.rindex("\n", 0, at) + 1].splitlines()[1:] if at else []
+    expected = [[float(cell) for cell in line.split(",")] for line in lines]
+    assert np.column_stack([time, values]).tolist() == expected
+    assert len(left_out) == (whole[at - 1] != "\n")
+
+
 ODD = [np.zeros((3, 3)), np.zeros(4), np.zeros((0, 4)), np.array([["a"] * 4]), np.array({}), np.zeros(2, "f8,f8,f8,f8")]
 
 
@@ -150,8 +195,8 @@ def test_an_array_of_another_shape_or_kind_is_refused(tmp_path, table):
 def test_a_folder_becomes_one_bag_per_recording_with_the_files_that_belong_to_it(folder, tmp_path):
     written = import_folder(folder, tmp_path / "out", ImportOptions())
     assert written == {
-        tmp_path / "out" / "T1": {"dvl/twist": 3, "gnss/twist": 3, "imu/data": 3},
-        tmp_path / "out" / "T2": {"dvl/twist": 3, "gnss/twist": 0, "imu/data": 0},
+        tmp_path / "out" / "T1": ({"dvl/twist": 3, "gnss/twist": 3, "imu/data": 3}, ()),
+        tmp_path / "out" / "T2": ({"dvl/twist": 3, "gnss/twist": 0, "imu/data": 0}, ()),
     }
     with BagReader([tmp_path / "out" / "T1"]) as bag:
         assert bag.message_counts == {"dvl/twist": 3, "gnss/twist": 3, "imu/data": 3}

@@ -164,8 +164,8 @@ def test_attitude_is_that_of_yaw_pitch_roll(rng):
 
 def test_recorded_motion_is_the_recording_turned_into_forward_left_up(snapir):
     motion = recorded("T05")
-    time, velocity_frd = read_columns(snapir / "T05_dvl.csv", "m/s")
-    _, rpy = read_columns(snapir / "T05_attitude.csv", "rad")
+    time, velocity_frd, _ = read_columns(snapir / "T05_dvl.csv", "m/s")
+    _, rpy, _ = read_columns(snapir / "T05_attitude.csv", "rad")
     inside = (time > time[0] + MARGIN_S) & (time < time[-1] - MARGIN_S)
     state = motion.at(time[inside] - time[0] - MARGIN_S)
     off = np.linalg.norm(state.velocity_body - velocity_frd[inside] * [1.0, -1.0, -1.0], axis=1)
