@@ -17,6 +17,7 @@ from ..effects.base import ActsOn, AnyEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
 from ..files.parameter_files import load_parameters
+from ..files.reading import read_file
 from ..files.result_file import FORMAT, load_result
 
 Three = tuple[float, float, float]
@@ -101,11 +102,7 @@ def load_description(path: Path) -> DvlDescription:
 def _document(path: Path) -> Any:
     """Content of a JSON file; of another what it is, RESULT or PARAMETERS. Raises InputError."""
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path}: is too large for a diagnosis; give what dvl-calib diagnose --json writes")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); name a diagnosis or a result file") from error
+        text = read_file(path, "diagnosis", LARGEST_FILE).decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not text; give what dvl-calib diagnose --json writes") from error
     if text.lstrip().startswith("{"):

@@ -30,8 +30,8 @@ from .atomic import own_stream, save_bytes
 from .yaml_files import load_yaml
 
 FORMAT = "dvl_calib_ros result 1"
-# Result files have some ten thousand bytes; what is much larger is none, and is not read to find out.
-LARGEST_FILE = 1 << 22
+# The last entry of a result file, which its head announces: what of a copy was cut off would else go unseen
+_END = "complete"
 
 
 def estimate_document(estimate: Estimate) -> dict[str, Any]:
@@ -70,6 +70,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         "format": FORMAT,
         "software": f"dvl_calib_ros {__version__}",
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "ends_with": _END,
         "model": result.selected,
         **estimate_document(estimate),
         "std": _std_in_words(estimate, estimate.std),
@@ -98,6 +99,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
         "parameters": dict(parameters),
+        _END: True,
     }
 
 
@@ -185,7 +187,7 @@ class _Worth:
     def of_file(path: Path) -> _Worth | None:
         """None for what is no result file, or a damaged one."""
         try:
-            content: Any = load_yaml(path, "result file") if path.stat().st_size <= LARGEST_FILE else None
+            content: Any = load_yaml(path, "result file")
             return _Worth.of(content) if content["format"] == FORMAT else None
         except (InputError, OSError, KeyError, TypeError, ValueError, OverflowError):
             return None
@@ -242,7 +244,8 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     models = content.get("models")
     if not isinstance(models, dict) or not models:
         raise InputError(f"{path}: damaged, it holds no models")
-    if "parameters" not in content:  # the last that is written
+    # of before the end was announced, the parameters are the last that is written
+    if "parameters" not in content or ("ends_with" in content and content.get(_END) is not True):
         raise InputError(f"{path}: damaged, its end is missing")
     known = {
         name: _gaussian(f"{path}: models: {name}", name, saved, of_recording)

@@ -12,6 +12,10 @@ import numpy as np
 
 from ..calibration.frames import Array, rotation_from_rpy, rpy_from_rotation
 from ..errors import InputError
+from .reading import read_file
+
+# Those with meshes written out in them have some MB
+LARGEST_FILE = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -141,10 +145,7 @@ def _with_attribute(tag: bytes, name: str, text: bytes) -> bytes:
 
 def read_urdf(path: Path) -> Urdf:
     """Read a URDF's joints. Raises InputError for what is none, or still holds xacro macros."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as URDF ({error.strerror})") from error
+    content = read_file(path, "URDF", LARGEST_FILE)
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: is UTF-16, which cannot be edited byte for byte; save it as UTF-8")
     return parse_urdf(path, content)

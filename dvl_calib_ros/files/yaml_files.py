@@ -9,13 +9,15 @@ from typing import Any
 import yaml
 
 from ..errors import InputError
+from .reading import read_file
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """SafeLoader that takes scalars for what rcl's YAML parser does.
 
     1e-3 is a number (YAML 1.1 wants 1.0e-3), 2026-05-01 is text (YAML 1.1 has dates). Aliases are refused: a few lines
-    of them that refer to each other stand for more than fits in memory.
+    of them that refer to each other stand for more than fits in memory. So is a key that stands twice: ROS takes both
+    sections of a node, PyYAML only the last.
     """
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -24,18 +26,32 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
             raise yaml.composer.ComposerError(None, None, "write it out, without aliases (*name)", mark)
         return super().compose_node(parent, index)
 
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        lines: dict[tuple[str, str], int] = {}
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            name = (key.tag, key.value)
+            if name in lines:
+                problem = f"{key.value!r} stands there twice, first in line {lines[name]}; keep one"
+                raise yaml.composer.ComposerError(None, None, problem, key.start_mark)
+            lines[name] = key.start_mark.line + 1
+        return node
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"),
-    list("-+.0123456789"),
-)
 
-
+# What rcl's parser takes for a number. YAML 1.1 has more: 1:30 is ninety, 1_0 is ten
+_NUMBERS = {
+    "int": (r"[-+]?(?:0|[1-9]\d*|0[0-7]+|0x[\da-fA-F]+)$", "-+0123456789"),
+    "float": (
+        r"[-+]?(?:(?:\d+\.\d*|\.\d+)(?:[eE][-+]?\d+)?|\d+[eE][-+]?\d+|\.(?:inf|Inf|INF))$|\.(?:nan|NaN|NAN)$",
+        "-+.0123456789",
+    ),
+}
 _Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    first: [(tag, pattern) for tag, pattern in resolvers if tag.rpartition(":")[2] not in (*_NUMBERS, "timestamp")]
     for first, resolvers in _Loader.yaml_implicit_resolvers.items()
 }
+for _name, (_pattern, _first) in _NUMBERS.items():
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_name}", re.compile(_pattern), list(_first))
 
 
 def parse_scalar(text: str) -> Any:
@@ -56,17 +72,13 @@ def load_yaml(path: Path, what: str, text: str | None = None) -> Any:
 
     text: what is to be read instead of what the file holds now.
     """
+    content = read_file(path, what) if text is None else None
     try:
-        if text is not None:
-            return yaml.load(text, Loader=_Loader)  # a SafeLoader
-        with path.open(encoding="utf-8") as file:
-            return yaml.load(file, Loader=_Loader)  # a SafeLoader
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such {what}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as {what} ({error.strerror})") from error
+        if content is not None:
+            text = content.decode("utf-8")
+        return yaml.load(text, Loader=_Loader)  # a SafeLoader
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: no {what}, not text: {error}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        where = " ".join(str(error).split())
+        where = " ".join(str(error).split()).replace('in "<unicode string>", line', "in line")
         raise InputError(f"{path}: no {what}, not valid YAML: {where}") from error

@@ -373,7 +373,7 @@ def test_rollback_touches_nothing_when_one_file_has_no_backup(tmp_path, saved, c
         (["missing.yaml"], "missing.yaml: no such result file"),
         (["result.yaml", "--fusion", "result.yaml"], "would write over the input result.yaml"),
         (["result.yaml", "--fusion", "x", "--launch", "x"], "names of their own"),
-        (["result.yaml", "--urdf", "missing.urdf"], "missing.urdf: cannot be read as URDF"),
+        (["result.yaml", "--urdf", "missing.urdf"], "missing.urdf: no such URDF"),
         (["result.yaml", "-o", "x"], "name that, too"),
         (["result.yaml", "--joint", "x"], "name that, too"),
         (["result.yaml", "--launch", "missing/x"], "missing does not exist; create it"),

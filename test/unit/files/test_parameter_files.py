@@ -58,6 +58,8 @@ def test_parameters_are_found_under_every_name_the_node_can_have(tmp_path, text)
         ("initial_std_scale", "1e-3", 0.001),
         ("initial_std_scale", "1E-3", 0.001),
         ("initial_std_scale", ".5e-2", 0.005),
+        ("dvl_frame", "1:30", "1:30"),
+        ("dvl_frame", "1_0", "1_0"),
         ("mounting_rpy", "[1e-3, -2e-1, +3e0]", (0.001, -0.2, 3.0)),
         ("use_message_covariance", "false", False),
         ("model", "M4", "M4"),
@@ -181,10 +183,26 @@ def test_a_file_that_has_nothing_for_the_node_by_its_full_name_is_refused(tmp_pa
             names_of_others(path, "/auv/dvl_calibration")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/**: {ros__parameters: {min_speed: 0.5}}\n/**: {ros__parameters: {max_speed: 9.0}}\n",
+        "/**:\n  ros__parameters:\n    min_speed: 0.5\n    min_speed: 0.6\n",
+        "/**:\n  ros__parameters: {min_speed: 0.5, max_speed: 9.0, min_speed: 0.6}\n",
+        "/**:\n  ros__parameters: {min_speed: 0.5}\n  ros__parameters: {max_speed: 9.0}\n",
+    ],
+)
+def test_a_key_that_stands_twice_is_refused_for_only_one_of_both_would_count(tmp_path, text):
+    path = tmp_path / "p.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"stands there twice, first in line [123]; keep one"):
+        load_parameters(path)
+
+
 def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
     with pytest.raises(InputError, match="no such ROS 2 parameter file"):
         load_parameters(tmp_path / "missing.yaml")
-    with pytest.raises(InputError, match="Is a directory"):
+    with pytest.raises(InputError, match="it is a folder; name a file"):
         load_parameters(tmp_path)
 
 

@@ -237,17 +237,22 @@ def test_a_damaged_or_foreign_file_is_refused_with_its_name_and_the_reason(saved
     assert str(caught.value).startswith(f"{saved}: ") and expected in str(caught.value)
 
 
-@pytest.mark.parametrize("part", [0.0, 0.1, 0.3, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 0.99])
-def test_a_torn_file_is_refused_unless_all_its_models_are_whole(saved, result, part):
-    text = saved.read_text()
-    models_end = text.index("counts:")
-    saved.write_text(text[: int(part * len(text))])
-    if part * len(text) < models_end:
+@pytest.mark.parametrize("line", range(60))
+def test_a_file_of_which_the_end_was_cut_off_anywhere_is_refused(saved, line):
+    """Also in its parameters, of which those that are missing would be taken for not changed."""
+    lines = saved.read_text().splitlines(keepends=True)
+    at = len(lines) - 1 - line if line < 45 else (line - 45) * len(lines) // 15
+    for cut in ("".join(lines[:at]), "".join(lines[:at]) + lines[at][: len(lines[at]) // 2]):
+        saved.write_text(cut)
         with pytest.raises(InputError, match=r"result\.yaml: "):
             load_initial_calibration(saved)
-    else:
-        with suppress(InputError):
-            assert [*load_initial_calibration(saved)["M7"].x] == [*result.estimates["M7"].state]
+
+
+def test_a_file_of_before_the_end_was_announced_is_read(saved, result):
+    def as_before(content):
+        del content["ends_with"], content["complete"]
+
+    assert [*load_initial_calibration(change(saved, as_before))["M7"].x] == [*result.estimates["M7"].state]
 
 
 def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_prior(saved):

@@ -1,0 +1,38 @@
+"""Files of text that are read whole: of a known kind, and of a size that such a file has."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from ..errors import InputError
+
+# A result file has some ten thousand bytes; what is much larger is none, and would take minutes to parse
+LARGEST_FILE = 1 << 22
+
+
+def read_file(path: Path, what: str, largest: int = LARGEST_FILE) -> bytes:
+    """Content of a file that somebody names as `what`.
+
+    Raises InputError if it cannot be read, is larger, or is none: a pipe or a device may never answer or never end.
+    """
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            mode = os.fstat(handle).st_mode
+            if not stat.S_ISREG(mode):
+                what_it_is = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+                raise InputError(f"{path}: cannot be read as {what}, it is {what_it_is}; name a file")
+            with open(handle, "rb", closefd=False) as file:
+                content = file.read(largest + 1)
+        finally:
+            os.close(handle)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: no such {what}") from None
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        why = (error.strerror if isinstance(error, OSError) else None) or error
+        raise InputError(f"{path}: cannot be read as {what} ({why})") from error
+    if len(content) > largest:
+        raise InputError(f"{path}: is too large for a {what}, which has {largest >> 20} MB at most; name another")
+    return content
