@@ -45,9 +45,12 @@ class BagReader:
         self.decoder = Decoder(known)
         self._stack = ExitStack()
         self._sources: list[Source] = []
+        self._n_sources: list[int] = []  # of each path
         try:
             for path in paths:
-                self._sources += self._open(path)
+                opened = self._open(path)
+                self._sources += opened
+                self._n_sources.append(len(opened))
         except BaseException:
             self._stack.close()
             raise
@@ -101,6 +104,24 @@ class BagReader:
             else:
                 spans.append((start_ns, end_ns))
         return spans
+
+    @property
+    def pauses_ns(self) -> list[tuple[int, int]]:
+        """Log times between which none of the recordings at the paths that were given goes on, in order."""
+        at = 0
+        spans = []
+        for count in self._n_sources:
+            own = [source for source in self._sources[at : at + count] if source.counts]
+            at += count
+            if own:
+                spans.append((min(s.span_ns[0] for s in own), max(s.span_ns[1] for s in own)))
+        pauses: list[tuple[int, int]] = []
+        until_ns: int | None = None
+        for start_ns, end_ns in sorted(spans):
+            if until_ns is not None and start_ns > until_ns:
+                pauses.append((until_ns, start_ns))
+            until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
+        return pauses
 
     def messages(
         self, topics: Iterable[str], wanted: Callable[[str, int], bool] = lambda *_: True

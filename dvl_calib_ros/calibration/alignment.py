@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from .clocks import SECOND_NS, Clocks
 from .frames import Array, Quaternion, Vector, slerp, slerps
 from .gates import Gates, PriorWindow
 from .models import Needs
+from .new_days import SHORTEST_PAUSE_NS, NewDays
 from .parameters import XY, XYZ, Parameters
 from .rows import NO_DECISIONS, Decisions, Events, OrderedStreams, Rows, ScreenedStreams
 from .samples import (
@@ -77,10 +78,10 @@ class Aligner:
     n_judged, n_oriented, n_paired: numbers of the first row whose verdict, attitude or reference is not decided yet;
     the verdict may wait for the angular velocity. reference, imu: their samples of late. lag_ns: by how much (in
     stamps) one stream may lag another, a wrong clock included. given: by need, how many rows there are so far for
-    models that have it. tally: by stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the
-    DVL's stamps went back when all is to start anew; everything here has then been forgotten. before_clearing: called
-    before the past of a track is forgotten whose stamps went back, so that who needs it takes it then, whatever stretch
-    it came in.
+    models that have it. day_rows, day_starts_ns: numbers and stamps of rows that a new day begins with. tally: by
+    stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the DVL's stamps went back when
+    all is to start anew; everything here has then been forgotten. before_clearing: called before the past of a track is
+    forgotten whose stamps went back, so that who needs it takes it then, whatever stretch it came in.
     """
 
     def __init__(
@@ -88,12 +89,14 @@ class Aligner:
         parameters: Parameters,
         prior_sway_heave: tuple[float, float] | None = None,
         on_restart: Callable[[float], None] = lambda _: None,
+        recordings_ns: Sequence[int] = (),
     ) -> None:
         self.parameters = parameters
         self._prior_sway_heave = prior_sway_heave
         self._on_restart = on_restart
         self.before_clearing: Callable[[], None] = lambda: None
         self._clocks = Clocks.of(parameters)
+        self._new_days = NewDays(round(parameters.new_day_after * 1e9), recordings_ns)
         east, north = parameters.reference_velocity_offset
         offsets = {VelocityFrame.ENU: (east, north, 0.0), VelocityFrame.NED: (north, east, 0.0)}
         self._velocity_offset = np.array([offsets.get(frame, (0.0, 0.0, 0.0)) for frame in FRAMES])
@@ -141,6 +144,8 @@ class Aligner:
         self._row_of_held = 0
         self.reached_ns = LONG_AGO_NS  # the newest horizon so far
         self.first_ns: int | None = None
+        self.day_rows: list[int] = []
+        self.day_starts_ns: list[int] = []
         self.last_ns: int | None = None
         self._shortest_interval_ns = NEVER_NS
         self.longest_dropout_ns = 0
@@ -209,6 +214,9 @@ class Aligner:
             self.first_ns = stamp_ns
         else:
             self._shortest_interval_ns = shortest_ns = min(self._shortest_interval_ns, interval_ns)
+            if interval_ns > SHORTEST_PAUSE_NS and self._new_days.begins(stamp_ns, interval_ns):
+                self.day_rows.append(self.rows.end)
+                self.day_starts_ns.append(stamp_ns)
             if interval_ns > DROPOUT_NS and interval_ns > DROPOUT_INTERVALS * shortest_ns:
                 self.tally["dvl"]["dropouts"] += 1
                 self.longest_dropout_ns = max(self.longest_dropout_ns, interval_ns)
@@ -651,6 +659,10 @@ class Aligner:
         rows.await_partners(slots)
         before_ns = int(stamps_ns[0]) if self.last_ns is None else self.last_ns
         interval_ns = np.diff(stamps_ns, prepend=before_ns)
+        for index in np.flatnonzero(interval_ns > SHORTEST_PAUSE_NS).tolist():
+            if self._new_days.begins(int(stamps_ns[index]), int(interval_ns[index])):
+                self.day_rows.append(rows.base + slots.start + index)
+                self.day_starts_ns.append(int(stamps_ns[index]))
         rows.interval_ns[slots] = interval_ns
         self._note_intervals(interval_ns[1:] if self.first_ns is None else interval_ns)
         self.first_ns = int(stamps_ns[0]) if self.first_ns is None else self.first_ns

@@ -22,8 +22,8 @@ class Assembler:
     """Between the Kalman filter and K models that differ in z and H only: they are of one size, with one noise.
 
     start: what the filter starts from, x (K, n), P (K, n, n): the prior, or `initial` for the models named there
-    (shapes as the models' states). process_rate: Q per second (K, n, n): a random walk of misalignment and scale, not
-    of nuisance states; None for none.
+    (shapes as the models' states). prior: that, of all (of states of the day the same in the filter). process_rate: Q
+    per second (K, n, n): a random walk of misalignment and scale, not of nuisance states; None for none.
     """
 
     def __init__(
@@ -33,7 +33,10 @@ class Assembler:
         first = self.models[0]
         self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise
         self._motion_is_noise = first.motion_is_noise
-        self._starts = [(initial or {}).get(model.name) or prior(model, parameters) for model in self.models]
+        priors = [prior(model, parameters) for model in self.models]
+        self.prior = GaussianState(np.array([each.x for each in priors]), np.array([each.p for each in priors]))
+        begun = initial or {}
+        self._starts = [begun.get(model.name) or known for model, known in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
         held = [
             to_correction(state) if model.in_correction_parameters else _without(floor, state)

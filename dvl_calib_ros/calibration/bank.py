@@ -16,7 +16,7 @@ import numpy as np
 
 from . import kalman
 from .assembly import Assembler
-from .folds import FOLDS, FoldInformation, Moments, folds_of
+from .folds import FOLDS, FoldInformation, Moments, folds_of, on_another_day
 from .frames import Array
 from .history import Counts, Standing
 from .kalman import GaussianState
@@ -61,7 +61,8 @@ def groups_of(
     """
     alike: dict[object, list[Model]] = {}
     for model in models:
-        kind = (model.needs, model.n_state, model.n_measurement, model.noise, model.motion_is_noise)
+        of_day = tuple(model.of_day.tolist())
+        kind = (model.needs, model.n_state, model.n_measurement, model.noise, model.motion_is_noise, of_day)
         alike.setdefault(kind, []).append(model)
     return tuple(Group(group, parameters, initial, verified) for group in alike.values())
 
@@ -88,6 +89,7 @@ class Group:
         self.moments = Moments()
         self.index = {model.name: k for k, model in enumerate(models)}
         self._x, self._p = self._assembler.start
+        self._of_day = models[0].of_day
         still = self._assembler.process_rate is None
         self._scatter = BlockScatter(self._x, self._p, BLOCK_S) if still else None
         self._states: dict[str, GaussianState] = {}
@@ -135,6 +137,19 @@ class Group:
         else:
             self._rows_sum += (after.used * self._assembler.rows_left(seen.unmeasured)).sum(axis=1)
         return standing
+
+    def end_day(self) -> None:
+        """Go on with what belongs to the vehicle; what is of the day is to be found anew."""
+        if not len(self._of_day):
+            return
+        before = GaussianState(self._x, self._p)
+        after = on_another_day(before, self._assembler.prior, self._of_day)
+        if self._scatter is not None:
+            self._scatter.end_day(before, after, self._of_day)
+        if self._folds is not None:
+            self._folds.end_day(self._assembler.prior, self._of_day)
+        self._x, self._p = after
+        self._states.clear()
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
         """The models updated; one whose numbers run away stays as it was before, and is counted."""

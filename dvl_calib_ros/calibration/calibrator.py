@@ -10,7 +10,8 @@ question that is asked of it is a method.)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +33,7 @@ from .observations import Observations
 from .observe import Observer
 from .parameters import ParameterError, Parameters
 from .results import Estimate, Result
-from .samples import AlignedBlock, DvlSample, ImuSample, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
+from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
 from .verification import Verification, held_out_error, verify
 
@@ -66,7 +67,8 @@ class Calibrator:
     by model name. block_size: samples that are gathered before the models are updated, if nobody asks for their state
     earlier. on_event: told of restarts in words. on_rows: given the aligned rows, in order, once all models have had
     them. on_restart: called when all of them are to be forgotten. verified: keep what hold-out verification needs.
-    trace: filled with the models' states over time.
+    trace: filled with the models' states over time. recordings_ns: stamps between one recording and the next, each of
+    which is a day of its own.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class Calibrator:
         on_restart: Callable[[], None] = lambda: None,
         verified: bool = False,
         trace: StateTrace | None = None,
+        recordings_ns: Sequence[int] = (),
     ) -> None:
         if parameters.prior_source == "reference" and prior_sway_heave is None:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
@@ -93,7 +96,7 @@ class Calibrator:
         self._verified = verified
         self._trace = trace
         self._observer = Observer(parameters)
-        self._aligner = Aligner(parameters, prior_sway_heave, self._restart)
+        self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
         self.reset()
 
     # ------------------------------------------------------------------ state
@@ -115,7 +118,7 @@ class Calibrator:
             self.parameters,
             self._aligner,
             (self._initial or {}).get(extended.name) or unknown,
-            np.sqrt(np.diag(unknown.p)),
+            unknown,
             gate_of(extended.n_measurement, self.parameters),
             self._on_block,
             self._verified,
@@ -185,15 +188,29 @@ class Calibrator:
             return
         if not self._headings.waits_for(int(rows.stamps_ns[decided - 1 - rows.base])):
             return
-        seen = self._observed(Needs.ATTITUDE, first, decided)
-        oriented = np.zeros(decided - first, dtype=bool)
-        oriented[seen.numbers - first] = True
-        stamps_ns = rows.stamps_ns[first - rows.base : decided - rows.base]
-        shown_ns = self._headings.add(stamps_ns, oriented, seen.observations)
         self._n_headings = decided
-        if shown_ns is not None:
-            wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
-            self.selection.headings_show_the_current(shown_ns + wait_ns)
+        for start, end, is_new_day in self._by_days(first, decided):
+            if is_new_day:
+                self._headings.end_day()
+            seen = self._observed(Needs.ATTITUDE, start, end)
+            oriented = np.zeros(end - start, dtype=bool)
+            oriented[seen.numbers - start] = True
+            stamps_ns = rows.stamps_ns[start - rows.base : end - rows.base]
+            shown_ns = self._headings.add(stamps_ns, oriented, seen.observations)
+            if shown_ns is not None:
+                wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
+                self.selection.headings_show_the_current(shown_ns + wait_ns)
+
+    def _by_days(self, first: int, end: int) -> Iterator[tuple[int, int, bool]]:
+        """Rows first .. end - 1 parted where days begin: the first and the end of each part, and whether a day does."""
+        days = self._aligner.day_rows
+        if not days or days[-1] < first or days[0] >= end:  # as nearly always
+            yield first, end, False
+            return
+        own = [day for day in days if first <= day < end]
+        cuts = sorted({first, *own, end})
+        for start, stop in pairwise(cuts):
+            yield start, stop, start in own
 
     def _on_block(self, from_ns: int) -> None:
         """Let the selection, and the trace, know what G2 says after another block."""
@@ -209,6 +226,14 @@ class Calibrator:
         first, group.next_row = group.next_row, decided
         if decided == first:
             return
+        for start, end, is_new_day in self._by_days(first, decided):
+            if is_new_day:
+                group.end_day()
+            self._give(group, start, end)
+        self._forget_rows()
+
+    def _give(self, group: Group, first: int, decided: int) -> None:
+        """Give a group's models the rows first .. decided - 1, of one day."""
         seen = self._observed(group.needs, first, decided)
         wanted = None if self._trace is None else self._trace.wanted(first, decided)
         ends = None if wanted is None or not len(wanted) else np.searchsorted(seen.numbers, wanted, side="right")
@@ -221,7 +246,6 @@ class Calibrator:
             after = group.standing(len(ends))
         if self._trace is not None and wanted is not None and after is not None:
             self._trace.add(wanted, group, after)
-        self._forget_rows()
 
     def _decided(self, needs: Needs) -> int:
         """Number of the first row that is not decided for models with these needs."""
@@ -446,17 +470,21 @@ class Calibrator:
         suggestion = self._delay.coarse.suggestion() if model.aided else None
         return verify(model, state, estimate.convergence, held_out, self.parameters, counts, suggestion)
 
-    def held_out_terms(self, name: str) -> list[Terms]:
-        """For every fold what one model corrects, had it not seen that fold; for one made with ``verified``.
+    def held_out_terms(self, name: str) -> list[list[Terms]]:
+        """For every fold what one model corrects on every day, had it not seen that fold; for one made ``verified``.
 
         Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
         """
         source = self._source(MODELS[name])
         if source is None:
-            return [Terms.of_state(state.x) for state in self._delay.without_folds()]
+            return [[Terms.of_state(state.x) for state in states] for states in self._delay.without_folds()]
         terms = MODELS[source].error_terms_from_state
         states = self._group_of[source].states_without_folds(source)
-        return [Terms(terms @ state.x, np.zeros(3), 0.0) for state in states]
+        return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * self._delay.n_days for state in states]
+
+    def day_of(self, stamps_ns: Stamps) -> Index:
+        """Which day (N,) stamps are of, from 0, as far as `recording` goes."""
+        return self._delay.day_of(stamps_ns)
 
     @property
     def recording(self) -> tuple[Recording, int] | None:

@@ -31,8 +31,9 @@ class FoldInformation:
     def __init__(self, start: GaussianState) -> None:
         """start: x (K, n), P (K, n, n) of the filter."""
         k, n = start.x.shape
-        self._prior = np.linalg.inv(start.p)
-        self._prior_state = (self._prior @ start.x[:, :, None])[:, :, 0]
+        # of each fold, what those without it started from
+        self._prior = np.broadcast_to(np.linalg.inv(start.p), (FOLDS, k, n, n)).copy()
+        self._prior_state = (self._prior @ start.x[:, :, None])[..., 0]
         self._information = np.zeros((FOLDS, k, n, n))
         self._information_state = np.zeros((FOLDS, k, n))
 
@@ -49,8 +50,30 @@ class FoldInformation:
     def without(self, fold: int, index: int) -> GaussianState:
         """The filter's x (n,) and P (n, n) of one model, had it not seen a fold."""
         others = np.arange(FOLDS) != fold
-        p = np.linalg.inv(self._prior[index] + self._information[others, index].sum(axis=0))
-        return GaussianState(p @ (self._prior_state[index] + self._information_state[others, index].sum(axis=0)), p)
+        p = np.linalg.inv(self._prior[fold, index] + self._information[others, index].sum(axis=0))
+        state = self._prior_state[fold, index] + self._information_state[others, index].sum(axis=0)
+        return GaussianState(p @ state, p)
+
+    def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
+        """Go on from what is known, but of the states of the day (u,) from `start`, x (K, n), P (K, n, n)."""
+        for fold in range(FOLDS):
+            for index in range(start.x.shape[0]):
+                known = GaussianState(start.x[index], start.p[index])
+                x, p = on_another_day(self.without(fold, index), known, of_day)
+                self._prior[fold, index] = np.linalg.inv(p)
+                self._prior_state[fold, index] = self._prior[fold, index] @ x
+        self._information[:] = 0.0
+        self._information_state[:] = 0.0
+
+
+def on_another_day(state: GaussianState, start: GaussianState, of_day: NDArray[np.intp]) -> GaussianState:
+    """A state x (..., n), P (..., n, n) of which those of the day (u,) are as in `start` (of one shape with it)."""
+    x, p = state.x.copy(), state.p.copy()
+    x[..., of_day] = start.x[..., of_day]
+    p[..., of_day, :] = 0.0
+    p[..., :, of_day] = 0.0
+    p[..., of_day[:, None], of_day] = start.p[..., of_day[:, None], of_day]
+    return GaussianState(x, p)
 
 
 def _rows(h: Array) -> Array:

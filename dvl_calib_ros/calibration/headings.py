@@ -31,7 +31,7 @@ class Headings:
 
     def __init__(self, parameters: Parameters) -> None:
         angle, current = parameters.initial_std_misalignment, STRONGER * parameters.current_std
-        self._prior_std = angle
+        self._prior_std, self._current_std = angle, current
         self._information = np.diag([angle**-2, current**-2, current**-2])
         self._motion_std = parameters.motion_std
         self.shown = False
@@ -62,6 +62,11 @@ class Headings:
                     return stamp_ns
             self._information = self._information + part[start:end].sum(axis=0)
         return None
+
+    def end_day(self) -> None:
+        """Go on with what is known of the angle; the current is another one."""
+        angle_std = np.sqrt(np.linalg.inv(self._information)[0, 0])
+        self._information = np.diag([angle_std**-2, self._current_std**-2, self._current_std**-2])
 
     def _told(self, seen: Observations) -> Array:
         """Information (M, 3, 3) on φ_z (rad) and the current east and north (m/s)."""

@@ -465,6 +465,14 @@ class Parameters:
         low=0.1,
         high=86400.0,
     )
+    new_day_after: float = _parameter(
+        3600.0,
+        "Pause of the DVL after which it is another day: the delay of its stamps, a constant error of the reference "
+        "and the current, which belong to the day, are found anew. Recordings replayed together are a day each.",
+        unit="s",
+        low=15.0,
+        high=1e9,
+    )
     fine_std_misalignment: float = _parameter(
         0.0017453292519943296,
         "Convergence is fine once every observable angle's standard deviation is below this (0.1°) ...",

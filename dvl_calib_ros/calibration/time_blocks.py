@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .chi_square import chi2_isf
 from .frames import Array
+from .kalman import GaussianState
 
 # Blocks kept; when they are full, neighbours are joined and blocks are twice as long. So memory is bounded, and effects
 # that last for minutes show in the end.
@@ -49,6 +50,28 @@ class TimeBlocks:
             self._each *= 2
         self.kept.append((information.copy(), vector.copy()))
         self._in_last = 1
+
+    def end_day(self, of_day: NDArray[np.intp], information: Array, vector: Array, source: NDArray[np.intp]) -> None:
+        """Leave to what was told only what it says of the states that go on, the others being found anew.
+
+        of_day: (u,) which states those others are. information (K, n, n), vector (K, n): of all that is known. source:
+        (K,) from which of the K each takes its past.
+        """
+        if not len(of_day):
+            return
+        n, k = information.shape[-1], len(information)
+        within = np.linalg.inv(information[np.ix_(np.arange(k), of_day, of_day)])
+        # scores of the day's own states are known to vanish: what they would, were x another, is taken off the others
+        onto = np.broadcast_to(np.eye(n), (k, n, n)).copy()
+        onto[:, :, of_day] -= information[:, :, of_day] @ within
+        onto[:, of_day] = 0.0
+        found = (within @ vector[:, of_day, None])[..., 0]
+
+        def left(told: Array, y: Array) -> tuple[Array, Array]:
+            rest = y - (told[:, :, of_day] @ found[..., None])[..., 0]
+            return (onto @ told @ onto.swapaxes(1, 2))[source], (onto @ rest[..., None])[source, :, 0]
+
+        self.kept = [left(*each) for each in self.kept]
 
     def inflation(self, index: int, x: Array, p: Array) -> Array:
         """By how much σ of each state (n,) has to grow, at least 1. index: which of the K. x (n,), P (n, n) of it.
@@ -109,6 +132,15 @@ class BlockScatter:
                 continue
             self._blocks.add(information - self._told[0], vector - self._told[1], 1.0)
             self._told, self._state = (information, vector), each
+        self._factors.clear()
+
+    def end_day(self, before: GaussianState, after: GaussianState, of_day: NDArray[np.intp]) -> None:
+        """Go on with states `after` the end of a day, x (K, n), P (K, n, n), from those `before`. of_day: which (u,) of
+        them were of the day."""
+        self.add(before.x[None], before.p[None])
+        self._blocks.end_day(of_day, *self._told, np.arange(len(before.x)))
+        self._state, self._told = after, _information(*after)
+        self._last = None
         self._factors.clear()
 
     def inflation(self, index: int) -> Array:

@@ -103,7 +103,10 @@ def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) ->
     except np.linalg.LinAlgError:
         return None
     stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-    return dead_reckoned(recording, folds_of(stamps_ns, parameters), terms, parameters, epoch_ns)
+    # of every fold and day what corrects it
+    n_days = len(terms[0])
+    parts = folds_of(stamps_ns, parameters) * n_days + calibrator.day_of(stamps_ns)
+    return dead_reckoned(recording, parts, [each for of_days in terms for each in of_days], parameters, epoch_ns)
 
 
 def dead_reckoned(

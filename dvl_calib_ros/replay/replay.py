@@ -124,6 +124,7 @@ def replay(
             on_restart=recorder.start if recorder else on_restart,
             verified=True,
             trace=recorder.trace if recorder else None,
+            recordings_ns=[(before_ns + after_ns) // 2 for before_ns, after_ns in bag.pauses_ns],
         )
         decoder = MessageDecoder(calibrator.parameters)
         _feed_all(bag, chosen, decoder, calibrator, on_progress)

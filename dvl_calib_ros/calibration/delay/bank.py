@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correction_parameters import PriorOnErrors, to_correction
-from ..folds import FOLDS
+from ..folds import FOLDS, on_another_day
 from ..frames import Array
 from ..kalman import GaussianState
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
-from .rows import BEYOND, DELAY, DELAYS_S, N_STATE, DelayedRows
+from .rows import BEYOND, DELAY, DELAYS_S, N_STATE, OF_DAY, DelayedRows
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
 CELL_STD_S = 0.2
@@ -54,36 +54,51 @@ class Hypotheses(NamedTuple):
 class Posterior:
     """What the bank says.
 
-    state: x (n,), P (n, n) of G2's states. shown: (n,) which of them the data alone shows. level: mean squared
-    innovation of the best hypothesis over what the noise claims, at least 1. inflation: (n,) by how much its standard
-    deviations were raised above the filter's own.
+    state: x (n,), P (n, n) of G2's states. shown: (n,) which of them the data alone shows. inflation: (n,) by how much
+    its standard deviations were raised above the filter's own.
     """
 
     state: GaussianState
     shown: Mask
-    level: float
     inflation: Array
+
+
+class _Ended(NamedTuple):
+    """A day that is over.
+
+    known: of all, and without each fold, the state as the filter has it, x (n,), P (n, n). shown: (n,) which of the
+    states the data showed. inflation: (n,) by how much σ was to be raised.
+    """
+
+    known: list[GaussianState]
+    shown: Mask
+    inflation: Array
+
+
+class DayState(NamedTuple):
+    """G2's states on one day, x (n,), P (n, n), by all data; and which (n,) of them are shown."""
+
+    state: GaussianState
+    shown: Mask
 
 
 class DelayBank:
     """Accumulates rows; asks for nothing else. prior: x (n,), P (n, n) of G2's states."""
 
     def __init__(
-        self, prior: GaussianState, unknown_std: Array, gate: float, process_rate: Array | None, verified: bool
+        self, prior: GaussianState, unknown: GaussianState, gate: float, process_rate: Array | None, verified: bool
     ) -> None:
-        """unknown_std: (n,) of a prior without any calibration before it.
+        """unknown: a prior without any calibration before it, which is that of another day's own states, too.
 
         gate: largest νᵀS⁻¹ν that is used, times the level. process_rate: Q per second (n, n), None for none."""
         self.prior = prior
-        self._unknown_std = unknown_std
+        self._unknown = unknown
+        self._unknown_std = np.sqrt(np.diag(unknown.p))
         self._gate = gate
         self._process_rate = process_rate
-        self._errors = _around_each_delay(prior)
-        held = to_correction(prior)
-        self._start = _around_each_delay(held)
-        inverse = np.linalg.inv(self._start.p)
-        self._information = inverse.copy()
-        self._vector = (inverse @ self._start.x[..., None])[..., 0]
+        self._begin_day()
+        self._information, self._vector = _information(self._start)
+        self._ended: list[_Ended] = []
         self._square = np.einsum("ki,ki->k", self._vector, self._start.x)
         self._log_det = np.zeros(len(DELAYS_S))
         self._regressor_noise = np.zeros(4)
@@ -95,9 +110,37 @@ class DelayBank:
         if verified:
             k = len(DELAYS_S)
             self._folds = np.zeros((FOLDS, k, N_STATE, N_STATE)), np.zeros((FOLDS, k, N_STATE))
+
+    def _begin_day(self) -> None:
+        """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
+        prior = self.prior
+        self._errors = _around_each_delay(prior)
+        self._start = _around_each_delay(to_correction(prior))
         # of a delay's deviation from the prior's mean
         variance = prior.p[DELAY, DELAY] + CELL_STD_S**2
         self._log_prior = -0.5 * (DELAYS_S - prior.x[DELAY]) ** 2 / variance
+
+    def end_day(self) -> None:
+        """Go on with what belongs to the vehicle; delay and constant error of the reference are to be found anew."""
+        found, log_share = self._shares()
+        best = int(np.argmax(log_share))
+        inflation = self._inflation(best, found)
+        folds = [None] if self._folds is None else [None, *range(FOLDS)]
+        known = [self._held(self._solve(fold), log_share) for fold in folds]
+        self._ended.append(_Ended(known, self._shown(best, inflation), inflation))
+        self.blocks.end_day(OF_DAY, self._information, self._vector, np.full(len(DELAYS_S), best))
+        self.prior = on_another_day(self.prior, self._unknown, OF_DAY)
+        self._begin_day()
+        begins = [_information(_around_each_delay(on_another_day(each, self._unknown, OF_DAY))) for each in known]
+        self._information, self._vector = begins[0]
+        if self._folds is not None:
+            for fold, (information, vector) in enumerate(begins[1:]):
+                self._folds[0][fold] = self._information - information
+                self._folds[1][fold] = self._vector - vector
+        x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
+        self._square = found.misfit[best] + np.einsum("ki,ki->k", self._vector, x)
+        self._log_det = np.zeros(len(DELAYS_S))
+        self._regressor_noise[-1] = 0.0
 
     @property
     def mean_nis(self) -> float:
@@ -181,14 +224,10 @@ class DelayBank:
 
     def posterior(self) -> Posterior:
         """The mixture of all hypotheses, as of now."""
-        found = self._solve()
-        # a first level from the best as claimed; tempering does not change which that is but for the prior
-        level = self._level(found, int(np.argmax(found.log_evidence)))
-        log_share = found.log_evidence / level + self._log_prior
+        found, log_share = self._shares()
         best = int(np.argmax(log_share))
         state = self._mixture(found, log_share)
-        inflation = self.blocks.inflation(best, found.x[best], found.p[best]) if self._process_rate is None else None
-        inflation = np.ones(N_STATE) if inflation is None else inflation
+        inflation = self._inflation(best, found)
         shown = self._shown(best, inflation)
         x, p = state.x, state.p * inflation[:, None] * inflation
         for index in range(*BEYOND.indices(N_STATE)):
@@ -196,26 +235,76 @@ class DelayBank:
                 x[index] = self.prior.x[index]
                 p[index] = p[:, index] = 0.0
                 p[index, index] = self.prior.p[index, index]
-        return Posterior(GaussianState(x, p), shown, level, inflation)
+        return Posterior(GaussianState(x, p), shown, inflation)
 
-    def without_fold(self, fold: int) -> GaussianState:
-        """The state had the bank not seen a fold, the delay's probabilities being those of all data."""
+    def days(self) -> list[DayState]:
+        """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""
+        found, log_share = self._shares()
+        states = self._on_days_before(self._mixture(found, log_share), self._held(found, log_share), 0)
+        days = []
+        for ended, (x, p) in zip(self._ended, states, strict=True):
+            p = p * ended.inflation[:, None] * ended.inflation
+            for index in OF_DAY[~ended.shown[OF_DAY]]:  # claimed nothing of
+                x[index] = self._unknown.x[index]
+                p[index] = p[:, index] = 0.0
+                p[index, index] = self._unknown.p[index, index]
+            days.append(DayState(GaussianState(x, p), ended.shown))
+        return days
+
+    def without_fold(self, fold: int) -> list[GaussianState]:
+        """The states of every day had the bank not seen a fold, the delay's probabilities being those of all data."""
+        _, log_share = self._shares()
+        found = self._solve(fold)
+        last = self._mixture(found, log_share)
+        if not self._ended:
+            return [last]
+        return [*self._on_days_before(last, self._held(found, log_share), 1 + fold), last]
+
+    def _on_days_before(self, last: GaussianState, held: GaussianState, fold: int) -> list[GaussianState]:
+        """The states (n,) of days that are over, by what later ones say of the vehicle (Rauch, Tung, Striebel).
+
+        last: of this day, in the errors; held: the same as the filter has it. fold: place in `_Ended.known`.
+        """
+        on = np.setdiff1d(np.arange(N_STATE), OF_DAY)
+        states = []
+        for ended in self._ended:
+            x, p = ended.known[fold]
+            gain = p[np.ix_(OF_DAY, on)] @ np.linalg.inv(p[np.ix_(on, on)])
+            if self._process_rate is not None:  # what later days say of this one is then forgotten by and by
+                gain = np.zeros_like(gain)
+            of_day = x[OF_DAY] + gain @ (held.x[on] - x[on])
+            gained = p[np.ix_(on, on)] - held.p[np.ix_(on, on)]
+            left = GaussianState(last.x.copy(), last.p.copy())
+            left.x[OF_DAY] = of_day
+            cross = last.p[np.ix_(on, on)] @ gain.T
+            left.p[np.ix_(on, OF_DAY)], left.p[np.ix_(OF_DAY, on)] = cross, cross.T
+            left.p[np.ix_(OF_DAY, OF_DAY)] = p[np.ix_(OF_DAY, OF_DAY)] - gain @ gained @ gain.T
+            states.append(left)
+        return states
+
+    def _shares(self) -> tuple[Hypotheses, Array]:
+        """All hypotheses, and the logarithm (K,) of how likely each is."""
         found = self._solve()
+        # a first level from the best as claimed; tempering does not change which that is but for the prior
         level = self._level(found, int(np.argmax(found.log_evidence)))
-        return self._mixture(self._solve(fold), found.log_evidence / level + self._log_prior)
+        return found, found.log_evidence / level + self._log_prior
+
+    def _inflation(self, best: int, found: Hypotheses) -> Array:
+        """By how much blocks of time raise σ of each state (n,)."""
+        if self._process_rate is not None:
+            return np.ones(N_STATE)
+        return self.blocks.inflation(best, found.x[best], found.p[best])
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
-        share = np.exp(log_share - log_share.max())
-        share[share < SMALLEST_SHARE] = 0.0
-        kept = np.flatnonzero(share)
-        share = share[kept] / share[kept].sum()
+        """All hypotheses as one, in the errors."""
+        kept, share = _likely(log_share)
         to_errors = PriorOnErrors(_at(self._start, kept), _at(self._errors, kept)).to_errors
-        x, p = to_errors(GaussianState(found.x[kept], found.p[kept]))
-        x[:, DELAY] += DELAYS_S[kept]
-        mean = share @ x
-        apart = x - mean
-        covariance = np.einsum("k,kij->ij", share, p) + np.einsum("k,ki,kj->ij", share, apart, apart)
-        return GaussianState(mean, covariance)
+        return _one(to_errors(GaussianState(found.x[kept], found.p[kept])), kept, share)
+
+    def _held(self, found: Hypotheses, log_share: Array) -> GaussianState:
+        """`_mixture` as the filter has the states."""
+        kept, share = _likely(log_share)
+        return _one(GaussianState(found.x[kept], found.p[kept]), kept, share)
 
     def _shown(self, best: int, inflation: Array) -> Mask:
         """Which states (n,) the data show even if everything else were known much worse than the prior says."""
@@ -243,6 +332,29 @@ def _told(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:
     flat_wz = (weighted[:, None] @ z[..., None])[..., 0].transpose(1, 0, 2).reshape(k, -1)
     vector = (flat_wh @ flat_z[..., None])[..., 0]
     return flat_wh @ flat_h, vector, np.einsum("ki,ki->k", flat_wz, flat_z)
+
+
+def _likely(log_share: Array) -> tuple[Index, Array]:
+    """Which hypotheses are in the mixture, and the share of each."""
+    share = np.exp(log_share - log_share.max())
+    share[share < SMALLEST_SHARE] = 0.0
+    kept = np.flatnonzero(share)
+    return kept, share[kept] / share[kept].sum()
+
+
+def _one(states: GaussianState, kept: Index, share: Array) -> GaussianState:
+    """Hypotheses x (M, n), P (M, n, n), by the numbers kept (M,) of their delays, as one; its delay is the whole."""
+    x = states.x.copy()
+    x[:, DELAY] += DELAYS_S[kept]
+    mean = share @ x
+    apart = x - mean
+    return GaussianState(mean, np.einsum("k,kij->ij", share, states.p) + np.einsum("k,ki,kj->ij", share, apart, apart))
+
+
+def _information(states: GaussianState) -> tuple[Array, Array]:
+    """Λ (K, n, n) and Λx (K, n)."""
+    inverse = np.linalg.inv(states.p)
+    return inverse, (inverse @ states.x[..., None])[..., 0]
 
 
 def _at(states: GaussianState, index: Index) -> GaussianState:

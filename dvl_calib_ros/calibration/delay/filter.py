@@ -21,16 +21,17 @@ from ..heave_waves import HeaveWaves
 from ..kalman import GaussianState
 from ..observations import Assumptions, Observations
 from ..parameters import Parameters
-from ..samples import FRAME_CODES, FRAMES, Stamps, VelocityFrame, Verdict
+from ..samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
 from ..selection import NO_EVIDENCE, Evidence
 from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
-from .bank import DelayBank, Posterior
+from .bank import DayState, DelayBank, Posterior
 from .hold_out import NOT_MEASURED, Kept, Recording, held_out_error, thinned
 from .rows import (
     BEYOND,
     DELAY,
+    DELAYS_S,
     LEVER_ARM,
     MARGIN_S,
     N_STATE,
@@ -44,6 +45,7 @@ from .rows import (
 
 BLOCK_NS = 10_000_000_000
 MARGIN_NS = round(MARGIN_S * 1e9)
+LONGEST_DELAY_NS = round(DELAYS_S[-1] * 1e9)
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
 # No vehicle with a DVL turns faster, rad/s.
@@ -76,14 +78,14 @@ class DelayFilter:
         parameters: Parameters,
         aligner: Aligner,
         prior: GaussianState,
-        unknown_std: Array,
+        unknown: GaussianState,
         gate: float,
         on_block: Callable[[int], None],
         verified: bool,
     ) -> None:
         """Start from the prior of G2's states.
 
-        unknown_std: (n,) of a prior without any calibration before it. gate: largest νᵀS⁻¹ν of a good sample. on_block:
+        unknown: a prior without any calibration before it. gate: largest νᵀS⁻¹ν of a good sample. on_block:
         told after each block of the stamp from which on DVL samples may go by it. verified: keep what hold-out needs.
         """
         self._parameters = parameters
@@ -91,7 +93,7 @@ class DelayFilter:
         self._on_block = on_block
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
-        self._bank = DelayBank(prior, unknown_std, gate, np.diag(rate) if rate.any() else None, verified)
+        self._bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified)
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._template = Observations(
@@ -110,6 +112,7 @@ class DelayFilter:
         self.n_taken = 0  # rows of the aligner that have been looked at
         self._block_ns: int | None = None  # start of the next block
         self._epoch_ns = 0
+        self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
         self._kept: list[Kept] | None = [] if verified else None
         self._posterior: Posterior | None = None
         self._changed = False
@@ -219,6 +222,7 @@ class DelayFilter:
             return
         self.take_rows()
         while self._block_ns <= last_ns:
+            self._look_for_a_new_day(self._block_ns)
             if self._take_block(self._block_ns):
                 self._changed = True
                 self._on_block(self._block_ns + BLOCK_NS + self._wait_ns)
@@ -228,6 +232,16 @@ class DelayFilter:
             self._dvl.begin
             + int(np.searchsorted(self._dvl.stamps_ns[self._dvl.begin : self._dvl.size], self._block_ns - MARGIN_NS))
         )
+
+    def _look_for_a_new_day(self, block_ns: int) -> None:
+        """Start a new day with the block that may have references of its first DVL sample, however late that is."""
+        starts_ns = self._aligner.day_starts_ns
+        while len(self._day_starts_ns) < len(starts_ns):
+            if starts_ns[len(self._day_starts_ns)] - LONGEST_DELAY_NS >= block_ns + BLOCK_NS:
+                return
+            self._bank.end_day()
+            self._day_starts_ns.append(block_ns)
+            self._changed = True
 
     def _next_block(self, block_ns: int, last_ns: int) -> int:
         """The next block that has a reference; else the first one that is not complete."""
@@ -368,10 +382,30 @@ class DelayFilter:
         """All that was kept for verification, and the stamp (ns) of its time 0; None for nothing."""
         return (Recording.of(self._kept), self._epoch_ns) if self._kept else None
 
-    def without_folds(self) -> list[GaussianState]:
-        """For every fold the state had it not seen that fold."""
+    @property
+    def n_days(self) -> int:
+        """Number of days so far."""
+        return 1 + len(self._day_starts_ns)
+
+    def day_of(self, stamps_ns: Stamps) -> Index:
+        """Which day (N,) stamps are of, from 0."""
+        return np.searchsorted(np.array(self._day_starts_ns, dtype=np.int64), stamps_ns, side="right")
+
+    @property
+    def days(self) -> list[DayState]:
+        """What was found on each day, where there are more than one and lever arm or delay are claimed; else none."""
+        if not self._day_starts_ns or not self.claims or self.posterior is None:
+            return []
+        return [*self._bank.days(), DayState(self.posterior.state, self.posterior.shown)]
+
+    def without_folds(self) -> list[list[GaussianState]]:
+        """For every fold the states of every day had it not seen that fold."""
         return [self._bank.without_fold(fold) for fold in range(FOLDS)]
 
     def held_out_error(self) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
-        return held_out_error(self._kept, self._bank, self._epoch_ns, self._parameters) if self._kept else None
+        if not self._kept:
+            return None
+        recording = Recording.of(self._kept)
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + self._epoch_ns
+        return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), self._bank, self._parameters)

@@ -46,32 +46,36 @@ class Kept(NamedTuple):
         return Kept(own, noise_dvl, reference, turning)
 
 
-def held_out_error(kept: Sequence[Kept], bank: DelayBank, epoch_ns: int, p: Parameters) -> HeldOutError | None:
+def held_out_error(
+    recording: Recording, stamps_ns: Stamps, days: Index, bank: DelayBank, p: Parameters
+) -> HeldOutError | None:
     """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
+
+    stamps_ns, days: (N,) of the DVL's samples.
 
     As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
     less its delay, and the lever arm away from the reference point.
     """
-    recording = Recording.of(kept)
-    folds = folds_of(np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns, p)
+    folds = folds_of(stamps_ns, p)
     nominal = np.zeros(len(bank.prior.x))
     sums = np.zeros(4)
     samples = 0
     for fold in range(FOLDS):
-        at = np.flatnonzero(folds == fold)
         try:
-            state = bank.without_fold(fold)
+            states = bank.without_fold(fold)
         except np.linalg.LinAlgError:  # as in `posterior`
             return None
-        before = recording.errors(at, nominal, p)
-        after = recording.errors(at, state.x, p)
-        both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
-        jacobian = after.jacobian[both]
-        calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
-        noise = after.noise[both].sum()
-        squares = [(each.error[both] ** 2).sum() for each in (before, after)]
-        sums += [*squares, noise + calibration, calibration]
-        samples += int(np.count_nonzero(both))
+        for day, state in enumerate(states):
+            at = np.flatnonzero((folds == fold) & (days == day))
+            before = recording.errors(at, nominal, p)
+            after = recording.errors(at, state.x, p)
+            both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
+            jacobian = after.jacobian[both]
+            calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
+            noise = after.noise[both].sum()
+            squares = [(each.error[both] ** 2).sum() for each in (before, after)]
+            sums += [*squares, noise + calibration, calibration]
+            samples += int(np.count_nonzero(both))
     return held_out_from_sums(samples, sums)
 
 

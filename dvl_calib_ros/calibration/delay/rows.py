@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
+from ..models import MODELS
 from ..models.own import g1_noise, linearise_g1
 from ..observations import Observations
 from ..samples import Index, Mask
@@ -37,6 +38,9 @@ MARGIN_S = 7.0
 N_G1, N_STATE = 8, 12
 LEVER_ARM, DELAY = slice(8, 11), 11
 BEYOND = slice(N_G1, N_STATE)  # what G1 has not
+# What belongs to the day, not to the vehicle: the constant error of the reference, and the delay (which a result file
+# hands on all the same: a node that is started again is on the same day more often than not).
+OF_DAY: Index = np.array([*MODELS["G2"].of_day, DELAY])
 
 
 class DvlColumns(NamedTuple):

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..frames import Array
 from ..observations import Observations
@@ -105,6 +106,11 @@ class Model:
     def n_state(self) -> int:
         """Number of states n."""
         return self.n_errors + len(self.nuisance)
+
+    @cached_property
+    def of_day(self) -> NDArray[np.intp]:
+        """Which states (u,) are of the day (`Nuisance.of_the_day`)."""
+        return np.array([self.n_errors + i for i, each in enumerate(self.nuisance) if each.of_the_day], dtype=np.intp)
 
     @cached_property
     def error_terms_from_state(self) -> Array:

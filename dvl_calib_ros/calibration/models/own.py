@@ -180,7 +180,10 @@ OWN = (
         "F1", Needs.NOTHING, 2, _f1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
         assumes="no GNSS; sway and heave near unknown constants, as large as current_std and heave_offset_std say",
         wrong_when="a current stronger than current_std; a run that is mostly turning",
-        nuisance=(Nuisance("sway", "m/s", "current_std"), Nuisance("heave", "m/s", "heave_offset_std")),
+        nuisance=(
+            Nuisance("sway", "m/s", "current_std", of_the_day=True),
+            Nuisance("heave", "m/s", "heave_offset_std"),
+        ),
         noise=_f1_noise,
         motion_is_noise=True,
     ),
@@ -189,8 +192,8 @@ OWN = (
         assumes="attitude, no GNSS; a constant current, skid in proportion to the turn rate, depth held or pitch flown",
         wrong_when="on one heading (then it is F1: yaw and current are the same); a current that changes along the run",
         nuisance=(
-            Nuisance("current_east", "m/s", "current_std"),
-            Nuisance("current_north", "m/s", "current_std"),
+            Nuisance("current_east", "m/s", "current_std", of_the_day=True),
+            Nuisance("current_north", "m/s", "current_std", of_the_day=True),
             Nuisance("skid", "s", 3.0),
             Nuisance("dive", "", 0.5),
             Nuisance("heave", "m/s", "heave_offset_std"),
