@@ -106,22 +106,15 @@ class BagReader:
         return spans
 
     @property
-    def pauses_ns(self) -> list[tuple[int, int]]:
-        """Log times between which none of the recordings at the paths that were given goes on, in order."""
+    def span_of_each_ns(self) -> list[tuple[int, int] | None]:
+        """First and last log time at each of the paths that were given; None where there is no message."""
         at = 0
-        spans = []
+        spans: list[tuple[int, int] | None] = []
         for count in self._n_sources:
-            own = [source for source in self._sources[at : at + count] if source.counts]
+            own = [source.span_ns for source in self._sources[at : at + count] if source.counts]
+            spans.append((min(start for start, _ in own), max(end for _, end in own)) if own else None)
             at += count
-            if own:
-                spans.append((min(s.span_ns[0] for s in own), max(s.span_ns[1] for s in own)))
-        pauses: list[tuple[int, int]] = []
-        until_ns: int | None = None
-        for start_ns, end_ns in sorted(spans):
-            if until_ns is not None and start_ns > until_ns:
-                pauses.append((until_ns, start_ns))
-            until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
-        return pauses
+        return spans
 
     def messages(
         self, topics: Iterable[str], wanted: Callable[[str, int], bool] = lambda *_: True

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from .comparison import date
 from .findings import Finding, finding
 from .heave_waves import Heave
-from .results import Estimate
+from .results import DAYS_OF, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -104,15 +105,23 @@ def heave_advice(heave: Heave | None) -> list[Finding]:
     return [] if heave is None else [finding("HEAVE_WAVES", std=heave.std, period=heave.period)]
 
 
-def reference_advice(estimate: Estimate) -> list[Finding]:
-    """Whether the reference is wrong by a constant that several headings have shown."""
+def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Finding]:
+    """Whether the reference is wrong by a constant that several headings have shown, on each of several days."""
     names = "reference_east", "reference_north"
     std = estimate.std_of(*names)
     if std is None:
         return []
-    offset = np.array([estimate.state_of(name) for name in names])
-    size = float(np.linalg.norm(offset))
-    if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * std).all():
-        return []
-    course = math.degrees(math.atan2(*offset)) % 360.0
-    return [finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course)]
+    found = [("", np.array([estimate.state_of(name) for name in names]), std)]
+    if days and estimate.model == DAYS_OF:
+        found = []
+        for day in days:
+            where = f" on {day.name or date(day.first_ns)}"
+            found.append((where, np.array(day.reference_offset), np.array(day.reference_offset_std)))
+    said = []
+    for where, offset, own_std in found:
+        size = float(np.linalg.norm(offset))
+        if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * own_std).all():
+            continue
+        course = math.degrees(math.atan2(*offset)) % 360.0
+        said.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
+    return said

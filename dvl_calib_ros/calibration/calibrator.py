@@ -32,7 +32,7 @@ from .observability import convergence, observability
 from .observations import Observations
 from .observe import Observer
 from .parameters import ParameterError, Parameters
-from .results import Estimate, Result
+from .results import DAYS_OF, Day, Estimate, Result
 from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
 from .verification import Verification, held_out_error, verify
@@ -505,7 +505,23 @@ class Calibrator:
             verifications={name: self.verification(name) for name in MODELS} if self._verified else {},
             suggestion=self.suggestion,
             heave=self.heave,
+            days=self.days,
         )
+
+    @property
+    def days(self) -> tuple[Day, ...]:
+        """What belongs to each day by G2, where there are several and it claims more than G1; else none."""
+        found = self._delay.days
+        names = MODELS[DAYS_OF].state_names
+        delay, *offset = (names.index(name) for name in ("time_offset", "reference_east", "reference_north"))
+        nominal = self.parameters.dvl_time_offset
+        days = []
+        for first_ns, (state, shown) in zip((self.first_ns or 0, *self._aligner.day_starts_ns), found, strict=False):
+            std = np.sqrt(np.diag(state.p))
+            (east, north), (east_std, north_std) = state.x[offset].tolist(), std[offset].tolist()
+            late, late_std = nominal + float(state.x[delay]), float(std[delay])
+            days.append(Day(first_ns, late, late_std, bool(shown[delay]), (east, north), (east_std, north_std)))
+        return tuple(days)
 
     @property
     def heave(self) -> Heave | None:

@@ -364,7 +364,7 @@ _KINDS = (
     ),
     FindingKind(
         "REFERENCE_OFFSET",
-        "the reference is off by {millimetres:.0f} mm/s towards {course:.0f}° all along",
+        "the reference is off by {millimetres:.0f} mm/s towards {course:.0f}° all along{where}",
         "An error of an inertial navigation that stays, or a current, where the DVL tracks the water. G1 and G2 have "
         "it among their states, so they are none the worse; errors and drift against this reference hold it.",
         "judge the drift by another reference",

@@ -95,14 +95,46 @@ class Estimate:
         return corrected_mounting(self.misalignment, rotation_dvl_from_body)
 
 
+# The model whose states `Day` are.
+DAYS_OF = "G2"
+
+
+@dataclass(frozen=True)
+class Day:
+    """What belongs to one of several days, by the data of all.
+
+    Parameters
+    ----------
+    first_ns
+        Stamp of its first DVL sample.
+    dvl_time_offset, dvl_time_offset_std
+        By how much the DVL's stamps are late, s: as the parameters say, and what was found; its σ.
+    shown
+        Whether the data showed it.
+    reference_offset, reference_offset_std
+        (2,) constant error of the reference, east and north, m/s; its σ.
+    name
+        Of the recording, '' for none.
+    """
+
+    first_ns: int
+    dvl_time_offset: float
+    dvl_time_offset_std: float
+    shown: bool
+    reference_offset: tuple[float, float]
+    reference_offset_std: tuple[float, float]
+    name: str = ""
+
+
 @dataclass(frozen=True)
 class Result:
     """All models' estimates, which one is selected, and what the data went through.
 
     first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
-    `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values.
-    verifications: by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit,
-    where the one given is grossly wrong, else ''. heave: that of waves, None where there are none.
+    `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values. verifications:
+    by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit, where the one
+    given is grossly wrong, else ''. days: in order, none where there is one. heave: that of waves, None where there are
+    none.
     """
 
     selected: str
@@ -116,6 +148,7 @@ class Result:
     verifications: Mapping[str, Verification]
     suggestion: str = ""
     heave: Heave | None = None
+    days: tuple[Day, ...] = ()
 
     @property
     def estimate(self) -> Estimate:

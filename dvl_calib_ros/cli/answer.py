@@ -87,10 +87,12 @@ def _table(replayed: Replayed) -> Table:
     from rich import box
     from rich.table import Table
 
+    from ..calibration.comparison import date
     from ..calibration.frames import rpy_from_rotation
     from ..calibration.models import MODELS
     from ..calibration.observability import body_angle_std, scale_std_ahead
     from ..calibration.parameters import Parameters
+    from ..calibration.results import DAYS_OF
 
     result = replayed.result
     estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
@@ -120,7 +122,13 @@ def _table(replayed: Replayed) -> Table:
                 f"{arm_std[index]:.2f} m{mark}",
             )  # fmt: skip
     offset_std = estimate.std_of("time_offset")
-    if offset_std is not None:
+    if result.days and result.selected == DAYS_OF:
+        for day in result.days:
+            table.add_row(
+                f"stamps late, {day.name or date(day.first_ns)}", f"{parameters.dvl_time_offset:.2f} s",
+                f"{day.dvl_time_offset:+.2f} s", f"{day.dvl_time_offset_std:.2f} s{'' if day.shown else ' ?'}",
+            )  # fmt: skip
+    elif offset_std is not None:
         offset, mark = estimate.dvl_time_offset(parameters.dvl_time_offset), " ?" if "time offset" in unseen else ""
         table.add_row(
             "stamps late", f"{parameters.dvl_time_offset:.2f} s", f"{offset:+.2f} s", f"{offset_std[0]:.2f} s{mark}"

@@ -17,13 +17,14 @@ import yaml
 
 from .. import __version__
 from ..calibration.assembly import prior
+from ..calibration.folds import on_another_day
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import mounting_pose, scale_and_delay
 from ..calibration.observability import Convergence
 from ..calibration.parameters import FLU, FRD, Parameters
-from ..calibration.results import Estimate, Result
+from ..calibration.results import DAYS_OF, Estimate, Result
 from ..calibration.verification import verification_document
 from ..errors import InputError, printable
 from .atomic import own_stream, save_bytes
@@ -96,10 +97,31 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
             "child_frame_id": child,
             "static_transform_publisher": _static_transform_publisher(lever_arm, to_frame, parent, child),
         },
+        **days_document(result),
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
         "parameters": dict(parameters),
         _END: True,
+    }
+
+
+def days_document(result: Result) -> dict[str, Any]:
+    """What belongs to each day, in order, where there were several: the mounting holds the delay of the last."""
+    if not result.days or result.selected != DAYS_OF:
+        return {}
+    return {
+        "days": [
+            {
+                "name": day.name,
+                "first_ns": day.first_ns,
+                "dvl_time_offset": day.dvl_time_offset,
+                "dvl_time_offset_std": day.dvl_time_offset_std,
+                "dvl_time_offset_shown": day.shown,
+                "reference_velocity_offset": list(day.reference_offset),
+                "reference_velocity_offset_std": list(day.reference_offset_std),
+            }
+            for day in result.days
+        ]
     }
 
 
@@ -225,12 +247,8 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
 
 
 def _another_day(name: str, state: GaussianState) -> GaussianState:
-    model, (x, p) = MODELS[name], (state.x.copy(), state.p.copy())
-    start = prior(model, Parameters())
-    n_errors = model.n_errors
-    for index in (n_errors + i for i, each in enumerate(model.nuisance) if each.of_the_day):
-        x[index], p[index], p[:, index] = start.x[index], start.p[index], start.p[index]
-    return GaussianState(x, p)
+    model = MODELS[name]
+    return on_another_day(state, prior(model, Parameters()), model.of_day)
 
 
 def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any], dict[str, GaussianState]]:

@@ -37,15 +37,19 @@ class Recordings:
 
     comparison: None where less than two could be calibrated for themselves. unchecked: names of those that could not.
     overlapping: names of two that hold the DVL at the same time. pauses_ns: times without any, between two of them.
+    number: how many there are, bags of the same time being one.
     """
 
     comparison: Comparison | None
     unchecked: tuple[str, ...]
     overlapping: tuple[str, str] | None
     pauses_ns: tuple[int, ...]
+    number: int
 
-    def objections(self, model: str) -> list[tuple[Word, str]]:
-        """Why an estimate of all of them together by this model is not to be used as it is."""
+    def objections(self, model: str, parted: bool) -> list[tuple[Word, str]]:
+        """Why an estimate of all of them together by this model is not to be used as it is.
+
+        parted: whether it has a delay for each."""
         found = []
         if self.overlapping is not None:
             first, second = self.overlapping
@@ -64,12 +68,12 @@ class Recordings:
             (Word.REJECT, f"{_decapitalised(sentence)}: all together are averaged, which is the mounting of neither")
             for sentence in moved
         ]
-        if self.comparison.clock_changed and "time_offset" in MODELS[model].state_names:
+        if self.comparison.clock_changed and "time_offset" in MODELS[model].state_names and not parted:
             found.append(
                 (
                     Word.REJECT,
-                    "the DVL's stamps are late by another delay in each, and one is taken for all: calibrate each by "
-                    "itself, or use dvl-calib diagnose, which takes a delay for each",
+                    "the DVL's stamps are late by another delay in each, and one is taken for all that follow each "
+                    "other so closely: calibrate each by itself",
                 )
             )
         n_moved = max(1, len(moved))  # without any there is one sentence that says so
@@ -155,7 +159,8 @@ def _each_by_itself(
     own = [bag for bag in bags if bag.has_dvl]
     gaps_ns = (after.from_ns - before.to_ns for before, after in pairwise(own))
     pauses_ns = tuple(gap_ns for gap_ns in gaps_ns if gap_ns > DROPOUT_NS)
-    return Recordings(comparison, tuple(unchecked), overlapping, pauses_ns)
+    number = sum(any(bag.has_dvl for bag in group) for group in groups)
+    return Recordings(comparison, tuple(unchecked), overlapping, pauses_ns, number)
 
 
 def _bags(paths: Sequence[Path], topics: Topics) -> list[_Bag]:
@@ -202,7 +207,7 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
     verifications = {}
     notes: list[str] = []
     for name, verification in result.verifications.items():
-        objections = recordings.objections(name)
+        objections = recordings.objections(name, parted=len(result.days) >= recordings.number)
         if name == result.selected and merge:
             notes += [f"merged as asked: {sentence}" for _, sentence in objections]
         verifications[name] = verification if merge else verification.with_objections(objections)

@@ -20,13 +20,14 @@ from ..calibration.findings import Finding, finding
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
-from ..calibration.results import Result
+from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..calibration.verification import verification_document
 from ..errors import InputError
-from ..files.result_file import estimate_document, load_initial_calibration
+from ..files.result_file import days_document, estimate_document, load_initial_calibration
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
@@ -124,14 +125,15 @@ def replay(
             on_restart=recorder.start if recorder else on_restart,
             verified=True,
             trace=recorder.trace if recorder else None,
-            recordings_ns=[(before_ns + after_ns) // 2 for before_ns, after_ns in bag.pauses_ns],
+            recordings_ns=_between(bag),
         )
         decoder = MessageDecoder(calibrator.parameters)
         _feed_all(bag, chosen, decoder, calibrator, on_progress)
         calibrator.finish()
         on_finished(calibrator)
         found += decoder.problems.values()
-    result = calibrator.result()
+        result = calibrator.result()
+        result = replace(result, days=_named(result.days, paths, bag))
     found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters)
@@ -148,6 +150,32 @@ def replay(
         decoder.turns_dvl,
         navigation=navigation,
     )
+
+
+def _between(bag: BagReader) -> list[int]:
+    """Log times between one recording and the next."""
+    between = []
+    until_ns: int | None = None
+    for start_ns, end_ns in sorted(span for span in bag.span_of_each_ns if span is not None):
+        if until_ns is not None and start_ns > until_ns:
+            between.append((until_ns + start_ns) // 2)
+        until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
+    return between
+
+
+def _named(days: Sequence[Day], paths: Sequence[Path], bag: BagReader) -> tuple[Day, ...]:
+    """Days by the recording that each began with, where there is one for each; else by their dates."""
+    names = []
+    for day in days:
+        own = [
+            path.name
+            for path, span_ns in zip(paths, bag.span_of_each_ns, strict=True)
+            if span_ns is not None and span_ns[0] - SHORTEST_PAUSE_NS <= day.first_ns <= span_ns[1]
+        ]
+        names.append(own[0] if own else "")
+    if len(set(names)) < len(days) or not all(names):
+        return tuple(days)
+    return tuple(replace(day, name=name) for day, name in zip(days, names, strict=True))
 
 
 def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
@@ -297,7 +325,7 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[F
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_advice(estimate)
-    return found + reference_advice(result.estimate) + heave_advice(result.heave)
+    return found + reference_advice(result.estimate, result.days) + heave_advice(result.heave)
 
 
 def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
@@ -328,6 +356,7 @@ def replay_document(result: Result, models: Sequence[str]) -> dict[str, Any]:
         "models": {name: estimate_document(result.estimates[name]) for name in models},
         "verification": {name: verification_document(result.verifications[name]) for name in models},
         "selected": segments,
+        **days_document(result),
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
         "parameters": dict(result.parameters),
         "version": __version__,

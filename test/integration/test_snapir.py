@@ -14,6 +14,7 @@ from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
 from dvl_calib_ros.files.trajectories import ImportOptions, import_recording, read_columns
+from dvl_calib_ros.replay.checked import checked_replay
 from dvl_calib_ros.replay.replay import extrinsics_of_replay, replay
 from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss
 
@@ -109,6 +110,27 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
     assert np.sqrt(np.mean(error**2)) < 0.6
     assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.1
     assert selected.count("A1") >= 9
+
+
+def test_three_recordings_together_are_accepted_with_one_lever_arm_and_a_delay_for_each(snapir_ins, tmp_path):
+    """Their clocks are 0.9 s apart from day to day; one delay for all was rejected."""
+    bags = []
+    for day, name in enumerate(("T01", "T03", "T05")):
+        files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
+        start_ns = (1_700_000_000 + 86_400 * day) * 1_000_000_000
+        options = ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01, start_ns=start_ns)
+        import_recording(*files, tmp_path / name, options)
+        bags.append(tmp_path / name)
+    replayed = checked_replay(bags, Parameters())
+    result = replayed.result
+    verification = result.verifications["G2"]
+    assert result.selected == "G2" and verification.verdict.value == "accept"
+    assert verification.held_out.corrected < 0.025
+    assert abs(result.estimate.lever_arm((0.0, 0.0, 0.0))[0] + 1.85) < 0.03
+    found = {day.name: round(day.dvl_time_offset, 2) for day in result.days}
+    assert found == pytest.approx({"T01": -1.41, "T03": -1.49, "T05": -0.52}, abs=0.03)
+    offset = next(each for each in replayed.findings if each.code == "REFERENCE_OFFSET")
+    assert "on T05" in offset.says
 
 
 @pytest.mark.slow
