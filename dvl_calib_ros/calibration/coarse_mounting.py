@@ -47,7 +47,7 @@ class Suggestion(NamedTuple):
 
 
 class CoarseFits:
-    """Sums over samples at each of `DELAYS_S`, from which any rotation of any frame can be judged. Memory is constant."""
+    """Sums over samples at each of `DELAYS_S`, from which any rotation of any frame can be judged. Constant memory."""
 
     def __init__(self, rotation_dvl_from_body: Array) -> None:
         """rotation_dvl_from_body: (3, 3) nominal."""

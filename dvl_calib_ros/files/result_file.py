@@ -238,7 +238,7 @@ def _worth_keeping(new: _Worth, n_backups: int, before: Sequence[Path]) -> list[
 def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:
     """States and covariances of a result file to begin with, by model name. Raises InputError naming what is wrong.
 
-    What is of the day that it was made on (`Nuisance.of_the_day`) is as not known. mounting_rpy: the nominal mounting
+    What is not handed on (`Nuisance.handed_on`) is as not known. mounting_rpy: the nominal mounting
     to go on with. The file's angles are relative to its own, which must be that.
     """
     content, known = load_result(path, of_recording=True)
@@ -248,7 +248,7 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
 
 def _another_day(name: str, state: GaussianState) -> GaussianState:
     model = MODELS[name]
-    return on_another_day(state, prior(model, Parameters()), model.of_day)
+    return on_another_day(state, prior(model, Parameters()), model.not_handed_on)
 
 
 def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any], dict[str, GaussianState]]:

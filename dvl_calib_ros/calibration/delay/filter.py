@@ -31,8 +31,8 @@ from .hold_out import NOT_MEASURED, Kept, Recording, held_out_error, thinned
 from .rows import (
     BEYOND,
     DELAY,
-    DELAYS_S,
     LEVER_ARM,
+    LONGEST_DELAY_S,
     MARGIN_S,
     N_STATE,
     DvlColumns,
@@ -45,7 +45,7 @@ from .rows import (
 
 BLOCK_NS = 10_000_000_000
 MARGIN_NS = round(MARGIN_S * 1e9)
-LONGEST_DELAY_NS = round(DELAYS_S[-1] * 1e9)
+LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
 # No vehicle with a DVL turns faster, rad/s.

@@ -22,6 +22,7 @@ from .local_motion import local_fit, reach_at, spacing_at
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
 # (0.1 m/s² changing by 0.3 m/s³ bends by 1.5 mm/s).
 DELAYS_S: Array = np.arange(-16, 17) * 0.2
+LONGEST_DELAY_S = 3.2
 STEP_S = 0.2
 # Samples at least as dense as this tell their noise apart from the vehicle's motion, s.
 NOISE_FROM_S = 0.15
@@ -38,9 +39,8 @@ MARGIN_S = 7.0
 N_G1, N_STATE = 8, 12
 LEVER_ARM, DELAY = slice(8, 11), 11
 BEYOND = slice(N_G1, N_STATE)  # what G1 has not
-# What belongs to the day, not to the vehicle: the constant error of the reference, and the delay (which a result file
-# hands on all the same: a node that is started again is on the same day more often than not).
-OF_DAY: Index = np.array([*MODELS["G2"].of_day, DELAY])
+# What belongs to the day, not to the vehicle: the constant error of the reference, and the delay.
+OF_DAY: Index = MODELS["G2"].of_day
 
 
 class DvlColumns(NamedTuple):

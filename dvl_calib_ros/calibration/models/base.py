@@ -39,13 +39,15 @@ class Nuisance(NamedTuple):
     """A state that is estimated only because it would else be taken for misalignment or scale.
 
     std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. of_the_day: another on
-    another day, so what was found is not gone on with from a result file.
+    another day. handed_on: gone on with from a result file all the same, as a node that is started again is on the same
+    day more often than not, and has found it by much data.
     """
 
     name: str
     unit: str
     std: float | str
     of_the_day: bool = False
+    handed_on: bool = True
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,15 @@ class Model:
     @cached_property
     def of_day(self) -> NDArray[np.intp]:
         """Which states (u,) are of the day (`Nuisance.of_the_day`)."""
-        return np.array([self.n_errors + i for i, each in enumerate(self.nuisance) if each.of_the_day], dtype=np.intp)
+        return self._nuisance_that(lambda each: each.of_the_day)
+
+    @cached_property
+    def not_handed_on(self) -> NDArray[np.intp]:
+        """Which states (u,) are not gone on with from a result file (`Nuisance.handed_on`)."""
+        return self._nuisance_that(lambda each: not each.handed_on)
+
+    def _nuisance_that(self, is_so: Callable[[Nuisance], bool]) -> NDArray[np.intp]:
+        return np.array([self.n_errors + i for i, each in enumerate(self.nuisance) if is_so(each)], dtype=np.intp)
 
     @cached_property
     def error_terms_from_state(self) -> Array:

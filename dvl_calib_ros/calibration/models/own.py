@@ -136,8 +136,8 @@ _SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
 # A constant heave, and by what the reference is wrong all along.
 _G1_NUISANCE = (
     Nuisance("heave", "m/s", "heave_offset_std"),
-    Nuisance("reference_east", "m/s", "reference_offset_std", of_the_day=True),
-    Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True),
+    Nuisance("reference_east", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
+    Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
 )
 _SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
 # What shows the states that only G2 has, by name.
@@ -169,7 +169,7 @@ OWN = (
             Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
             Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
             Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
-            Nuisance("time_offset", "s", "initial_std_time_offset"),
+            Nuisance("time_offset", "s", "initial_std_time_offset", of_the_day=True),
         ),
         noise=g1_noise,
         rows_in_body=True,
