@@ -468,7 +468,16 @@ class Calibrator:
             )
         counts = (estimate.used, estimate.gated)
         suggestion = self._delay.coarse.suggestion() if model.aided else None
-        return verify(model, state, estimate.convergence, held_out, self.parameters, counts, suggestion)
+        return verify(
+            model,
+            state,
+            estimate.convergence,
+            held_out,
+            self.parameters,
+            counts,
+            suggestion,
+            self._delay.reference_claims,
+        )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """For every fold what one model corrects on every day, had it not seen that fold; for one made ``verified``.

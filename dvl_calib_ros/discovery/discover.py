@@ -23,7 +23,7 @@ from ..messages.decode import EARTH_FRAMES
 from ..messages.drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES
 from ..replay.replay import Topics
 from . import choose
-from .fit import CLEARLY, FITS, Fit, Hypothesis, ImuFrame, best_rotation, fit, nominal_rpy, together
+from .fit import CLEARLY, FITS, Fit, Hypothesis, ImuFrame, best_rotation, explained, fit, nominal_rpy, together
 from .survey import Look, Survey, survey
 from .transforms import FrameTree, Placed
 
@@ -182,9 +182,9 @@ class _Search:
             chosen = self._chosen = self._fit(dvl, reference, imu, known, turned, imu_frames, placed)
         elif known is None:
             self._mounting_from_motion(dvl, turned)
-        if chosen is not None:
+        if chosen is not None and reference is not None:
             turned = chosen.hypothesis.turned
-            self._take(chosen, known, imu_frames, reference)
+            self._take(chosen, known, imu_frames, dvl, reference, imu)
         elif imu_frames and imu is not None:
             self._take_imu(imu_frames[0], imu)
         if self._parameters.dvl_axes == FROM_MESSAGE and turned != self._turned_by_message(dvl):
@@ -316,12 +316,25 @@ class _Search:
         if not fits:
             return None
         wanted = Hypothesis(declared or USUAL[0], imu_frames[0] if imu_frames else None, turned)
-        return _decided(fits, wanted, declared is not None)
+        decided = _decided(fits, wanted, declared is not None)
+        own = next((each for each in fits if each.hypothesis == wanted), None)
+        if decided is None or own is None or decided is own:
+            return decided
+        mounting = None if known is None else known.T
+        best, as_declared = (explained(dvl, reference, imu, each.hypothesis, mounting).left for each in (decided, own))
+        return decided if best < CLEARLY * as_declared else own
 
-    def _take(self, chosen: Fit, known: Array | None, imu_frames: Sequence[ImuFrame], reference: Look | None) -> None:
+    def _take(
+        self,
+        chosen: Fit,
+        known: Array | None,
+        imu_frames: Sequence[ImuFrame],
+        dvl: Look,
+        reference: Look,
+        imu: Look | None,
+    ) -> None:
         """Write what a fit says into the parameters."""
         hypothesis, parameters = chosen.hypothesis, self._parameters
-        assert reference is not None
         declared = self._declared_reference(reference)
         if hypothesis.reference is not declared:
             self._values["gnss_frame"] = hypothesis.reference.value
@@ -343,7 +356,11 @@ class _Search:
         found = chosen.rotation_dvl_from_body.T
         if known is None:
             if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-                self._mounting_found(nominal_rpy(found), "where DVL and reference agree best")
+                as_it_is = explained(dvl, reference, imu, hypothesis, np.eye(3))
+                turned = explained(dvl, reference, imu, hypothesis, None)
+                if turned.left < CLEARLY * as_it_is.left:
+                    agree = "where DVL and reference agree best"
+                    self._mounting_found(nominal_rpy(turned.rotation_dvl_from_body.T), agree)
         elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
             self._contradictions.append(
                 f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "

@@ -3,18 +3,28 @@
 For every hypothesis (reference in the body, ENU or NED; IMU as its transform says or as marine instruments give it;
 DVL forward-left-up or forward-right-down) the reference is turned into the body and compared with the DVL. Where the
 mounting is known, by what is left of the difference; where it is not, by what is left after the best rotation (Wahba's
-problem, solved by singular values).
+problem, solved by singular values). A DVL that sits ahead, or is stamped late, can look as if it were turned; so before
+anything else than what is declared is taken, both are looked at with the lever arm and the delay that suit them best.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, cross, rotation_from_quaternion, rpy_from_rotation
+from ..calibration.coarse_mounting import DELAYS_S
+from ..calibration.frames import (
+    ENU_FROM_NED,
+    FLU_FROM_FRD,
+    Array,
+    cross,
+    rotation_from_quaternion,
+    rpy_from_rotation,
+    skew,
+)
 from ..calibration.samples import VelocityFrame
 from .survey import Look, comparable
 
@@ -29,6 +39,10 @@ KEPT_SHARE = 0.9
 CLEARLY = 0.5
 # ... and fits in itself: what it leaves is below this share of the speed (17 degrees of misalignment).
 FITS = 0.3
+# A misalignment or a scale beyond this is no longer that of the mounting that is declared.
+MISALIGNED, SCALED = math.radians(10.0), 0.1
+# Rounds in which rotation and lever arm are found in turns.
+ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,13 +170,84 @@ def fit(
         best = best_rotation(dvl, body, np.eye(3) if known is None else known)
         # a second time without the worst
         errors = ((dvl - body @ best.T) ** 2).sum(axis=1)
-        kept = errors <= np.quantile(errors, KEPT_SHARE)
+        kept = _better(errors)
         best = best_rotation(dvl[kept], body[kept], np.eye(3) if known is None else known)
         best_left = _rms(dvl - body @ best.T) / speed
         left = best_left if known is None else _rms(dvl - body @ known.T) / speed
         fits.append(Fit(hypothesis, left, best, best_left))
     # of two that fit alike the one that asks for the smaller turn
     return sorted(fits, key=lambda each: each.left + (0.0 if rotation_dvl_from_body is not None else 0.02 * each.angle))
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What is left with the lever arm and the delay that suit a reading of the data best, as a share of the speed, and
+    its rotation_dvl_from_body (3, 3)."""
+
+    left: float
+    rotation_dvl_from_body: Array
+
+
+NOT_EXPLAINED = Explained(math.inf, np.eye(3))
+
+
+def explained(
+    dvl: Look, reference: Look, imu: Look | None, hypothesis: Hypothesis, rotation_dvl_from_body: Array | None
+) -> Explained:
+    """What is left under a hypothesis with any lever arm, any delay, and a small misalignment and scale.
+
+    rotation_dvl_from_body: the mounting (3, 3), which stands if it is not None; else the best is found.
+    """
+    found = [
+        _explained(data, hypothesis, rotation_dvl_from_body)
+        for late_s in DELAYS_S.tolist()
+        if (data := together(replace(dvl, stamps_s=dvl.stamps_s - late_s), reference, imu)) is not None
+    ]
+    return min(found, key=lambda each: each.left, default=NOT_EXPLAINED)
+
+
+def _explained(data: Together, hypothesis: Hypothesis, known: Array | None) -> Explained:
+    """As `explained`, at one delay.
+
+    Of a rotation that is found and the same turned about the direction of travel, which a lever arm makes alike, that
+    with the smaller angle is taken unless the other leaves clearly less.
+    """
+    if known is None:
+        best = _with_lever_arm(data, hypothesis, None)
+        turned = _with_lever_arm(data, hypothesis, best.rotation_dvl_from_body @ FLU_FROM_FRD)
+        upright, other = sorted((best, turned), key=lambda each: -float(np.trace(each.rotation_dvl_from_body)))
+        return other if other.left < CLEARLY * upright.left else upright
+    return _with_lever_arm(data, hypothesis, known)
+
+
+def _with_lever_arm(data: Together, hypothesis: Hypothesis, known: Array | None) -> Explained:
+    body = body_velocity(data, hypothesis)
+    if body is None:
+        return NOT_EXPLAINED
+    rates = np.zeros_like(body)
+    if data.rates is not None and hypothesis.imu is not None:
+        rates = np.nan_to_num(data.rates @ hypothesis.imu.rotation_body_from_imu.T)
+    dvl = data.dvl @ FLU_FROM_FRD if hypothesis.turned else data.dvl
+    rotation = best_rotation(dvl, body, np.eye(3)) if known is None else known
+    for last in range(ROUNDS if known is None else 1, 0, -1):
+        own = dvl @ rotation
+        columns = np.concatenate([skew(rates), skew(own), own[:, :, None]], axis=2)
+        kept = np.arange(len(own))
+        for _ in range(2):  # a second time without the worst
+            h, z = columns[kept].reshape(-1, 7), (own - body)[kept].reshape(-1)
+            x = np.linalg.lstsq(h, z, rcond=1e-6)[0]
+            rest = own - body - columns @ x
+            kept = np.flatnonzero(_better((rest**2).sum(axis=1)))
+        if last > 1:
+            rotation = best_rotation(dvl[kept], (body + cross(rates, x[:3]))[kept], np.eye(3))
+    if np.linalg.norm(x[3:6]) > MISALIGNED or abs(x[6]) > SCALED:
+        return NOT_EXPLAINED
+    return Explained(_rms(rest) / _rms(dvl), rotation)
+
+
+def _better(errors: Array) -> Array:
+    """(N,) whether a sample is not among the worst."""
+    return np.asarray(errors <= np.quantile(errors, KEPT_SHARE))
 
 
 def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:

@@ -23,9 +23,9 @@ from ..messages.decode import stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
 
-# Bursts: so many over the recording, each so long, of each topic at most so often. 60 bursts of 2 s show turns and
-# straights; 10 Hz is what a DVL gives at most.
-BURSTS, BURST_NS, BURST_EVERY_NS = 60, 2_000_000_000, 95_000_000
+# Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
+# straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
+BURSTS, BURST_NS, BURST_EVERY_NS = 24, 6_000_000_000, 95_000_000
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 # What is faster (m/s) is garbage, whose square may be no number any more; millimetres per second still pass.
 FASTEST = 1e5

@@ -110,6 +110,7 @@ class DelayFilter:
         self._lever_arm = (x, y, z)
         self._dvl = _Dvl()
         self.n_taken = 0  # rows of the aligner that have been looked at
+        self._claiming = self._not_claiming = 0  # references
         self._block_ns: int | None = None  # start of the next block
         self._epoch_ns = 0
         self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
@@ -281,6 +282,8 @@ class DelayFilter:
         reference, stamps_ns = self._reference(block_ns, end_ns)
         if not len(stamps_ns) or self._dvl_is_silent(end_ns):
             return False
+        self._claiming += int(np.count_nonzero(reference.claimed))
+        self._not_claiming += int(np.count_nonzero(~reference.claimed))
         dvl, noise_dvl = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         self._compare_coarsely(block_ns, end_ns, dvl, imu)
@@ -376,6 +379,11 @@ class DelayFilter:
             noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
         stamps_ns = track.stamps_ns[at].copy()
         return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY, given), stamps_ns
+
+    @property
+    def reference_claims(self) -> bool:
+        """Whether it is the reference's messages that say how noisy it is, and no parameter."""
+        return self._claiming > self._not_claiming
 
     @property
     def recording(self) -> tuple[Recording, int] | None:

@@ -110,7 +110,8 @@ class Compared(NamedTuple):
     error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
     does not measure. measured (N, 3, 3): onto what it does measure, body. body (N, 3): the reference velocity.
     rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. variance (N,): of the reference, over the
-    axes that it measures. acceleration (N, 3): of the reference, body. rates (N, 3): rad/s.
+    axes that it measures; claimed (N,): its message says so, and the DVL's is to be added. acceleration (N, 3): of the
+    reference, body. rates (N, 3): rad/s.
     """
 
     error: Array
@@ -119,6 +120,7 @@ class Compared(NamedTuple):
     rotation_enu_from_body: Array
     oriented: Mask
     variance: Array
+    claimed: Mask
     acceleration: Array
     rates: Array
 
@@ -151,7 +153,7 @@ class Recording(NamedTuple):
         jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
         jacobian[:, :, LEVER_ARM] = skew(seen.rates)
         jacobian[:, :, DELAY] = -seen.acceleration
-        share = np.trace(seen.measured, axis1=1, axis2=2) / 3.0
+        share = np.where(seen.claimed, np.trace(seen.measured, axis1=1, axis2=2) / 3.0, 0.0)
         return _Errors(seen.error, seen.measured @ jacobian, seen.variance + self.noise_dvl[at] * share)
 
     def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
@@ -183,7 +185,8 @@ class Recording(NamedTuple):
         error[~found] = np.nan
         acceleration = np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
         total = (variance[after] * axes).sum(axis=1)
-        return Compared(error, measured, body, rotation, oriented, total, acceleration, rates)
+        claimed = self.reference.claimed[after]
+        return Compared(error, measured, body, rotation, oriented, total, claimed, acceleration, rates)
 
 
 def thinned(stamps_ns: Stamps) -> Index:
