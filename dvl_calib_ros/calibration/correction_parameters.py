@@ -9,6 +9,8 @@ Scales are those of x and y. A DVL looks down and a vehicle hardly heaves, so no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -62,32 +64,34 @@ def _errors_from_one_correction(correction: Array) -> Mapped:
         (d * h - e * g, b * g - a * h, a * e - b * d),
     )
     share = 1.0 / (a * cofactors[0][0] + b * cofactors[1][0] + c * cofactors[2][0])
-    top, middle, bottom = inverse = [[share * value for value in row] for row in cofactors]
+    rows_of_b = top, middle, bottom = tuple([share * value for value in row] for row in cofactors)
+    columns_of_b = tuple(zip(*rows_of_b, strict=True))
     scale = top[0], middle[1], bottom[2]
+    slopes = [[_slopes(row, column) for column in columns_of_b] for row in rows_of_b]
     errors, derivatives = [], []
     # φ_x = (c_zy - c_yz) / 2 and so on with c_ij = b_ij / b_ii, whose derivatives are (db_ij - c_ij db_ii) / b_ii
     for i, j in ((2, 1), (0, 2), (1, 0)):
-        one, other = inverse[i][j] / scale[i], inverse[j][i] / scale[j]
+        of_i, of_j = scale[i], scale[j]
+        one, other = rows_of_b[i][j] / of_i, rows_of_b[j][i] / of_j
         errors.append(0.5 * (one - other))
-        of_one = [(_slope(inverse, n, i, j) - one * _slope(inverse, n, i, i)) / scale[i] for n in range(_N)]
-        of_other = [(_slope(inverse, n, j, i) - other * _slope(inverse, n, j, j)) / scale[j] for n in range(_N)]
-        derivatives.append([0.5 * (left - right) for left, right in zip(of_one, of_other, strict=True)])
+        row, opposite = slopes[i], slopes[j]
+        derivatives.append(
+            [
+                0.5 * ((ij - one * ii) / of_i - (ji - other * jj) / of_j)
+                for ij, ii, ji, jj in zip(row[j], row[i], opposite[i], opposite[j], strict=True)
+            ]
+        )
     for i in range(2):
         errors.append(scale[i] - 1.0)
-        derivatives.append([_slope(inverse, n, i, i) for n in range(_N)])
+        derivatives.append(list(slopes[i][i]))
     return Mapped(np.array(errors), np.array(derivatives))
 
 
-# Where [ψ×] has its 1 and its -1, for each of ψ.
-_ONES = ((2, 1), (0, 2), (1, 0))
-
-
-def _slope(b: list[list[float]], n: int, i: int, j: int) -> float:
-    """d(b_ij) by the n-th of ψ and κ: B G B with B = (I - [ψ×] - diag(κ))⁻¹."""
-    if n < 3:
-        row, column = _ONES[n]
-        return b[i][row] * b[column][j] - b[i][column] * b[row][j]
-    return b[i][n - 3] * b[n - 3][j]
+def _slopes(row: Sequence[float], column: Sequence[float]) -> tuple[float, float, float, float, float]:
+    """d(b_ij) by each of ψ and κ: B G B with B = (I - [ψ×] - diag(κ))⁻¹, from row i and column j of B."""
+    left_x, left_y, left_z = row
+    x, y, z = column
+    return left_z * y - left_y * z, left_x * z - left_z * x, left_y * x - left_x * y, left_x * x, left_y * y
 
 
 def correction_from_errors(errors: Array) -> Array:
@@ -162,10 +166,20 @@ def _information(state: GaussianState) -> tuple[Array, Array]:
 
 def _extended(jacobian: Array, n: int) -> Array:
     """(..., 5, 5) -> (..., n, n): further states are as they are."""
+    if jacobian.ndim == 2:
+        one = _identity(n).copy()
+        one[:_N, :_N] = jacobian
+        return one
     extended = np.empty((*jacobian.shape[:-2], n, n))
-    extended[...] = np.eye(n)
+    extended[...] = _identity(n)
     extended[..., :_N, :_N] = jacobian
     return extended
+
+
+@cache
+def _identity(n: int) -> Array:
+    """(n, n); not to be written to."""
+    return np.eye(n)
 
 
 def _product(matrix: Array, vector: Array) -> Array:

@@ -20,6 +20,7 @@ from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallba
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
@@ -192,7 +193,7 @@ class CalibrationNode(Node):
 
         def resubscribe() -> None:
             old = self._inputs[topic]
-            self._deliver({})  # what waits in the old one would be lost
+            self.deliver()  # what waits in the old one would be lost
             self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
             self.destroy_subscription(old)
 
@@ -207,6 +208,15 @@ class CalibrationNode(Node):
 
     def _on_message(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
         self._deliver({topic: Arrived.of(message, info)})
+
+    @property
+    def inputs(self) -> Sequence[Subscription]:
+        """Subscriptions that the sensors' messages come by."""
+        return list(self._inputs.values())
+
+    def deliver(self) -> None:
+        """Feed all messages that wait."""
+        self._deliver({})
 
     def _deliver(self, taken: Mapping[str, Arrived]) -> None:
         """Feed messages that were taken, by topic, and all that wait."""

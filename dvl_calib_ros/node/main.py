@@ -37,12 +37,12 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     """As `main`, with what asks it to stop."""
     try:
         import rclpy
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
         from ..calibration.parameters import ParameterError
         from ..errors import InputError
         from .calibration_node import CalibrationNode
+        from .executor import ReceivingExecutor
     except ImportError as error:
         return _refused(
             f"ROS 2 is not available ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
@@ -56,8 +56,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     node = None
     try:
         node = CalibrationNode(parameter_files(args))
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        executor = ReceivingExecutor(node)
         # spin_until_future_complete would remember one callback more with every message
         ending.tell(lambda: executor.create_task(lambda: None))
         while not ending.requested:
