@@ -5,11 +5,20 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
+import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `cli.main` does, before numpy is imported
+
+if sys.dont_write_bytecode:  # hundreds of processes of tests would all compile everything, which none installed does
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(
+        Path(tempfile.gettempdir()) / f"dvl_calib_ros_tests_bytecode_{os.getuid()}"
+    )
 
 import numpy as np
 import pytest

@@ -118,6 +118,7 @@ class Aligner:
         gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
         retention_ns = RETENTION_NS + gnss_ns + imu_ns + latency_ns
         self.orders: dict[Stream, Sequencer[Any]] = {stream: Sequencer(self._max_jump_ns) for stream in Stream}
+        self._dvl_order = self.orders[Stream.DVL]  # asked with every sample
         self.reference = Track(gnss_ns, latency_ns, retention_ns)
         self.imu = Track(imu_ns, latency_ns, retention_ns)
         self._tracks = {Stream.REFERENCE: self.reference, Stream.IMU: self.imu}
@@ -187,7 +188,7 @@ class Aligner:
             self._first_stamp_ns = sample.stamp_ns
         true_ns = self._clocks.dvl(sample.stamp_ns, self._first_stamp_ns)
         sample = DvlSample(true_ns, sample.velocity, covariance)
-        order = self.orders[Stream.DVL]
+        order = self._dvl_order
         if order.goes_on(sample.stamp_ns):
             self._append_row(sample, row)
         else:
@@ -380,9 +381,12 @@ class Aligner:
 
         One whose clock is far ahead would say of every DVL sample that nothing can come for it any more.
         """
-        dvl_ns = self.orders[Stream.DVL].last_ns or 0
-        tracks_ns = (self.reference.newest_ns or 0, self.imu.newest_ns or 0)
-        return max((ns for ns in tracks_ns if dvl_ns < ns <= dvl_ns + self._max_jump_ns), default=dvl_ns)
+        horizon_ns = dvl_ns = self._dvl_order.last_ns or 0
+        for track in (self.reference, self.imu):
+            newest_ns = track.newest_ns
+            if newest_ns is not None and horizon_ns < newest_ns <= dvl_ns + self._max_jump_ns:
+                horizon_ns = newest_ns
+        return horizon_ns
 
     def _is_late(self, stamp_ns: int) -> bool:
         """Whether a sample that has just come lags other streams by more than one may even if its clock is wrong."""

@@ -10,6 +10,7 @@ Scales are those of x and y. A DVL looks down and a vehicle hardly heaves, so no
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import cache
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ import numpy as np
 
 from .frames import Array, skew
 from .kalman import GaussianState
+from .samples import Index
 
 _N = 5  # three angles, two scales
 # d([ψ×] + diag(κ)) / d(ψ, κ): (5, 3, 3)
@@ -132,10 +134,17 @@ class PriorOnErrors:
     """
 
     def __init__(self, start: GaussianState, prior: GaussianState) -> None:
-        """Both (n,)."""
+        """Both (n,), or (K, n) for filters with a prior each."""
         self._started, self._started_state = _information(start)
         self._information = np.linalg.inv(prior.p)
         self._mean = prior.x
+
+    def part(self, at: Index) -> PriorOnErrors:
+        """Of some of K filters."""
+        some = copy(self)
+        some._started, some._started_state = self._started[at], self._started_state[at]
+        some._information, some._mean = self._information[at], self._mean[at]
+        return some
 
     def to_errors(self, held: GaussianState) -> GaussianState:
         """States x (..., n), P (..., n, n) of the filter -> of the errors."""

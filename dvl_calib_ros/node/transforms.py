@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
@@ -26,12 +27,18 @@ class Transforms:
         self._own: deque[Any] = deque(maxlen=OWN_TRANSFORMS)
         self._description = ""
         self.heard = 0
-        self._subscriptions = [node.create_subscription(String, "robot_description", self._on_description, _LATCHED)]
+        # every event callback is one more thing that is waited for with every message
+        quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
+        self._subscriptions = [
+            node.create_subscription(String, "robot_description", self._on_description, _LATCHED, event_callbacks=quiet)
+        ]
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:  # ROS from PyPI is without it; the description alone will have to do
             return
-        self._subscriptions.append(node.create_subscription(TFMessage, "/tf_static", self._on_transforms, _LATCHED))
+        self._subscriptions.append(
+            node.create_subscription(TFMessage, "/tf_static", self._on_transforms, _LATCHED, event_callbacks=quiet)
+        )
 
     def _on_description(self, message: Any) -> None:
         self._description = message.data

@@ -114,8 +114,8 @@ class DelayBank:
     def _begin_day(self) -> None:
         """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
         prior = self.prior
-        self._errors = _around_each_delay(prior)
         self._start = _around_each_delay(to_correction(prior))
+        self._prior_on_errors = PriorOnErrors(self._start, _around_each_delay(prior))
         # of a delay's deviation from the prior's mean
         variance = prior.p[DELAY, DELAY] + CELL_STD_S**2
         self._log_prior = -0.5 * (DELAYS_S - prior.x[DELAY]) ** 2 / variance
@@ -298,8 +298,8 @@ class DelayBank:
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """All hypotheses as one, in the errors."""
         kept, share = _likely(log_share)
-        to_errors = PriorOnErrors(_at(self._start, kept), _at(self._errors, kept)).to_errors
-        return _one(to_errors(GaussianState(found.x[kept], found.p[kept])), kept, share)
+        errors = self._prior_on_errors.part(kept).to_errors(GaussianState(found.x[kept], found.p[kept]))
+        return _one(errors, kept, share)
 
     def _held(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """`_mixture` as the filter has the states."""
@@ -355,10 +355,6 @@ def _information(states: GaussianState) -> tuple[Array, Array]:
     """Λ (K, n, n) and Λx (K, n)."""
     inverse = np.linalg.inv(states.p)
     return inverse, (inverse @ states.x[..., None])[..., 0]
-
-
-def _at(states: GaussianState, index: Index) -> GaussianState:
-    return GaussianState(states.x[index], states.p[index])
 
 
 def _around_each_delay(prior: GaussianState) -> GaussianState:
