@@ -132,14 +132,17 @@ class CoarseFits:
         squares = self._gg[index] + self._vv[index] - 2.0 * np.sum(rotation * self._gv[index], axis=(1, 2))
         return np.asarray(squares / self._gg[index]) if self._gg[index] > 0.0 else np.full(len(squares), math.inf)
 
-    def _named(self, declared: int, best: int, rotation: Array, misfit: float) -> Suggestion:
+    def _named(self, declared: int, best: int, rotation: Array, misfit: float) -> Suggestion | None:
         frame = _FRAMES[best].value
         same_frame = best == declared
+        as_given = _angle(rotation, self._nominal) < SAME_WITHIN
+        if same_frame and as_given:  # a large misalignment, for the calibration to find
+            return None
         about = [] if same_frame else [f"the reference looks like {frame.upper() if best else 'the body frame'}"]
         parameters: dict[str, object] = {} if same_frame else {"gnss_frame": frame}
         earth = best != 0 and declared != 0
         otherwise = ""
-        if _angle(rotation, self._nominal) < SAME_WITHIN:  # the frame explains it
+        if as_given:  # the frame explains it
             if earth and not same_frame and self._misfits(best, FLU_FROM_FRD @ self._nominal).min() < FITS_BELOW:
                 otherwise = ", or the IMU's orientation looks like NED (imu_frame: ned): only sway tells these apart"
         elif not same_frame and earth and _angle(rotation, FLU_FROM_FRD @ self._nominal) < SAME_WITHIN:

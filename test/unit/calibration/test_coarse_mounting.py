@@ -68,6 +68,12 @@ def test_a_wrong_configuration_is_rejected_with_the_sentence_that_names_it(wrong
     assert any(sentence in reason for reason in found.reasons), found.reasons
 
 
+def test_a_large_misalignment_is_no_other_configuration():
+    found = verdict(dvl=rotation_from_rpy([0.0, 0.0, np.radians(11.0)]).T)
+    assert found.verdict is Word.REJECT
+    assert "the misalignment is 1" in found.reasons[0] and not any("not the configuration" in r for r in found.reasons)
+
+
 def test_a_mounting_that_fits_is_named_in_rad():
     reasons = " ".join(verdict(dvl=rotation_from_rpy([0.0, 0.0, 0.785]).T).reasons)
     named = reasons.partition("mounting_rpy ")[2].split()[:3]
