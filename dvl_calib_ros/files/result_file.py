@@ -180,7 +180,8 @@ def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> 
     InputError: If it cannot be written.
 
     """
-    if not document["used"] and own_stream(path) is None and path.exists():
+    # os.path.exists: what cannot be asked, as on a disk that has gone, is for save_bytes to say
+    if not document["used"] and os.path.exists(path) and own_stream(path) is None:
         before = _Worth.of_file(path)
         if before is None or before.used:
             holds = "is no result file" if before is None else f"holds a result of {before.used} samples"

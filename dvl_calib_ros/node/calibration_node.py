@@ -33,7 +33,7 @@ from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..discovery.placement import Frames, not_default, placement
-from ..errors import InputError
+from ..errors import InputError, printable
 from ..files.atomic import check_writable
 from ..files.outputs import check_outputs
 from ..files.parameter_files import NODE_NAME
@@ -334,6 +334,19 @@ class CalibrationNode(Node):
         return problems + twin_problems(self, self._estimate_publisher)
 
     # ------------------------------------------------------------------ services, parameters
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Any:
+        """As rclpy's, which makes the services of parameters by it: no request ends the node, whatever is in it."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return callback(request, response)
+            except Exception as error:  # rclpy raises ValueError for a parameter of a type that it does not know
+                why = printable(f"{type(error).__name__}: {error}")
+                self.get_logger().error(f"{srv_name}: a request cannot be answered ({why}); nothing more of it is done")
+                return srv_type.Response()
+
+        return super().create_service(srv_type, srv_name, answer, **options)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +30,16 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped
-from live_fixtures import LATCHED, Live, Offline, Sent, assert_agree, assert_counts_add_up, sent
+from live_fixtures import LATCHED, Live, Offline, Sent, assert_agree, assert_counts_add_up, received, sent
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros import NODE, World, until
 from std_srvs.srv import Trigger
 
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.yaml_files import load_yaml
@@ -398,6 +403,54 @@ def test_a_storm_of_parameters_good_and_bad_costs_no_sample_and_ends_where_it_sh
     assert saved["counts"] == expected.counts and saved["model"] == "G1"
 
 
+def parameter_values() -> list[ParameterValue]:
+    """Of every type that there is, one that there is not, and none."""
+    kind = ParameterType
+    return [
+        *(ParameterValue(type=kind.PARAMETER_BOOL, bool_value=each) for each in (False, True)),
+        *(ParameterValue(type=kind.PARAMETER_INTEGER, integer_value=each) for each in (0, -1, 2**63 - 1)),
+        *(ParameterValue(type=kind.PARAMETER_DOUBLE, double_value=each) for each in (0.0, -1e308, 5e-324, NAN, INF)),
+        *(
+            ParameterValue(type=kind.PARAMETER_STRING, string_value=each)
+            for each in ("", "x\x1b", "/x/y.yaml", "é" * 300)
+        ),
+        *(ParameterValue(type=kind.PARAMETER_DOUBLE_ARRAY, double_array_value=each) for each in ([], [NAN] * 3, [0.1])),
+        ParameterValue(type=kind.PARAMETER_BYTE_ARRAY, byte_array_value=[b"a"]),
+        ParameterValue(type=kind.PARAMETER_BOOL_ARRAY, bool_array_value=[True] * 3),
+        ParameterValue(type=kind.PARAMETER_INTEGER_ARRAY, integer_array_value=[1, 2, 3]),
+        ParameterValue(type=kind.PARAMETER_STRING_ARRAY, string_array_value=["a"]),
+        ParameterValue(type=kind.PARAMETER_NOT_SET),
+        ParameterValue(type=77),  # of a later ROS
+    ]
+
+
+def test_values_of_every_type_for_every_parameter_end_no_node_and_cost_no_sample(node):
+    names, values = [*SCHEMA, "use_sim_time", "missing", ""], parameter_values()
+    before = {name: node.world.parameter(name) for name in SCHEMA if not SCHEMA[name].read_only}
+    messages = as_messages(CLEAN)
+    per_name = math.ceil(len(messages) / len(names))
+    for number, name in enumerate(names):
+        node.publish(messages[number * per_name : (number + 1) * per_name])
+        parameters = [ParameterMessage(name=name, value=value) for value in values]
+        known = SetParameters.Request(parameters=parameters[:-1])
+        results = node.world.call(SetParameters, f"{NODE}/set_parameters", known).results
+        assert len(results) == len(parameters) - 1 and all(each.successful or each.reason for each in results)
+        unknown = SetParameters.Request(parameters=parameters[-1:])
+        assert node.world.call(SetParameters, f"{NODE}/set_parameters", unknown).results == []
+        together = SetParametersAtomically.Request(parameters=parameters)
+        assert not node.world.call(
+            SetParametersAtomically, f"{NODE}/set_parameters_atomically", together
+        ).result.successful
+        if name in SCHEMA and SCHEMA[name].read_only:
+            assert not any(each.successful for each in results)
+    for name, value in before.items():
+        assert node.world.set_parameter(name, value).successful
+    replay = Offline(PARAMETERS).feed(messages)
+    saved = node.when_like(replay)
+    assert received(saved["counts"]) == received(replay.calibrator.counts)
+    assert all(np.isfinite(each["state"]).all() for each in saved["models"].values())
+
+
 SUBSCRIBER = """
 import rclpy
 from geometry_msgs.msg import TwistWithCovarianceStamped as Twist
@@ -450,6 +503,36 @@ def test_a_full_disk_is_said_and_leaves_the_old_file_and_the_next_save_succeeds(
     assert [path.name for path in node.result_file.parent.iterdir() if path.name.startswith(".")] == []
     node.saved()
     assert "not saved" not in node.status().message
+
+
+def test_a_result_file_whose_folder_goes_comes_back_or_becomes_something_else_costs_no_result(tmp_path):
+    """A disk is pulled out during the run, and another one is there in its place."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    file, messages = folder / "result.yaml", as_messages(between(0, 20))
+    world = World()
+    with world.calibration_node("max_latency:=60.0", f"result_file:={file}") as process:
+        node = Live(world, process, file)
+        node.publish(messages)
+        node.when_like(Offline(PARAMETERS).feed(messages))
+        for change in (
+            lambda: shutil.rmtree(folder),
+            folder.touch,
+            lambda: (folder.unlink(), file.mkdir(parents=True)),
+        ):
+            change()
+            answer = world.call(Trigger, f"{NODE}/save")
+            assert not answer.success and str(file) in answer.message
+            node.wait_until_it_says("the result was not saved: ")
+        file.rmdir()
+        assert node.saved()["used"] and os.listdir(folder) == ["result.yaml"]
+        shutil.rmtree(folder)
+    assert process.returncode == 0 and "Traceback" not in process.output
+    printed = process.output.partition("The result follows.\n")[2]
+    file.parent.mkdir()
+    file.write_text(printed)
+    assert len(load_initial_calibration(file)) == len(MODELS)
+    world.close()
 
 
 # Runs the node, which kills itself, as a power cut would, at one of the calls that writing a file is made of.

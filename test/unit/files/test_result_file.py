@@ -141,6 +141,13 @@ def test_a_result_of_no_sample_replaces_nothing_that_holds_something(tmp_path, s
     assert sorted(os.listdir(tmp_path)) == ["notes.yaml", "result.yaml"]
 
 
+@pytest.mark.parametrize("used", [0, 3])
+def test_where_the_disk_has_gone_the_error_is_one_that_the_node_knows_and_prints_the_result_after(tmp_path, used):
+    """A name too long stands in for it: the system's answer to every question is an error."""
+    with pytest.raises(InputError, match="could not be written"):
+        save_result(tmp_path / ("x" * 300 + ".yaml"), document(used, "collecting"))
+
+
 def test_an_empty_result_is_written_where_nothing_is_and_makes_room_without_a_trace(tmp_path):
     path = tmp_path / "r.yaml"
     for used, left in ((0, [0]), (0, [0]), (7, [7]), (8, [8, 7])):
