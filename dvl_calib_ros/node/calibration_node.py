@@ -17,7 +17,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStam
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -33,7 +32,7 @@ from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample
 from ..discovery.placement import Frames, not_default, placement
-from ..errors import InputError, printable
+from ..errors import InputError
 from ..files.atomic import check_writable
 from ..files.outputs import check_outputs
 from ..files.parameter_files import NODE_NAME
@@ -48,6 +47,7 @@ from ..files.result_file import (
 from ..messages.drivers import velocity_type
 from ..messages.feed import MessageFeed
 from ..streams import say
+from .answering import AnsweringNode
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
@@ -65,7 +65,7 @@ QUEUE = 5000
 BLOCK_SIZE = 512
 
 
-class CalibrationNode(Node):
+class CalibrationNode(AnsweringNode):
     """See interfaces.md, "The node". Raises ParameterError or InputError for a configuration that cannot run.
 
     parameter_files: those that the node was started with.
@@ -334,19 +334,6 @@ class CalibrationNode(Node):
         return problems + twin_problems(self, self._estimate_publisher)
 
     # ------------------------------------------------------------------ services, parameters
-
-    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Any:
-        """As rclpy's, which makes the services of parameters by it: no request ends the node, whatever is in it."""
-
-        def answer(request: Any, response: Any) -> Any:
-            try:
-                return callback(request, response)
-            except Exception as error:  # rclpy raises ValueError for a parameter of a type that it does not know
-                why = printable(f"{type(error).__name__}: {error}")
-                self.get_logger().error(f"{srv_name}: a request cannot be answered ({why}); nothing more of it is done")
-                return srv_type.Response()
-
-        return super().create_service(srv_type, srv_name, answer, **options)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()

@@ -10,6 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from ..errors import InputError
+from .answering import AnsweringNode
 from .status import Status, status_name
 
 
@@ -28,7 +29,7 @@ class Listener:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         except Exception as error:  # rclpy raises types of its own for bad --ros-args, which it takes from sys.argv
             raise InputError(" ".join(str(error).split())) from error
-        self._node = rclpy.create_node("dvl_calib_watch", context=self._context)
+        self._node = AnsweringNode("dvl_calib_watch", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._latest: Status | None = None

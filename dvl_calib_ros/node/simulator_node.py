@@ -18,7 +18,6 @@ from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
@@ -32,6 +31,7 @@ from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
 from ..messages.encode import FRAME_IDS
 from ..simulation.live import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
+from .answering import AnsweringNode
 from .dvl_message import fill
 from .ending import Ending
 from .message_types import message_class
@@ -58,7 +58,7 @@ class Outputs:
             raise InputError(f"--dvl-type {self.dvl_type}: none of {', '.join(TYPES_OF['dvl_type'])}")
 
 
-class SimulatorNode(Node):  # type: ignore[misc]
+class SimulatorNode(AnsweringNode):
     """Publishers of the three sensors. depth: messages that may wait for a subscriber. Raises InputError."""
 
     def __init__(self, outputs: Outputs, depth: int = QUEUE) -> None:

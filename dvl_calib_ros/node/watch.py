@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -23,6 +22,7 @@ from rich.table import Table
 from ..calibration.correction import NOT_ESTIMATED
 from ..demo.player import BagPlayer
 from ..files.parameter_files import NODE_NAME
+from .answering import AnsweringNode
 
 # place in ~/estimate's covariance diagonal, factor to what people read
 SHOWN = {
@@ -38,7 +38,7 @@ class Watcher:
 
     def __init__(self, paths: Sequence[Path], truth: Mapping[str, float]) -> None:
         self._truth = truth
-        self._node = rclpy.create_node("dvl_calib_demo")
+        self._node = AnsweringNode("dvl_calib_demo")
         latched = QoSProfile(
             depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
         )

@@ -17,6 +17,9 @@ from conftest import ROOT
 from geometry_msgs.msg import TwistStamped, TwistWithCovarianceStamped
 from live_fixtures import Offline, Sent
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros import PATIENCE_S, World, until
 from sensor_msgs.msg import Imu
@@ -191,6 +194,15 @@ def test_a_simulator_that_is_reset_begins_anew(world):
     assert stamp_ns(heard["imu"][0].header.stamp) == start_ns
     second = [each for each in heard["imu"] if stamp_ns(each.header.stamp) < start_ns]
     assert stamp_ns(second[0].header.stamp) == start_ns - 100_000_000_000
+
+
+def test_a_request_that_ros_itself_cannot_read_ends_no_simulator(world):
+    unknown = ParameterMessage(name="use_sim_time", value=ParameterValue(type=77))
+    with simulator(world, "--trajectory", "box") as process:
+        world.received(Imu, "imu/data", DEEP)
+        request = SetParameters.Request(parameters=[unknown])
+        assert world.call(SetParameters, "dvl_simulator/set_parameters", request).results == []
+        assert process.poll() is None
 
 
 def test_another_type_of_the_dvls_messages_can_be_had(world):
