@@ -141,15 +141,16 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
             "compare; calibrate on more data (dvl-calib doctor says what is missing)"
         )
     rest = [Difference.between(fused(ordered[:i] + ordered[i + 1 :]), ordered[i]) for i in range(n)] if n > 2 else []
-    moved = _changes(ordered, MOUNTING, CHANCE / (n - 1))
+    together, chance = _Together(), CHANCE / (n - 1)
+    moved = _changes(ordered, MOUNTING, chance, together)
     return Comparison(
         calibrations=tuple(ordered),
         pairs=tuple(pairs),
         against_rest=tuple(rest),
         moved=tuple(moved),
-        scale_changed=tuple(_changes(ordered, ONLY_SCALE, CHANCE / (n - 1))),
-        clock_changed=tuple(_changes(ordered, ONLY_CLOCK, CHANCE / (n - 1))),
-        scatter=_scatter(ordered, [change.first_after for change in moved]),
+        scale_changed=tuple(_changes(ordered, ONLY_SCALE, chance, together)),
+        clock_changed=tuple(_changes(ordered, ONLY_CLOCK, chance, together)),
+        scatter=_scatter(ordered, [change.first_after for change in moved], together),
     )
 
 
@@ -164,20 +165,21 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     base = several[0]
     shown = np.any([each.shown for each in several], axis=0)
     covariance, found = np.zeros((N_COMPONENTS, N_COMPONENTS)), np.zeros(N_COMPONENTS)
+    values = [_values(each, base) for each in several]
     for group in (MOUNTING, ONLY_SCALE, ONLY_CLOCK):
         information, vector = np.zeros((N_COMPONENTS, N_COMPONENTS)), np.zeros(N_COMPONENTS)
-        for each in several:
+        for each, own_values in zip(several, values, strict=True):
             index = group[each.shown[group]]
             at = np.ix_(index, index)
             own = np.linalg.inv(each.covariance[at])
             information[at] += own
-            vector[index] += own @ _values(each, base)[index]
+            vector[index] += own @ own_values[index]
         index = group[shown[group]]
         at = np.ix_(index, index)
         covariance[at] = np.linalg.inv(information[at])
         found[index] = covariance[at] @ vector[index]
     # what nobody has shown stays as the first assumes it
-    found = np.where(shown, found, _values(base, base))
+    found = np.where(shown, found, values[0])
     return replace(
         base,
         name=f"{len(several)} together",
@@ -194,17 +196,33 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     )
 
 
+class _Together:
+    """`fused`, remembering what several gave: stretches of one series are asked for again and again."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, ...], Extrinsics] = {}
+
+    def __call__(self, several: Sequence[Extrinsics]) -> Extrinsics:
+        """Of some of one series, which lives as long as this."""
+        key = tuple(map(id, several))
+        if key not in self._known:
+            self._known[key] = fused(several)
+        return self._known[key]
+
+
 def _values(each: Extrinsics, base: Extrinsics) -> Array:
     """(8,) components, the turn being that from the mounting of `base`."""
     turn = rotation_vector(each.rotation_body_from_dvl @ base.rotation_body_from_dvl.T)
     return np.array([*turn, *each.lever_arm, each.scale, each.time_offset])
 
 
-def _changes(series: list[Extrinsics], components: NDArray[np.intp], chance: float) -> list[Change]:
+def _changes(
+    series: list[Extrinsics], components: NDArray[np.intp], chance: float, together: _Together
+) -> list[Change]:
     """Where some components of a series in time change, in order of time."""
     best, at = None, 0
     for k in range(1, len(series)):
-        difference = Difference.between(fused(series[:k]), fused(series[k:]))
+        difference = Difference.between(together(series[:k]), together(series[k:]))
         test = difference.test(components)
         # by how surprising it is: where few components are compared, a smaller sum is as much. Beyond what a double
         # holds as a probability the sum itself decides
@@ -213,10 +231,11 @@ def _changes(series: list[Extrinsics], components: NDArray[np.intp], chance: flo
     if best is None:
         return []
     change = Change(best[0], series[at - 1], series[at])
-    return [*_changes(series[:at], components, chance), change, *_changes(series[at:], components, chance)]
+    before, after = (_changes(part, components, chance, together) for part in (series[:at], series[at:]))
+    return [*before, change, *after]
 
 
-def _scatter(series: list[Extrinsics], starts: list[Extrinsics]) -> ChiSquare:
+def _scatter(series: list[Extrinsics], starts: list[Extrinsics], together: _Together) -> ChiSquare:
     """Of the mountings about what is common to each stretch between changes."""
     total, freedom = 0.0, 0
     stretches: list[list[Extrinsics]] = [[]]
@@ -226,7 +245,7 @@ def _scatter(series: list[Extrinsics], starts: list[Extrinsics]) -> ChiSquare:
         stretches[-1].append(each)
     for stretch in stretches:
         for k in range(1, len(stretch)):  # each against those before it: independent terms, the same sum
-            test = Difference.between(fused(stretch[:k]), stretch[k]).test(MOUNTING)
+            test = Difference.between(together(stretch[:k]), stretch[k]).test(MOUNTING)
             total, freedom = total + test.value, freedom + test.freedom
     return ChiSquare.of(total, freedom)
 

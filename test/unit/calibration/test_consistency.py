@@ -29,7 +29,7 @@ def normalised_estimation_error_squared(**options) -> dict[str, np.ndarray]:
             run = MatchedRun(
                 trajectory="box" if aided else "straight", seconds=60, phi=phi, scale=scale, dvl_std=0.05, seed=seed
             )
-            calibrator = calibrate(make_samples(run), parameters, block_size=512)
+            calibrator = calibrate(make_samples(run), parameters)
             for each, model in MODELS.items():
                 if model.aided != aided or model.nuisance or any(axes == (0,) for _, axes in model.scale_axes):
                     continue  # M2 and M4 hold a scale along x only, which this truth is not

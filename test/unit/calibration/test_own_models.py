@@ -76,7 +76,7 @@ def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_g1():
     found = []
     for seed in range(10):
         run = MatchedRun("straight", 600.0, gnss_std=0.2, dvl_std=0.01, seed=seed)
-        calibrator = calibrate(make_samples(run), parameters, block_size=512)
+        calibrator = calibrate(make_samples(run), parameters)
         found.append([calibrator.estimate(name).scale[0] for name in ("M1", "G1")])
     pulled, free = np.mean(found, axis=0)
     assert pulled == pytest.approx(-3 * 0.04 / 1.5**2, rel=0.15)
@@ -85,11 +85,12 @@ def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_g1():
 
 def calibrated_on(velocity, measured, **parameters):
     """A calibrator that was fed velocities (N, 3) and what the DVL made of them, once a second, without GNSS noise."""
-    calibrator = Calibrator(Parameters(**parameters), block_size=512)
-    for i, (v, g) in enumerate(zip(measured.tolist(), velocity.tolist(), strict=True)):
-        calibrator.feed_reference(ReferenceSample(i * SECOND, tuple(g)))
-        calibrator.feed_dvl(DvlSample(i * SECOND, tuple(v)))
-    return calibrator
+    samples = [
+        sample
+        for i, (v, g) in enumerate(zip(measured.tolist(), velocity.tolist(), strict=True))
+        for sample in (ReferenceSample(i * SECOND, tuple(g)), DvlSample(i * SECOND, tuple(v)))
+    ]
+    return calibrate(samples, Parameters(**parameters))
 
 
 def test_g1_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows(rng):
@@ -155,7 +156,7 @@ def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, sec
 
 def test_two_headings_tell_yaw_from_a_current(rng):
     samples = run_without_gnss((20.0, 200.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    calibrator = calibrate(samples, Parameters(current_std=0.3), block_size=512)
+    calibrator = calibrate(samples, Parameters(current_std=0.3))
     estimate = calibrator.estimate("A1")
     assert estimate.misalignment[2] == pytest.approx(0.04, abs=0.004)
     across = dict(zip(estimate.state_names, estimate.state, strict=True))
@@ -168,7 +169,7 @@ def test_two_headings_tell_yaw_from_a_current(rng):
 
 def test_one_heading_does_not_and_a1_says_so_and_falls_back_to_what_f1_says(rng):
     samples = run_without_gnss((20.0,), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    calibrator = calibrate(samples, block_size=512)
+    calibrator = calibrate(samples)
     a1, f1 = calibrator.estimate("A1"), calibrator.estimate("F1")
     yaw = a1.observability[2]
     assert not yaw.observed
@@ -180,7 +181,7 @@ def test_one_heading_does_not_and_a1_says_so_and_falls_back_to_what_f1_says(rng)
 
 def test_holding_depth_shows_pitch_however_the_vehicle_is_trimmed(rng):
     samples = run_without_gnss((20.0, 200.0), (0.0, 0.0), (0.0, 0.03, 0.0), rng, trim=np.deg2rad(-3.0))
-    estimates = calibrate(samples, block_size=512).result().estimates
+    estimates = calibrate(samples).result().estimates
     assert estimates["A1"].misalignment[1] == pytest.approx(0.03, abs=0.012)
     assert abs(estimates["M7"].misalignment[1] - 0.03) > 0.015
 
@@ -194,13 +195,13 @@ def test_without_attitude_a1_learns_nothing_and_the_others_are_not_kept_waiting(
 
 def test_no_number_of_headings_tells_yaw_better_than_a_vehicle_swims_straight(rng):
     samples = run_without_gnss((20.0, 200.0) * 4, (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    yaw = calibrate(samples, Parameters(current_std=0.3), block_size=512).estimate("A1").std[2]
+    yaw = calibrate(samples, Parameters(current_std=0.3)).estimate("A1").std[2]
     assert np.deg2rad(0.5) < yaw < np.deg2rad(0.7)
 
 
 def test_auto_runs_a1_once_headings_tell_a_current_from_the_mounting_and_says_so(rng):
     samples = run_without_gnss((20.0, 200.0, 20.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    calibrator = calibrate(samples, block_size=512)
+    calibrator = calibrate(samples)
     first, second = calibrator.selection.segments
     assert (first.model, second.model) == ("F1", "A1")
     assert 100.0 < 1e-9 * (second.from_ns - first.from_ns) < 200.0  # on the second heading
@@ -225,7 +226,7 @@ def test_with_gnss_headings_change_nothing():
 
 def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
     samples = run_without_gnss((20.0,), (0.0, 0.0), (0.0, 0.03, -0.04), rng, seconds_each=400)
-    calibrator = calibrate(samples, Parameters(current_std=0.05), block_size=512)
+    calibrator = calibrate(samples, Parameters(current_std=0.05))
     truth = np.array([0.0, 0.03, -0.04])
     errors = {name: np.abs(calibrator.estimate(name).misalignment - truth)[1:] for name in ("M7", "F1")}
     assert (errors["F1"] < 0.8 * errors["M7"]).all()
@@ -234,9 +235,7 @@ def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
 @pytest.mark.parametrize("name", ["A1", "F1"])
 def test_a_faster_dvl_does_not_make_the_models_of_motion_surer(name):
     run = MatchedRun("box", 300.0, dvl_std=0.01)
-    slow, fast = (
-        calibrate(make_samples(replace(run, dvl_every=every)), block_size=512).estimate(name) for every in (100, 10)
-    )
+    slow, fast = (calibrate(make_samples(replace(run, dvl_every=every))).estimate(name) for every in (100, 10))
     np.testing.assert_allclose(fast.std[:3], slow.std[:3], rtol=0.2)
 
 

@@ -71,7 +71,7 @@ def test_the_held_out_error_is_the_error_of_each_sample_with_the_state_that_has_
 def test_a_good_run_is_accepted_with_the_error_that_was_predicted():
     run = MatchedRun("box", 300.0, phi=(0.005, -0.01, 0.02), scale=0.003, gnss_std=0.05, dvl_std=0.01)
     parameters = Parameters(gnss_aided_std=np.hypot(0.05, 0.01))
-    calibrator = calibrate(make_samples(run), parameters, verified=True, block_size=512)
+    calibrator = calibrate(make_samples(run), parameters, verified=True)
     for name in ("M1", "G1"):
         verification = calibrator.verification(name)
         assert verification.verdict is Word.ACCEPT, verification.reasons
@@ -85,14 +85,14 @@ def test_a_good_run_is_accepted_with_the_error_that_was_predicted():
 def test_a_dvl_without_errors_is_not_rejected_for_what_correcting_nothing_adds():
     for seed in range(10):
         run = MatchedRun("box", 200.0, gnss_std=0.1, dvl_std=0.01, seed=seed)
-        calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.105), verified=True, block_size=512)
+        calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.105), verified=True)
         for name in ("G1", "F1"):  # of M3 it would be true: noise pulls its scale
             assert calibrator.verification(name).verdict is not Word.REJECT
 
 
 def test_a_receiver_noisier_than_it_says_makes_the_calibration_marginal():
     run = MatchedRun("box", 300.0, phi=(0.005, -0.01, 0.03), gnss_std=0.05)
-    calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.02), verified=True, block_size=512)
+    calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.02), verified=True)
     verification = calibrator.verification("M1")
     assert verification.verdict is Word.MARGINAL
     assert "noisier" in verification.reasons[0]
