@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -60,6 +61,11 @@ class MatchedRun:
 
 def make_samples(run: MatchedRun) -> list[DvlSample | ReferenceSample | ImuSample]:
     """All samples in order of stamps (of measurement), IMU first, then GNSS, then DVL."""
+    return list(_made(run))
+
+
+@cache
+def _made(run: MatchedRun) -> tuple[DvlSample | ReferenceSample | ImuSample, ...]:
     rng = np.random.default_rng(run.seed)
     motion = make_motion(run.trajectory, run.seconds, 100.0)
     mounting = rotation_from_rpy(run.mounting_rpy).T
@@ -81,7 +87,7 @@ def make_samples(run: MatchedRun) -> list[DvlSample | ReferenceSample | ImuSampl
             samples.append(ReferenceSample(stamp, tuple(reference[i].tolist()), None, run.frame))
         if i % run.dvl_every == 0:
             samples.append(DvlSample(stamp + run.dvl_late_ns, tuple(measured[i].tolist())))
-    return samples
+    return tuple(samples)
 
 
 def feed(calibrator: Calibrator, samples) -> Calibrator:

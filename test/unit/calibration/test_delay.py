@@ -170,7 +170,7 @@ def test_after_a_restart_the_state_is_that_of_a_calibration_that_began_there():
 
 def test_switching_by_hand_loses_nothing():
     samples = late(-1.4)
-    calibrator = Calibrator(NOISE.replace(model="M3"))
+    calibrator = Calibrator(NOISE.replace(model="M3"), block_size=64)
     feed(calibrator, samples)
     calibrator.set_parameters(NOISE.replace(model="G2"))
     assert calibrator.selected == "G2"
