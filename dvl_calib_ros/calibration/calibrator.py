@@ -467,7 +467,7 @@ class Calibrator:
                 self.parameters.rotation_dvl_from_body,
             )
         counts = (estimate.used, estimate.gated)
-        suggestion = self._delay.coarse.suggestion() if model.aided else None
+        suggestion = self._delay.suggestion if model.aided else ""
         return verify(
             model,
             state,
@@ -540,8 +540,7 @@ class Calibrator:
     @property
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
-        found = self._delay.coarse.suggestion()
-        return "" if found is None else found.says
+        return self._delay.suggestion
 
 
 def _own(block: AlignedBlock) -> AlignedBlock:

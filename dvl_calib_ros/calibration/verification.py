@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from .chi_square import chi2_isf
-from .coarse_mounting import Suggestion
 from .error_model import CORRECTION_JACOBIAN, correction_matrix
 from .folds import Moments
 from .frames import Array
@@ -132,7 +131,7 @@ def verify(
     held_out: HeldOutError | None,
     parameters: Parameters,
     used_and_gated: tuple[int, int] | None = None,
-    suggestion: Suggestion | None = None,
+    suggestion: str = "",
     reference_claims: bool = True,
 ) -> Verification:
     """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
@@ -145,13 +144,13 @@ def verify(
     held_out: What it did on samples that it had not seen; None for too few.
     parameters: The thresholds.
     used_and_gated: How many samples it used, and threw out; None where that is not known.
-    suggestion: What configuration would fit, if the one given does not.
+    suggestion: What configuration would fit, in words, if the one given does not.
     reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
 
     """
     findings = [
         *use_findings(used_and_gated),
-        *([(Word.REJECT, f"{suggestion.says}, not the configuration given")] if suggestion else []),
+        *([(Word.REJECT, f"{suggestion}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
         _error_finding(held_out, parameters, reference_claims),

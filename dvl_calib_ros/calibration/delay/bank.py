@@ -147,12 +147,17 @@ class DelayBank:
         """Mean νᵀS⁻¹ν of the samples used, against the hypothesis that explained each best; nan if none."""
         return self._nis_sum / self.used if self.used else float("nan")
 
-    def add(self, rows: DelayedRows, folds: NDArray[np.int64], seconds: float) -> None:
-        """Take the rows of a block of time. folds: (J,) of each row. seconds: its length."""
+    @property
+    def likeliest_delay(self) -> float:
+        """Of the hypotheses, s."""
+        return float(DELAYS_S[int(np.argmax(self._shares()[1]))])
+
+    def add(self, rows: DelayedRows, folds: NDArray[np.int64], seconds: float) -> Mask:
+        """Take the rows of a block of time; which (J,) of them it used. folds: (J,) of each row. seconds: of it."""
         if self._process_rate is not None:
             self._drift(seconds)
         if not len(rows):
-            return
+            return np.zeros(0, dtype=bool)
         use = self._gated(rows)
         before = np.linalg.slogdet(self._information)[1]
         total, total_vector = np.zeros_like(self._information), np.zeros_like(self._vector)
@@ -164,7 +169,7 @@ class DelayBank:
             total_vector += told[1]
             square += told[2]
         if not (np.isfinite(total).all() and np.isfinite(total_vector).all() and np.isfinite(square).all()):
-            return  # it goes on as before these rows
+            return np.zeros(len(rows), dtype=bool)  # it goes on as before these rows
         self._square += square
         self._information += total
         self._regressor_noise += rows.weight[use] @ rows.regressor_noise[use]
@@ -175,6 +180,7 @@ class DelayBank:
             for fold, (information, vector, _) in by_fold:
                 self._folds[0][fold] += information
                 self._folds[1][fold] += vector
+        return use
 
     def _drift(self, seconds: float) -> None:
         """Random walk over so many seconds: P grows, x stays, and so does the misfit."""

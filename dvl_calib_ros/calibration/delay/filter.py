@@ -28,6 +28,7 @@ from ..tables import Table
 from ..verification import HeldOutError
 from .bank import DayState, DelayBank, Posterior
 from .hold_out import NOT_MEASURED, Kept, Recording, held_out_error, thinned
+from .reference_clock import ReferenceClock
 from .rows import (
     BEYOND,
     DELAY,
@@ -105,6 +106,7 @@ class DelayFilter:
             assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
         )
         self.coarse = CoarseFits(parameters.rotation_dvl_from_body)
+        self._reference_clock = ReferenceClock(parameters)
         self.heave = HeaveWaves(parameters.rotation_dvl_from_body)
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
@@ -167,6 +169,15 @@ class DelayFilter:
         p = prior.p.copy()
         p[:n, :n] = base.p
         return GaussianState(np.concatenate([base.x, prior.x[n:]]), p)
+
+    @property
+    def suggestion(self) -> str:
+        """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
+        found = self.coarse.suggestion()
+        if found is not None:
+            return found.says
+        late = self._reference_clock.found()
+        return "" if late is None else late.says(self._parameters)
 
     @property
     def evidence(self) -> Evidence:
@@ -241,6 +252,7 @@ class DelayFilter:
             if starts_ns[len(self._day_starts_ns)] - LONGEST_DELAY_NS >= block_ns + BLOCK_NS:
                 return
             self._bank.end_day()
+            self._reference_clock.start()
             self._day_starts_ns.append(block_ns)
             self._changed = True
 
@@ -294,8 +306,9 @@ class DelayFilter:
         if len(dvl.times) < 6 or len(imu.times) < 2:
             return False
         p = self._parameters
+        binned_dvl = DvlColumns(*binned(*dvl))
         rows = delayed_rows(
-            DvlColumns(*binned(*dvl)),
+            binned_dvl,
             reference,
             imu,
             noise_dvl=noise_dvl,
@@ -305,7 +318,10 @@ class DelayFilter:
             max_turn_rate=p.max_turn_rate,
             imu_gap_s=p.imu_timeout,
         )
-        self._bank.add(rows, folds_of(stamps_ns[rows.index], p), BLOCK_NS * 1e-9)
+        used = self._bank.add(rows, folds_of(stamps_ns[rows.index], p), BLOCK_NS * 1e-9)
+        self._reference_clock.add(
+            binned_dvl, reference.part(rows.index[used]), imu, noise_dvl, self._bank.likeliest_delay
+        )
         return len(rows) > 0
 
     def _dvl_is_silent(self, stamp_ns: int) -> bool:

@@ -62,6 +62,10 @@ class ReferenceColumns(NamedTuple):
     in_body: Mask
     claimed: Mask
 
+    def part(self, at: Index) -> ReferenceColumns:
+        """Some of them."""
+        return ReferenceColumns(self.times[at], self.velocity[at], self.noise[at], self.in_body[at], self.claimed[at])
+
 
 class ImuColumns(NamedTuple):
     """times (M,) s, orientation (M, 4) quaternion (x, y, z, w) enu from body, angular_velocity (M, 3) rad/s, body."""
@@ -111,7 +115,7 @@ def delayed_rows(
     parameters. imu_gap_s: longest gap that is interpolated across.
     """
     times = reference.times
-    turning, turning_noise = _angular_velocity(imu, times, imu_gap_s)
+    turning, turning_noise = angular_velocity_at(imu, times, imu_gap_s)
     seen = _in_body(reference, imu, imu_gap_s)
     body, noise, earth = seen.velocity, seen.noise, seen.earth_in_body
     moving = (body**2).sum(axis=1) >= min_speed**2
@@ -249,7 +253,7 @@ def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     )
 
 
-def _angular_velocity(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Array]:
+def angular_velocity_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Array]:
     """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (3,)."""
     known = ~np.isnan(imu.angular_velocity).any(axis=1)
     if np.count_nonzero(known) < 2:

@@ -1,0 +1,193 @@
+"""Which clock is late: the DVL's, the reference's, or the IMU's. G2 takes it to be the DVL's.
+
+Where the reference is stamped ρ late and the DVL τ late, velocities agree at stamps δ = τ - ρ apart, and that is what
+G2 finds. Attitude and angular velocity belong to the reference's own time, ρ before its stamp: in a turn of ω at speed
+u the wrong one turns its velocity by ω ρ, which a lever arm of ρ u explains almost as well. When turns begin and end
+tells them apart. So at a row of ρ, and of δ about what G2 finds, samples are compared by least squares each; horizontal
+only, so nothing is assumed of heave.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..frames import Array, skew
+from ..parameters import Parameters
+from .local_motion import local_fit, reach_at, spacing_at
+from .rows import (
+    LEAST_SLOPE_REACH_S,
+    MOST_REACH_S,
+    DvlColumns,
+    ImuColumns,
+    ReferenceColumns,
+    angular_velocity_at,
+    attitude_at,
+)
+
+# Evidence over ρ is a parabola as long as that is short beside a turn's beginning.
+LATE_S: Array = 0.4 * np.arange(-3, 4)
+ON_TIME = 3
+# δ shifts by half as much as ρ, and each is linear in what it is more.
+ABOUT_S: Array = np.array([-0.4, 0.0, 0.4])
+CELL_STD_S = 0.3
+# G2's delay may move so far about what this one began with.
+MOVED_S = 0.5
+# References closer together than this tell no more of a clock.
+EVERY_S = 0.35
+# Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
+# of an inertial navigation are late by less (five real recordings: 0.03 to 0.07 s).
+SAID_FROM_S = 0.1
+# Gain in log evidence from which it is said, as for G2 itself (chi-square 30).
+SAID_FROM_EVIDENCE = 15.0
+# A clock that is less off than this is right, as far as what is said goes.
+RIGHT_S = 0.1
+# dM (2, 3), lever arm (3), δ beyond the hypothesis' own, constant error of the reference (2).
+_N = 12
+_ARM, _DELAY, _OFFSET = slice(6, 9), 9, slice(10, 12)
+
+
+class LateClocks(NamedTuple):
+    """By how much the stamps of reference and DVL are late beside the IMU's, s, beyond what the parameters say.
+
+    at_least: whether the reference's is more than was looked for.
+    """
+
+    reference: float
+    dvl: float
+    at_least: bool
+
+    def says(self, parameters: Parameters) -> str:
+        """What configuration would fit, in words."""
+        late, of_dvl, p = self.reference, self.dvl, parameters
+        if self.at_least:
+            way = "late" if late > 0.0 else "early"
+            value = round(p.reference_time_offset + late, 2)
+            return (
+                f"the data fit a reference whose stamps are {abs(late):.1f} s {way} or more (look again with "
+                f"reference_time_offset: {value:g})"
+            )
+        reference = f"reference_time_offset: {round(p.reference_time_offset + late, 2):g}"
+        if abs(of_dvl - late) < RIGHT_S:
+            way = "early" if late > 0.0 else "late"
+            value = round(p.imu_time_offset - late, 2)
+            return f"the data fit an IMU whose stamps are {abs(late):.2f} s {way} (imu_time_offset: {value:g})"
+        way = "late" if late > 0.0 else "early"
+        if abs(of_dvl) < RIGHT_S:
+            return (
+                f"the data fit a reference whose stamps are {abs(late):.2f} s {way}, and a DVL that is in time "
+                f"({reference})"
+            )
+        way_of_dvl = "late" if of_dvl > 0.0 else "early"
+        return (
+            f"the data fit a reference whose stamps are {abs(late):.2f} s {way}, and a DVL whose stamps are "
+            f"{abs(of_dvl):.2f} s {way_of_dvl} ({reference})"
+        )
+
+
+class ReferenceClock:
+    """Sums of least squares at each ρ and δ, from the blocks since G2's delay last changed; constant memory."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._p = parameters
+        std = np.full(_N, parameters.initial_std_misalignment)
+        std[[0, 4]] = parameters.initial_std_scale
+        std[_ARM], std[_DELAY], std[_OFFSET] = (
+            parameters.initial_std_lever_arm, CELL_STD_S, parameters.reference_offset_std,
+        )  # fmt: skip
+        self._prior = np.diag(std**-2.0)
+        self.start()
+
+    def start(self) -> None:
+        """Start anew."""
+        shape = len(LATE_S), len(ABOUT_S)
+        self._around: float | None = None
+        self._information = np.broadcast_to(self._prior, (*shape, _N, _N)).copy()
+        self._vector = np.zeros((*shape, _N))
+        self._square = np.zeros(shape)
+        self._rows = 0.0
+
+    def add(
+        self, dvl: DvlColumns, reference: ReferenceColumns, imu: ImuColumns, noise_dvl: Array, delay: float
+    ) -> None:
+        """Take a block's references that are no outliers.
+
+        noise_dvl: (3, 3) (m/s)². delay: s, that G2 finds likeliest.
+        """
+        if self._around is None or abs(delay - self._around) > MOVED_S:
+            self.start()
+            self._around = delay
+        times = reference.times
+        if len(times) < 2:
+            return
+        first = np.flatnonzero(np.diff(np.floor(times / EVERY_S), prepend=-np.inf))
+        reference = reference.part(first)
+        times = reference.times
+        at = (self._around + ABOUT_S)[:, None] + times
+        spacing = spacing_at(dvl.times, times)
+        reach = np.clip(reach_at(spacing, LEAST_SLOPE_REACH_S, MOST_REACH_S), LEAST_SLOPE_REACH_S, None)
+        fit = local_fit(dvl.times, dvl.velocity, at.ravel(), np.tile(reach, len(at)))
+        body_from_dvl = self._p.rotation_dvl_from_body.T
+        measured = (fit.value @ body_from_dvl.T).reshape(*at.shape, 3)
+        slope = (fit.slope @ body_from_dvl.T).reshape(*at.shape, 3)
+        own = (times - LATE_S[:, None]).ravel()
+        shape = len(LATE_S), len(times)
+        rotation, oriented = attitude_at(imu, own, self._p.imu_timeout)
+        rates = angular_velocity_at(imu, own, self._p.imu_timeout)[0].reshape(*shape, 3)
+        to_body = rotation.swapaxes(1, 2).reshape(*shape, 3, 3)
+        to_body = np.where(reference.in_body[:, None, None], np.eye(3), to_body)
+        body = np.matmul(to_body, reference.velocity[..., None])[..., 0] + np.cross(rates, self._p.lever_arm)
+        known = fit.found.reshape(at.shape).all(axis=0)
+        known &= (oriented.reshape(shape) | reference.in_body).all(axis=0) & ~np.isnan(rates).any(axis=(0, 2))
+        known &= (measured[1] ** 2).sum(axis=1) >= self._p.min_speed**2
+        if not known.any():
+            return
+        added = np.where(reference.claimed, np.trace(noise_dvl) / 3.0, 0.0)
+        # the vertical may not be measured
+        horizontal = np.sort(np.diagonal(reference.noise, axis1=1, axis2=2), axis=1)[:, :2]
+        interval = np.minimum(np.diff(times, prepend=times[:1] - EVERY_S), spacing)
+        weight = (interval / spacing / (horizontal.mean(axis=1) + added))[known]
+        self._sum(measured[:, known], slope[:, known], body[:, known], rates[:, known],
+                  (to_body * ~reference.in_body[:, None, None])[:, known], weight)  # fmt: skip
+
+    def _sum(self, measured: Array, slope: Array, body: Array, rates: Array, to_body: Array, weight: Array) -> None:
+        """measured, slope: (D, J, 3). body, rates: (R, J, 3). to_body: (R, J, 3, 3). weight: (J,)."""
+        n_late, n_about, n = len(LATE_S), len(ABOUT_S), len(weight)
+        h = np.zeros((n_late, n_about, n, 2, _N))
+        h[..., 0, 0:3] = h[..., 1, 3:6] = measured
+        h[..., _ARM] = -skew(rates)[:, None, :, :2]
+        h[..., _DELAY] = slope[..., :2]
+        h[..., _OFFSET] = to_body[:, None, :, :2, :2]
+        z = body[:, None, :, :2] - measured[..., :2]
+        weighted = (h * weight[:, None, None]).reshape(n_late, n_about, 2 * n, _N).swapaxes(2, 3)
+        self._information += weighted @ h.reshape(n_late, n_about, 2 * n, _N)
+        self._vector += (weighted @ z.reshape(n_late, n_about, 2 * n, 1))[..., 0]
+        self._square += np.einsum("rdji,rdji,j->rd", z, z, weight)
+        self._rows += 2.0 * n
+
+    def found(self) -> LateClocks | None:
+        """Both clocks, where the reference's is off beyond doubt; else None."""
+        if self._around is None or self._rows < 4.0 * _N:
+            return None
+        x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
+        misfit = self._square - np.einsum("rdi,rdi->rd", x, self._vector)
+        level = max(1.0, float(misfit.min()) / (self._rows - _N))
+        evidence = -0.5 * (misfit / level + np.linalg.slogdet(self._information)[1])
+        by_about = evidence.argmax(axis=1)
+        each = evidence.max(axis=1)
+        delay = self._around + ABOUT_S[by_about] + x[np.arange(len(each)), by_about, _DELAY]
+        best = int(np.argmax(each))
+        if best in (0, len(each) - 1):
+            if each[best] - each[ON_TIME] < SAID_FROM_EVIDENCE:
+                return None
+            return LateClocks(float(LATE_S[best]), float(delay[best] + LATE_S[best]), at_least=True)
+        step = float(LATE_S[1] - LATE_S[0])
+        before, top, after = each[best - 1 : best + 2].tolist()
+        beyond = 0.5 * (before - after) / (before - 2.0 * top + after)
+        late = float(LATE_S[best]) + step * beyond
+        gained = top - 0.25 * (before - after) * beyond - each[ON_TIME]
+        if abs(late) < SAID_FROM_S or gained < SAID_FROM_EVIDENCE:
+            return None
+        own = float(delay[best]) + beyond * float(delay[best + 1] - delay[best - 1]) / 2.0
+        return LateClocks(late, own + late, at_least=False)

@@ -1,0 +1,84 @@
+"""Which clock is late: the DVL's, which G2 finds; the reference's or the IMU's, which is said and not averaged."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from runs import calibrate
+from test_delay import LEVER_ARM, NOISE, late
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.samples import ImuSample, ReferenceSample
+
+
+def stamped_late(samples, kind, seconds):
+    """The same with one stream's stamps late."""
+    shift_ns = round(seconds * 1e9)
+    moved = (s._replace(stamp_ns=s.stamp_ns + shift_ns) if isinstance(s, kind) else s for s in samples)
+    return sorted(moved, key=lambda sample: sample.stamp_ns)
+
+
+@cache
+def found(dvl: float = 0.0, reference: float = 0.0, imu: float = 0.0) -> Calibrator:
+    """What is made of a run whose streams are late by so many seconds; not to be fed any more."""
+    samples = stamped_late(stamped_late(late(dvl), ReferenceSample, reference), ImuSample, imu)
+    return calibrate(samples, NOISE, verified=True)
+
+
+@pytest.mark.parametrize("dvl", [0.0, -1.4, 0.9])
+def test_a_late_dvl_is_no_late_reference(dvl):
+    assert found(dvl=dvl).suggestion == ""
+    assert found(dvl=dvl).verification("G2").verdict.value == "accept"
+
+
+@pytest.mark.parametrize("reference", [0.6, -0.6, 0.2])
+def test_a_late_reference_is_named_and_the_lever_arm_that_it_bends_is_rejected(reference):
+    """The lever arm came out 0.9 m off with a good word for it."""
+    calibrator = found(reference=reference)
+    bent = calibrator.estimate("G2").state[8] - LEVER_ARM[0]
+    assert abs(bent) > 0.2
+    way = "late" if reference > 0.0 else "early"
+    said = calibrator.suggestion
+    assert said.startswith("the data fit a reference whose stamps are")
+    assert f"{way}, and a DVL that is in time" in said
+    assert offset_named(said, "reference_time_offset") == pytest.approx(reference, abs=0.05)
+    verification = calibrator.verification("G2")
+    assert verification.verdict.value == "reject"
+    assert f"{said}, not the configuration given" in verification.reasons[0]
+
+
+def offset_named(sentence: str, parameter: str) -> float:
+    return float(sentence.split(f"{parameter}: ")[1].rstrip(")"))
+
+
+def test_what_it_says_makes_the_calibration_right():
+    samples = stamped_late(late(0.0), ReferenceSample, 0.6)
+    offset = offset_named(found(reference=0.6).suggestion, "reference_time_offset")
+    calibrator = calibrate(samples, NOISE.replace(reference_time_offset=offset), verified=True)
+    assert calibrator.suggestion == ""
+    assert calibrator.verification("G2").verdict.value == "accept"
+    np.testing.assert_allclose(calibrator.estimate("G2").state[8:10], LEVER_ARM[:2], atol=0.1)
+
+
+def test_two_late_clocks_are_told_apart():
+    said = found(dvl=-0.5, reference=0.6).suggestion
+    assert "a reference whose stamps are 0.6" in said
+    assert "a DVL whose stamps are 0.4" in said or "a DVL whose stamps are 0.5" in said
+    assert "early" in said
+
+
+def test_a_late_imu_is_not_put_down_to_the_two_others():
+    said = found(imu=0.5).suggestion
+    assert "an IMU whose stamps are 0.5" in said and "late" in said
+    assert offset_named(said, "imu_time_offset") == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_reference_later_than_is_looked_for_is_said_to_be_so():
+    assert "1.2 s late or more (look again with reference_time_offset: 1.2)" in found(reference=2.0).suggestion
+
+
+def test_how_samples_are_gathered_changes_nothing_about_clocks():
+    samples = stamped_late(late(0.0), ReferenceSample, 0.6)
+    assert calibrate(samples, NOISE, block_size=400).suggestion == found(reference=0.6).suggestion
