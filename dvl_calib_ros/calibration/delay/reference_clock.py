@@ -15,6 +15,7 @@ import numpy as np
 
 from ..frames import Array, skew
 from ..parameters import Parameters
+from ..time_blocks import FEWEST, TimeBlocks
 from .local_motion import local_fit, reach_at, spacing_at
 from .rows import (
     LEAST_SLOPE_REACH_S,
@@ -39,51 +40,53 @@ EVERY_S = 0.35
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
 # of an inertial navigation are late by less (five real recordings: 0.03 to 0.07 s).
 SAID_FROM_S = 0.1
-# Gain in log evidence from which it is said: chi-square 16, by chance once in 20 000 times.
-SAID_FROM_EVIDENCE = 8.0
+# Gain in log evidence, tempered by what blocks of time show, from which it is said: three σ.
+SAID_FROM_EVIDENCE = 4.5
+# By how much noise that lasts may raise σ, where there are too few blocks to say.
+UNKNOWN_INFLATION = 3.0
 # A clock that is less off than this is right, as far as what is said goes.
 RIGHT_S = 0.1
 # dM (2, 3), lever arm (3), δ beyond the hypothesis' own, constant error of the reference (2).
 _N = 12
 _ARM, _DELAY, _OFFSET = slice(6, 9), 9, slice(10, 12)
+_SHOWS = [6, 7, 9]
 
 
 class LateClocks(NamedTuple):
     """By how much the stamps of reference and DVL are late beside the IMU's, s, beyond what the parameters say.
 
-    at_least: whether the reference's is more than was looked for.
+    dvl_std: of the DVL's. at_least: whether the reference's is more than was looked for.
     """
 
     reference: float
     dvl: float
+    dvl_std: float
     at_least: bool
 
     def says(self, parameters: Parameters) -> str:
-        """What configuration would fit, in words."""
-        late, of_dvl, p = self.reference, self.dvl, parameters
+        """What configuration would fit, in words: of one clock that is wrong, if that can be."""
+        late, p = self.reference, parameters
+        of_reference = f"reference_time_offset: {round(p.reference_time_offset + late, 2):g}"
+        of_imu = f"imu_time_offset: {round(p.imu_time_offset - late, 2):g}"
         if self.at_least:
-            way = "late" if late > 0.0 else "early"
-            value = round(p.reference_time_offset + late, 2)
             return (
-                f"the data fit a reference whose stamps are {abs(late):.1f} s {way} or more (look again with "
-                f"reference_time_offset: {value:g})"
+                f"the data fit a reference whose stamps are {_late(late, 1)} or more (look again with {of_reference})"
             )
-        reference = f"reference_time_offset: {round(p.reference_time_offset + late, 2):g}"
-        if abs(of_dvl - late) < RIGHT_S:
-            way = "early" if late > 0.0 else "late"
-            value = round(p.imu_time_offset - late, 2)
-            return f"the data fit an IMU whose stamps are {abs(late):.2f} s {way} (imu_time_offset: {value:g})"
-        way = "late" if late > 0.0 else "early"
-        if abs(of_dvl) < RIGHT_S:
+        doubt = max(RIGHT_S, 2.0 * self.dvl_std)
+        is_reference, is_imu = abs(self.dvl) < doubt, abs(self.dvl - late) < doubt
+        if is_reference and is_imu:
             return (
-                f"the data fit a reference whose stamps are {abs(late):.2f} s {way}, and a DVL that is in time "
-                f"({reference})"
+                f"the data fit stamps of the reference that are {_late(late)}, or of the IMU that are {_late(-late)} "
+                f"({of_reference}, or {of_imu})"
             )
-        way_of_dvl = "late" if of_dvl > 0.0 else "early"
-        return (
-            f"the data fit a reference whose stamps are {abs(late):.2f} s {way}, and a DVL whose stamps are "
-            f"{abs(of_dvl):.2f} s {way_of_dvl} ({reference})"
-        )
+        if is_imu:
+            return f"the data fit an IMU whose stamps are {_late(-late)} ({of_imu})"
+        dvl = "that is in time" if is_reference else f"whose stamps are {_late(self.dvl)}"
+        return f"the data fit a reference whose stamps are {_late(late)}, and a DVL {dvl} ({of_reference})"
+
+
+def _late(seconds: float, digits: int = 2) -> str:
+    return f"{abs(seconds):.{digits}f} s {'late' if seconds > 0.0 else 'early'}"
 
 
 class ReferenceClock:
@@ -106,7 +109,7 @@ class ReferenceClock:
         self._information = np.broadcast_to(self._prior, (*shape, _N, _N)).copy()
         self._vector = np.zeros((*shape, _N))
         self._square = np.zeros(shape)
-        self._rows = 0.0
+        self._blocks = TimeBlocks()
 
     def add(
         self, dvl: DvlColumns, reference: ReferenceColumns, imu: ImuColumns, noise_dvl: Array, delay: float
@@ -161,33 +164,45 @@ class ReferenceClock:
         h[..., _OFFSET] = to_body[:, None, :, :2, :2]
         z = body[:, None, :, :2] - measured[..., :2]
         weighted = (h * weight[:, None, None]).reshape(n_late, n_about, 2 * n, _N).swapaxes(2, 3)
-        self._information += weighted @ h.reshape(n_late, n_about, 2 * n, _N)
-        self._vector += (weighted @ z.reshape(n_late, n_about, 2 * n, 1))[..., 0]
+        information = weighted @ h.reshape(n_late, n_about, 2 * n, _N)
+        vector = (weighted @ z.reshape(n_late, n_about, 2 * n, 1))[..., 0]
+        self._blocks.add(information.reshape(-1, _N, _N), vector.reshape(-1, _N), 2.0 * n)
+        self._information += information
+        self._vector += vector
         self._square += np.einsum("rdji,rdji,j->rd", z, z, weight)
-        self._rows += 2.0 * n
 
     def found(self) -> LateClocks | None:
         """Both clocks, where the reference's is off beyond doubt; else None."""
-        if self._around is None or self._rows < 4.0 * _N:
+        if self._around is None or self._blocks.weight < 4.0 * _N:
             return None
         x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
         misfit = self._square - np.einsum("rdi,rdi->rd", x, self._vector)
-        level = max(1.0, float(misfit.min()) / (self._rows - _N))
+        level = max(1.0, float(misfit.min()) / (self._blocks.weight - _N))
+        # noise that lasts makes more evidence of itself than white noise, by as much as σ of lever arm and delay say
+        inflation = UNKNOWN_INFLATION
+        if len(self._blocks.kept) >= FEWEST:
+            likeliest = int(misfit.argmin())
+            own = np.linalg.inv(self._information.reshape(-1, _N, _N)[likeliest])
+            inflation = float(self._blocks.inflation(likeliest, x.reshape(-1, _N)[likeliest], own)[_SHOWS].max())
+        level *= inflation**2
         evidence = -0.5 * (misfit / level + np.linalg.slogdet(self._information)[1])
-        by_about = evidence.argmax(axis=1)
         each = evidence.max(axis=1)
-        delay = self._around + ABOUT_S[by_about] + x[np.arange(len(each)), by_about, _DELAY]
+        share = np.exp(evidence - each[:, None])
+        share /= share.sum(axis=1, keepdims=True)
+        delays = self._around + ABOUT_S + x[..., _DELAY]
+        delay = (share * delays).sum(axis=1)
+        variance = np.linalg.inv(self._information)[..., _DELAY, _DELAY] * level + (delays - delay[:, None]) ** 2
+        std = np.sqrt((share * variance).sum(axis=1))
         best = int(np.argmax(each))
         if best in (0, len(each) - 1):
             if each[best] - each[ON_TIME] < SAID_FROM_EVIDENCE:
                 return None
-            return LateClocks(float(LATE_S[best]), float(delay[best] + LATE_S[best]), at_least=True)
-        step = float(LATE_S[1] - LATE_S[0])
+            return LateClocks(float(LATE_S[best]), float(delay[best] + LATE_S[best]), float(std[best]), at_least=True)
         before, top, after = each[best - 1 : best + 2].tolist()
         beyond = 0.5 * (before - after) / (before - 2.0 * top + after)
-        late = float(LATE_S[best]) + step * beyond
+        late = float(LATE_S[best]) + float(LATE_S[1] - LATE_S[0]) * beyond
         gained = top - 0.25 * (before - after) * beyond - each[ON_TIME]
         if abs(late) < SAID_FROM_S or gained < SAID_FROM_EVIDENCE:
             return None
-        own = float(delay[best]) + beyond * float(delay[best + 1] - delay[best - 1]) / 2.0
-        return LateClocks(late, own + late, at_least=False)
+        apart = float(delay[best]) + beyond * float(delay[best + 1] - delay[best - 1]) / 2.0
+        return LateClocks(late, apart + late, float(std[best]), at_least=False)
