@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.comparison import compare
-from dvl_calib_ros.calibration.frames import FLU_FROM_FRD
+from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
@@ -102,12 +102,14 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
         import_recording(dvl, None, attitude, tmp_path / name, ImportOptions())
         result = replay([tmp_path / name], Parameters()).result
         estimate = result.estimates["A1"]
-        errors.append(np.degrees(estimate.state[2]) - YAW_DEG)
+        _, _, yaw = rpy_from_rotation(estimate.rotation_body_from_dvl(np.eye(3)))  # of the DVL, as YAW_DEG: not φ
+        errors.append(np.degrees(yaw) - YAW_DEG)
         sigmas.append(np.degrees(estimate.std[2]))
         selected.append(result.selected)
     error, scaled = np.array(errors), np.array(errors) / sigmas
-    assert np.median(np.abs(error)) < 0.25
-    assert np.sqrt(np.mean(error**2)) < 0.6
+    print("A1, deg:", np.round(error, 2), np.median(np.abs(error)), *(np.sqrt(np.mean(x**2)) for x in (error, scaled)))
+    assert np.median(np.abs(error)) < 0.32
+    assert np.sqrt(np.mean(error**2)) < 0.52
     assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.1
     assert selected.count("A1") >= 9
 
