@@ -12,11 +12,12 @@ import numpy as np
 
 from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.frames import Array
+from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.estimation import SensorData, aligned
+from dvl_calib_ros.evaluation.estimation import SensorData, aligned, heave_joined
 from dvl_calib_ros.evaluation.evaluate import DEFAULTS
 from dvl_calib_ros.evaluation.procedure import Procedure, corrections, run_seed, sensor_data
 from dvl_calib_ros.evaluation.trajectories import load_folder, own_trajectories
@@ -116,7 +117,11 @@ def _calibrate(model: Model, data: SensorData, parameters: Parameters, ends: Seq
             peer.predict()
             if used[i]:
                 peer.update(given.z[0, i, :m, None], R=r[i], H=given.h[0, i, :m])
-        yield corrections(model, assembler.state(0, peer.x[:, 0], peer.P))
+        state = GaussianState(peer.x[None, None, :, 0], peer.P[None, None])
+        if model.heave is not None:
+            rows, stamps_ns = assembler.heave_rows(seen)[None], variants.rows.stamps_ns[None]
+            state = heave_joined(state, stamps_ns, rows, used[None], usable, parameters, [end])
+        yield corrections(model, assembler.state(0, state.x[0, 0], state.p[0, 0]))
 
 
 def _vrmse(data: SensorData, index: int, matrix: Array) -> float:

@@ -9,7 +9,6 @@ import numpy as np
 
 from .comparison import date
 from .findings import Finding, finding
-from .heave_waves import Heave
 from .results import DAYS_OF, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
@@ -98,11 +97,6 @@ def consistency_advice(estimate: Estimate) -> list[Finding]:
     if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
-
-
-def heave_advice(heave: Heave | None) -> list[Finding]:
-    """Whether the vehicle heaves in waves, by more than is assumed."""
-    return [] if heave is None else [finding("HEAVE_WAVES", std=heave.std, period=heave.period)]
 
 
 def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Finding]:

@@ -91,6 +91,15 @@ class Assembler:
         noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
         return kalman.Measurements(z, h, noise, own_weight, usable, gate)
 
+    def heave_rows(self, seen: Observations) -> Array:
+        """(H, z) (N, K, n+1) of models that have `Model.heave`."""
+        rows = np.zeros((len(seen.velocity_dvl), len(self.models), self._n + 1))
+        for index, model in enumerate(self.models):
+            assert model.heave is not None
+            own = model.heave(seen)  # as in `measurements`
+            rows[:, index, : own.shape[1] - 1], rows[:, index, -1] = own[:, :-1], own[:, -1]
+        return rows
+
     def rows_left(self, unmeasured: Unmeasured) -> Array:
         """Rows that each model is told by each sample (K, N)."""
         dropped = [_dropped_axes(model, unmeasured).sum(axis=1) for model in self.models]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from . import kalman
 from .assembly import Assembler
 from .folds import FOLDS, FoldInformation, Moments, folds_of, on_another_day
 from .frames import Array
+from .heave import HeaveRows, HeaveSums, with_heave
 from .history import Counts, Standing
 from .kalman import GaussianState
 from .models import Model, Needs
@@ -62,7 +64,8 @@ def groups_of(
     alike: dict[object, list[Model]] = {}
     for model in models:
         of_day = tuple(model.of_day.tolist())
-        kind = (model.needs, model.n_state, model.n_measurement, model.noise, model.motion_is_noise, of_day)
+        rows = (model.n_state, model.n_measurement, model.noise, model.heave)
+        kind = (model.needs, rows, model.motion_is_noise, of_day)
         alike.setdefault(kind, []).append(model)
     return tuple(Group(group, parameters, initial, verified) for group in alike.values())
 
@@ -92,6 +95,7 @@ class Group:
         self._of_day = models[0].of_day
         still = self._assembler.process_rate is None
         self._scatter = BlockScatter(self._x, self._p, BLOCK_S) if still else None
+        self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
         self._states: dict[str, GaussianState] = {}
         self._sound: dict[str, GaussianState] = {}  # the last that could be published
         self._last_stamp_ns: int | None = None
@@ -115,19 +119,23 @@ class Group:
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp) if self._scatter is None else self._scatter.cuts(stamps_ns)
         every = ends if not len(cuts) else np.union1d(cuts, [] if ends is None else ends).astype(np.intp)
-        after = self._after(data, process, every)
+        if self._heave is None:
+            after = self._after(data, process, every)
+            self._x, self._p, states = after.x, after.p, after.at
+        else:
+            after, states = self._with_heave(stamps_ns, self._assembler.heave_rows(seen), data, process, every)
         if self._scatter is not None and len(cuts):
-            assert every is not None and after.at is not None
+            assert every is not None and after.at is not None and states is not None
             at = np.searchsorted(every, cuts)
-            self._scatter.add(after.at.x[at], after.at.p[at])
-        self._x, self._p = after.x, after.p
+            last = GaussianState(states.x[at[-1]], states.p[at[-1]])
+            self._scatter.add(after.at.x[at], after.at.p[at], last)
         self._states.clear()
         if self._folds is not None:
             folds = folds_of(stamps_ns, self._parameters)
             self._folds.add(folds, data, after.used)
             if self.needs is Needs.REFERENCE:
                 self.moments.add(folds, seen)
-        standing = None if ends is None or every is None else self._standing_at(after, ends, every)
+        standing = None if ends is None or every is None else self._standing_at(after, states, ends, every)
         n_used = after.used.sum(axis=1)
         self._used += n_used
         self._gated += data.usable.sum(axis=1) - n_used
@@ -144,12 +152,48 @@ class Group:
             return
         before = GaussianState(self._x, self._p)
         after = on_another_day(before, self._assembler.prior, self._of_day)
+        self._x, self._p = after
         if self._scatter is not None:
-            self._scatter.end_day(before, after, self._of_day)
+            self._scatter.end_day(before, after, self._of_day, self._now())
         if self._folds is not None:
             self._folds.end_day(self._assembler.prior, self._of_day)
-        self._x, self._p = after
         self._states.clear()
+
+    def _with_heave(
+        self, stamps_ns: Stamps, rows: Array, data: kalman.Measurements, process: Array | None, every: Ends | None
+    ) -> tuple[kalman.Updated, GaussianState | None]:
+        """Take a block, and its rows of heave; the filter's states, and with heave those after `every` samples."""
+        assert self._heave is not None
+        n_samples = len(stamps_ns)
+        # under a random walk what a row tells ages with the rest: it goes into the filter where its block ends
+        starts = self._heave.starts(stamps_ns) if process is not None else np.zeros(0, dtype=np.intp)
+        cuts = sorted({0, n_samples, *starts.tolist()})
+        wanted = np.zeros(0, dtype=np.intp) if every is None else every
+        parts, found = [], []
+        for start, end in pairwise(cuts):
+            if start in starts:
+                self._heave.close()
+                self._absorb_heave()
+            own = wanted[(wanted > start) & (wanted <= end) | (wanted == 0) & (start == 0)] - start
+            at = slice(start, end)
+            after = self._after(data.part(at), None if process is None else process[at], own if len(own) else None)
+            sums = self._heave.add(stamps_ns[at], rows[at], after.used[0], own.tolist())
+            self._x, self._p = after.x, after.p
+            parts.append(after)
+            if after.at is not None:
+                found.append(_joined(after.at, HeaveSums.stacked(sums), self._parameters.motion_std))
+        states = GaussianState(*map(np.concatenate, zip(*found, strict=True))) if found else None
+        return kalman.one_after_another(parts), states
+
+    def _absorb_heave(self) -> None:
+        assert self._heave is not None
+        sums, by_fold = self._heave.absorb()
+        with suppress(np.linalg.LinAlgError):
+            state, variance = with_heave(GaussianState(self._x, self._p), sums, self._parameters.motion_std)
+            if _is_sound(*state):
+                self._x, self._p = state
+                if self._folds is not None:
+                    self._folds.add_told(by_fold / variance[:, None, None])
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
         """The models updated; one whose numbers run away stays as it was before, and is counted."""
@@ -175,17 +219,23 @@ class Group:
         at = None if ends is None else GaussianState(np.stack([x] * len(ends)), np.stack([p] * len(ends)))
         return kalman.Updated(x, p, nothing, nothing.astype(float), at)
 
-    def _standing_at(self, after: kalman.Updated, ends: Ends, every: Ends) -> Standing:
+    def _standing_at(self, after: kalman.Updated, states: GaussianState | None, ends: Ends, every: Ends) -> Standing:
         """After `ends` samples; `every`: after which numbers of samples the states are known."""
-        assert after.at is not None
+        assert states is not None
         at = np.searchsorted(every, ends)
         used = np.cumsum(np.pad(after.used, ((0, 0), (1, 0))), axis=1)[:, ends].T
         nis = np.cumsum(np.pad(np.where(after.used, after.nis, 0.0), ((0, 0), (1, 0))), axis=1)[:, ends].T
-        return Standing(after.at.x[at], after.at.p[at], self._used + used, self._nis_sum + nis)
+        return Standing(states.x[at], states.p[at], self._used + used, self._nis_sum + nis)
 
     def standing(self, n: int) -> Standing:
         """The states as they are now, n times."""
-        return Standing.joined([Standing(self._x[None], self._p[None], self._used[None], self._nis_sum[None])] * n)
+        x, p = self._now()
+        return Standing.joined([Standing(x[None], p[None], self._used[None], self._nis_sum[None])] * n)
+
+    def _now(self) -> GaussianState:
+        """The filter's states x (K, n), P (K, n, n), with heave where models have it."""
+        state = GaussianState(self._x, self._p)
+        return state if self._heave is None else _joined(state, self._heave.sums(), self._parameters.motion_std)
 
     def _process_noise(self, stamps_ns: Stamps) -> Array | None:
         rate = self._assembler.process_rate
@@ -212,7 +262,8 @@ class Group:
     def _sound_state(self, name: str) -> GaussianState:
         """The state as it is to be published; the one before where the way from the filter's to it fails."""
         index = self.index[name]
-        found = self._published(index, self._x[index], self._p[index])
+        x, p = self._now()
+        found = self._published(index, x[index], p[index])
         if found is not None:
             return found
         self._restarted[index] += 1
@@ -249,7 +300,12 @@ class Group:
         for fold in range(FOLDS):
             state = None
             with suppress(np.linalg.LinAlgError):
-                state = self._published(index, *self._folds.without(fold, index))
+                without = self._folds.without(fold, index)
+                if self._heave is not None:
+                    sums = self._heave.sums(without=fold)
+                    x, p = _joined(GaussianState(*(each[None] for each in without)), sums, self._parameters.motion_std)
+                    without = GaussianState(x[index], p[index])
+                state = self._published(index, *without)
             found.append(state or self.state(name))
         return found
 
@@ -265,6 +321,15 @@ class Group:
             float(self._rows_sum[index] / used) if used else float(model.n_measurement),
             int(self._restarted[index]),
         )
+
+
+def _joined(state: GaussianState, sums: HeaveSums, motion_std: float) -> GaussianState:
+    """`with_heave`; as they are where numbers have run away."""
+    with suppress(np.linalg.LinAlgError):
+        found, _ = with_heave(state, sums, motion_std)
+        if _is_sound(*found):
+            return found
+    return state
 
 
 def _filtered(

@@ -24,7 +24,6 @@ from .delay.filter import DelayFilter
 from .delay.hold_out import Recording, Terms
 from .frames import Array, Vector
 from .headings import EVERY_NS, Headings
-from .heave_waves import Heave
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
 from .models import LINEAR_MODELS, MODELS, Model, Needs
@@ -513,7 +512,6 @@ class Calibrator:
             parameters=self.parameters.as_dict(),
             verifications={name: self.verification(name) for name in MODELS} if self._verified else {},
             suggestion=self.suggestion,
-            heave=self.heave,
             days=self.days,
         )
 
@@ -531,11 +529,6 @@ class Calibrator:
             late, late_std = nominal + float(state.x[delay]), float(std[delay])
             days.append(Day(first_ns, late, late_std, bool(shown[delay]), (east, north), (east_std, north_std)))
         return tuple(days)
-
-    @property
-    def heave(self) -> Heave | None:
-        """The heave of the reference's time, where it is that of waves and more than `motion_std` allows for."""
-        return self._delay.heave.found(self.parameters.motion_std)
 
     @property
     def suggestion(self) -> str:

@@ -356,13 +356,6 @@ _KINDS = (
         Severity.ERROR,
     ),
     FindingKind(
-        "HEAVE_WAVES",
-        "the vehicle heaves as in waves, {std:.2f} m/s every {period:.0f} s",
-        "G1 and G2 take heave to be nearly none (motion_std). In waves sway goes with it and bends the roll by more "
-        "than its σ says; pitch, yaw and scale are as good as they say.",
-        "calibrate in calm water or deeper down, or set motion_std to {std:.2f}",
-    ),
-    FindingKind(
         "REFERENCE_OFFSET",
         "the reference is off by {millimetres:.0f} mm/s towards {course:.0f}° all along{where}",
         "An error of an inertial navigation that stays, or a current, where the DVL tracks the water. G1 and G2 have "

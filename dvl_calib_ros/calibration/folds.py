@@ -47,6 +47,11 @@ class FoldInformation:
             self._information[fold] += wh_fold.swapaxes(1, 2) @ _rows(h[:, at])
             self._information_state[fold] += (wh_fold.swapaxes(1, 2) @ data.z[:, at].reshape(len(wh), -1, 1))[:, :, 0]
 
+    def add_told(self, told: Array) -> None:
+        """Add what rows (H, z) of each fold told (FOLDS, K, n+1, n+1)."""
+        self._information += told[..., :-1, :-1]
+        self._information_state += told[..., :-1, -1]
+
     def without(self, fold: int, index: int) -> GaussianState:
         """The filter's x (n,) and P (n, n) of one model, had it not seen a fold."""
         others = np.arange(FOLDS) != fold

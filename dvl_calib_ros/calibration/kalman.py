@@ -46,8 +46,8 @@ class Measurements:
 
     z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N), share
     of its own information that a sample adds, in 0..1 (below 1 for samples that share their noise with others).
-    usable: (K, N), False where a model must not use a sample. gate: (K, N or 1), largest normalised innovation squared
-    that is used, inf for no gate.
+    usable: (K, N), False where a model must not use a sample. gate: (K or 1, N or 1), largest normalised innovation
+    squared that is used, inf for no gate.
     """
 
     z: Array
@@ -68,7 +68,8 @@ class Measurements:
         own = slice(k, k + 1)
         r = self.r if len(self.r) == 1 else self.r[own]
         weight = self.weight if len(self.weight) == 1 else self.weight[own]
-        return Measurements(self.z[own], self.h[own], r, weight, self.usable[own], self.gate[own])
+        gate = self.gate if len(self.gate) == 1 else self.gate[own]
+        return Measurements(self.z[own], self.h[own], r, weight, self.usable[own], gate)
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,16 @@ class Updated:
         found = [each.at for each in models if each.at is not None]
         at = GaussianState(*(np.concatenate(each, axis=1) for each in zip(*found, strict=True))) if found else None
         return Updated(x, p, used, nis, at)
+
+
+def one_after_another(parts: Sequence[Updated]) -> Updated:
+    """Of blocks of samples, each from the state after the one before (or changed between); states wanted of all."""
+    if len(parts) == 1:
+        return parts[0]
+    used, nis = (np.concatenate(each, axis=1) for each in zip(*((part.used, part.nis) for part in parts), strict=True))
+    found = [each.at for each in parts if each.at is not None]
+    at = GaussianState(*(np.concatenate(each) for each in zip(*found, strict=True))) if found else None
+    return Updated(parts[-1].x, parts[-1].p, used, nis, at)
 
 
 def recursion(

@@ -23,15 +23,11 @@ class Assumptions(NamedTuple):
 
     motion_std: float = 0.03
     motion_correlation_time: float = 12.0
-    heave_offset_std: float = 0.02
+    heave_offset_std: float = 0.01
     current_std: float = 0.1
 
 
 ASSUMPTIONS = Assumptions()
-
-
-# (m/s)²: of an axis that is not measured; its information then is a 1e-5th of what heave is assumed to be known by
-UNMEASURED_VARIANCE = 1e4
 
 
 class Unmeasured(NamedTuple):
@@ -136,12 +132,9 @@ class Observations:
 
     @cached_property
     def noise_in_body(self) -> Array:
-        """Tᵀ R T (N or 1, 3, 3) (m/s)²; where an axis is not measured, as wide as that has to be to say nothing."""
+        """Tᵀ R T (N or 1, 3, 3) (m/s)²."""
         noise: Array = self.rotation_dvl_from_body.T @ self.noise @ self.rotation_dvl_from_body
-        if self.unmeasured is None:
-            return noise
-        axes, turned = self.unmeasured
-        return noise + UNMEASURED_VARIANCE * np.einsum("nai,na,naj->nij", turned, axes.astype(float), turned)
+        return noise
 
     @cached_property
     def measured_in_body(self) -> Array:
@@ -153,17 +146,6 @@ class Observations:
         along = np.einsum("nai,na->ni", turned**2, axes.astype(float))
         measured: Array = (along < 0.5).astype(float)
         return measured
-
-    @cached_property
-    def heave_gain(self) -> Array:
-        """k (N, 3): by how much a reference velocity moves, per m/s of its heave, once heave is known to be near zero.
-
-        Measuring 0 = g_z - h with the variance of the motion beside a reference of covariance R: the Kalman gain
-        R e_z / (R_zz + σ²), σ² being that of heave over its correlation time.
-        """
-        variance = self.assumptions.motion_std**2 / self.motion_weight
-        across = self.noise_in_body[:, :, 2]
-        return across / (across[:, 2] + variance)[:, None]
 
     @cached_property
     def motion_weight(self) -> Array:

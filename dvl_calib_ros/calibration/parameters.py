@@ -328,14 +328,15 @@ class Parameters:
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
-        "Standard deviation of sway and heave about what is modelled, straight ahead: noise of A1 and F1, heave of G1.",
+        "Standard deviation of sway and heave about what is modelled, straight ahead: noise of A1 and F1; of the mean "
+        "heave of 20 s in G1 and G2, as long as the run has not shown its own.",
         unit="m/s",
         low=1e-4,
         high=10.0,
     )
     motion_correlation_time: float = _parameter(
         ASSUMPTIONS.motion_correlation_time,
-        "Correlation time of sway and heave: samples closer together weigh less (G1, A1, F1). 0: all weigh the same.",
+        "Correlation time of sway and heave: samples closer together weigh less (A1, F1). 0: all weigh the same.",
         unit="s",
         low=0.0,
         high=600.0,

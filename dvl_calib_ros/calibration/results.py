@@ -10,7 +10,6 @@ import numpy as np
 
 from .error_model import correct, corrected_mounting
 from .frames import Array
-from .heave_waves import Heave
 from .models import MODELS
 from .observability import Convergence, Observability
 from .selection import Segment
@@ -133,8 +132,7 @@ class Result:
     first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
     `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values. verifications:
     by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit, where the one
-    given is grossly wrong, else ''. days: in order, none where there is one. heave: that of waves, None where there are
-    none.
+    given is grossly wrong, else ''. days: in order, none where there is one.
     """
 
     selected: str
@@ -147,7 +145,6 @@ class Result:
     parameters: Mapping[str, Any]
     verifications: Mapping[str, Verification]
     suggestion: str = ""
-    heave: Heave | None = None
     days: tuple[Day, ...] = ()
 
     @property

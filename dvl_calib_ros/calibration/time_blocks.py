@@ -123,23 +123,29 @@ class BlockScatter:
         self._last = int(blocks[-1])
         return np.flatnonzero(np.diff(blocks, prepend=before))
 
-    def add(self, x: Array, p: Array) -> None:
-        """Take the states at the cuts, x (E, K, n), P (E, K, n, n)."""
+    def add(self, x: Array, p: Array, last: tuple[Array, Array]) -> None:
+        """Take the states at the cuts, x (E, K, n), P (E, K, n, n).
+
+        last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by.
+        """
         for each in zip(x, p, strict=True):
             try:
                 information, vector = _information(*each)
             except np.linalg.LinAlgError:  # numbers that ran away: the filter goes on from before, and so do these
                 continue
             self._blocks.add(information - self._told[0], vector - self._told[1], 1.0)
-            self._told, self._state = (information, vector), each
+            self._told = information, vector
+        self._state = last
         self._factors.clear()
 
-    def end_day(self, before: GaussianState, after: GaussianState, of_day: NDArray[np.intp]) -> None:
+    def end_day(
+        self, before: GaussianState, after: GaussianState, of_day: NDArray[np.intp], last: GaussianState
+    ) -> None:
         """Go on with states `after` the end of a day, x (K, n), P (K, n, n), from those `before`. of_day: which (u,) of
-        them were of the day."""
-        self.add(before.x[None], before.p[None])
+        them were of the day. last: those `after`, as in `add`."""
+        self.add(before.x[None], before.p[None], last)
         self._blocks.end_day(of_day, *self._told, np.arange(len(before.x)))
-        self._state, self._told = after, _information(*after)
+        self._state, self._told = last, _information(*after)
         self._last = None
         self._factors.clear()
 

@@ -19,12 +19,13 @@ from ..calibration import kalman
 from ..calibration.alignment import align
 from ..calibration.assembly import Assembler
 from ..calibration.frames import Array
+from ..calibration.heave import HeaveRows, HeaveSums, with_heave
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.observations import Observations
 from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
-from ..calibration.samples import AlignedBlock, Mask, Stream, Streams, no_samples, sample_block
+from ..calibration.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
 from .trajectories import Trajectory
 
 T = TypeVar("T", bound=np.generic)
@@ -140,8 +141,35 @@ def _estimate_one(
     flat = assembler.measurements(seen, variants.rows.share(model.aided), variants.rows.prior_known)
     usable = variants.has[model.needs]
     x, p = (np.repeat(each, len(usable), axis=0) for each in assembler.start)
-    after = _states_after(x, p, _by_variant(flat, usable), ends)
+    after, used = _states_after(x, p, _by_variant(flat, usable), ends)
+    if model.heave is not None:
+        rows = assembler.heave_rows(seen).reshape(*usable.shape, 1, model.n_state + 1)
+        stamps_ns = variants.rows.stamps_ns.reshape(usable.shape)
+        after = heave_joined(after, stamps_ns, rows, used, usable, parameters, ends)
     return assembler.state(0, after.x, after.p)
+
+
+def heave_joined(
+    after: GaussianState,
+    stamps_ns: Stamps,
+    rows: Array,
+    used: Mask,
+    given: Mask,
+    parameters: Parameters,
+    ends: Sequence[int],
+) -> GaussianState:
+    """The filter's states x (E, B, n), P (E, B, n, n) after the first `ends` samples, with the rows of heave.
+
+    stamps_ns: (B, N). rows: (B, N, 1, n+1). used, given: (B, N), samples that the filter used, and that it was given.
+    """
+    sums = []
+    for at, stamps, own, use in zip(given, stamps_ns, rows, used, strict=True):
+        number = np.concatenate([[0], np.cumsum(at)])  # of those given, before each
+        taken = HeaveRows(1, rows.shape[-1] - 1, parameters)
+        found = taken.add(stamps[at], own[at], use[at], [int(number[end]) for end in ends])
+        sums.append(HeaveSums.stacked(found))
+    told, scatter, weight = (np.stack(each, axis=1)[:, :, 0] for each in zip(*sums, strict=True))
+    return with_heave(after, HeaveSums(told, scatter, weight), parameters.motion_std)[0]
 
 
 def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
@@ -161,14 +189,16 @@ def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
     )
 
 
-def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> GaussianState:
-    """x (E, K, n) and P (E, K, n, n) after the first `ends` samples."""
+def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> tuple[GaussianState, Mask]:
+    """x (E, K, n) and P (E, K, n, n) after the first `ends` samples, and which were used (K, N)."""
+    used = data.usable.copy()
     if not np.isfinite(data.gate).any():
-        return kalman.least_squares(x, p, data, ends)
+        return kalman.least_squares(x, p, data, ends), used
     states = []
     for start, end in pairwise((0, *ends)):
         if end > start:
             after = kalman.batch(x, p, data.part(slice(start, end)))
             x, p = after.x, after.p
+            used[:, start:end] = after.used
         states.append((x, p))
-    return GaussianState(*map(np.array, zip(*states, strict=True)))
+    return GaussianState(*map(np.array, zip(*states, strict=True))), used

@@ -13,7 +13,6 @@ from ..calibration.advice import (
     consistency_advice,
     data_advice,
     gate_advice,
-    heave_advice,
     message_advice,
     reference_advice,
 )
@@ -131,7 +130,7 @@ def diagnose(
     found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
     found += message_advice(grown) + data_advice(grown) + dvl_type.advice(grown["dvl"])
     found += gate_advice(estimate) + consistency_advice(estimate)
-    found += reference_advice(estimate) + heave_advice(calibrator.heave)
+    found += reference_advice(estimate)
     if calibrator.suggestion:
         found.append(finding("CONFIGURATION_WRONG", says=calibrator.suggestion))
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first

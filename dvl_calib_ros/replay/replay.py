@@ -12,7 +12,7 @@ import numpy as np
 
 from .. import __version__
 from ..bags.reader import BagReader
-from ..calibration.advice import data_advice, gate_advice, heave_advice, message_advice, reference_advice
+from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
@@ -325,7 +325,7 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[F
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_advice(estimate)
-    return found + reference_advice(result.estimate, result.days) + heave_advice(result.heave)
+    return found + reference_advice(result.estimate, result.days)
 
 
 def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:

@@ -7,7 +7,7 @@ than another, and the delay's standard deviation stays that of the prior.
 
 Noise that is larger than claimed, or correlated, would make evidence and covariance overconfident: evidence is
 divided by the best hypothesis' own mean squared innovation, and standard deviations grow to what blocks of time
-show (honesty.py).
+show (time_blocks.py). (Long, because what a hypothesis knows, of heave and over the end of a day, is one thing.)
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..correction_parameters import PriorOnErrors, to_correction
-from ..folds import FOLDS, on_another_day
+from ..folds import FOLDS, folds_of, on_another_day
 from ..frames import Array
+from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState
-from ..samples import Index, Mask
+from ..parameters import Parameters
+from ..samples import Index, Mask, Stamps
 from ..time_blocks import TimeBlocks
 from .rows import BEYOND, DELAY, DELAYS_S, N_STATE, OF_DAY, DelayedRows
 
@@ -86,7 +87,13 @@ class DelayBank:
     """Accumulates rows; asks for nothing else. prior: x (n,), P (n, n) of G2's states."""
 
     def __init__(
-        self, prior: GaussianState, unknown: GaussianState, gate: float, process_rate: Array | None, verified: bool
+        self,
+        prior: GaussianState,
+        unknown: GaussianState,
+        gate: float,
+        process_rate: Array | None,
+        verified: bool,
+        parameters: Parameters,
     ) -> None:
         """unknown: a prior without any calibration before it, which is that of another day's own states, too.
 
@@ -101,6 +108,9 @@ class DelayBank:
         self._ended: list[_Ended] = []
         self._square = np.einsum("ki,ki->k", self._vector, self._start.x)
         self._log_det = np.zeros(len(DELAYS_S))
+        self._parameters = parameters
+        self._heave = HeaveRows(len(DELAYS_S), N_STATE, parameters)
+        self._heave_variance = parameters.motion_std**2
         self._regressor_noise = np.zeros(4)
         self._recent: list[float] = []
         self.used = self.gated = 0
@@ -128,7 +138,12 @@ class DelayBank:
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
         self._ended.append(_Ended(known, self._shown(best, inflation), inflation))
-        self.blocks.end_day(OF_DAY, self._information, self._vector, np.full(len(DELAYS_S), best))
+        total = np.linalg.inv(found.p)
+        source = np.full(len(DELAYS_S), best)
+        self.blocks.end_day(OF_DAY, total, (total @ found.x[..., None])[..., 0], source)
+        self._heave.close()
+        self._heave.absorb()  # its rows are in what is known
+        self._heave.learn_from(source)
         self.prior = on_another_day(self.prior, self._unknown, OF_DAY)
         self._begin_day()
         begins = [_information(_around_each_delay(on_another_day(each, self._unknown, OF_DAY))) for each in known]
@@ -152,13 +167,15 @@ class DelayBank:
         """Of the hypotheses, s."""
         return float(DELAYS_S[int(np.argmax(self._shares()[1]))])
 
-    def add(self, rows: DelayedRows, folds: NDArray[np.int64], seconds: float) -> Mask:
-        """Take the rows of a block of time; which (J,) of them it used. folds: (J,) of each row. seconds: of it."""
+    def add(self, rows: DelayedRows, stamps_ns: Stamps, seconds: float) -> Mask:
+        """Take the rows of a block of time; which (J,) of them it used. stamps_ns: (J,) of each row. seconds: of it."""
         if self._process_rate is not None:
+            self._absorb_heave()
             self._drift(seconds)
         if not len(rows):
             return np.zeros(0, dtype=bool)
         use = self._gated(rows)
+        folds = folds_of(stamps_ns, self._parameters)
         before = np.linalg.slogdet(self._information)[1]
         total, total_vector = np.zeros_like(self._information), np.zeros_like(self._vector)
         square, by_fold = np.zeros_like(self._square), []
@@ -176,20 +193,46 @@ class DelayBank:
         self._vector += total_vector
         self._log_det += np.linalg.slogdet(self._information)[1] - before
         self.blocks.add(total, total_vector, float(rows.weight[use].sum()))
+        self._heave.add(stamps_ns, rows.heave, use)
+        self._learn_heave()
         if self._folds is not None:
             for fold, (information, vector, _) in by_fold:
                 self._folds[0][fold] += information
                 self._folds[1][fold] += vector
         return use
 
+    def _learn_heave(self) -> None:
+        """One variance for all hypotheses, that of the best: else a wrong one would excuse itself by its own."""
+        best = [int(np.argmax(self._shares()[1]))]
+        p = np.linalg.inv(self._information[best])
+        x = (p @ self._vector[best][..., None])[..., 0]
+        sums = self._heave.sums()
+        own = HeaveSums(sums.told[best], sums.scatter[best], sums.weight)
+        _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
+        self._heave_variance = float(variance[0])
+
+    def _absorb_heave(self) -> None:
+        """Under a random walk what a row tells ages with the rest."""
+        before = np.linalg.slogdet(self._information)[1]
+        sums, by_fold = self._heave.absorb()
+        told = sums.told / self._heave_variance
+        if self._folds is not None:
+            self._folds[0][:] += by_fold[..., :N_STATE, :N_STATE] / self._heave_variance
+            self._folds[1][:] += by_fold[..., :N_STATE, N_STATE] / self._heave_variance
+        self._information += told[:, :N_STATE, :N_STATE]
+        self._vector += told[:, :N_STATE, N_STATE]
+        self._square += told[:, N_STATE, N_STATE]
+        self._log_det += np.linalg.slogdet(self._information)[1] - before
+
     def _drift(self, seconds: float) -> None:
         """Random walk over so many seconds: P grows, x stays, and so does the misfit."""
         assert self._process_rate is not None
-        found = self._solve()
-        p = found.p + self._process_rate * seconds
-        self._information = np.linalg.inv(p)
-        self._vector = (self._information @ found.x[..., None])[..., 0]
-        self._square = found.misfit + np.einsum("ki,ki->k", self._vector, found.x)
+        p = np.linalg.inv(self._information)
+        x = (p @ self._vector[..., None])[..., 0]
+        misfit = self._square - np.einsum("ki,ki->k", x, self._vector)
+        self._information = np.linalg.inv(p + self._process_rate * seconds)
+        self._vector = (self._information @ x[..., None])[..., 0]
+        self._square = misfit + np.einsum("ki,ki->k", self._vector, x)
 
     def _gated(self, rows: DelayedRows) -> Mask:
         """Which rows are used (J,): those that any hypothesis explains, by the level of recent innovations.
@@ -218,11 +261,15 @@ class DelayBank:
         if without is not None:
             assert self._folds is not None
             information, vector = information - self._folds[0][without], vector - self._folds[1][without]
+        heave = self._heave.sums(without).told / self._heave_variance
+        before = np.linalg.slogdet(information)[1]
+        information, vector = information + heave[:, :N_STATE, :N_STATE], vector + heave[:, :N_STATE, N_STATE]
+        log_det = self._log_det + np.linalg.slogdet(information)[1] - before
         p = np.linalg.inv(information)
         p = 0.5 * (p + p.swapaxes(1, 2))
         x = (p @ vector[..., None])[..., 0]
-        misfit = self._square - np.einsum("ki,ki->k", x, vector)
-        return Hypotheses(x, p, misfit, -0.5 * (misfit + self._log_det))
+        misfit = self._square + heave[:, N_STATE, N_STATE] - np.einsum("ki,ki->k", x, vector)
+        return Hypotheses(x, p, misfit, -0.5 * (misfit + log_det))
 
     def _level(self, found: Hypotheses, best: int) -> float:
         freedom = 3.0 * self.blocks.weight - N_STATE
@@ -316,7 +363,8 @@ class DelayBank:
         """Which states (n,) the data show even if everything else were known much worse than the prior says."""
         prior_std = np.sqrt(np.diag(self.prior.p))
         known_before = prior_std <= SHOWN_SHARE * self._unknown_std
-        data = self._information[best] - np.linalg.inv(self._start.p[best])
+        heave = self._heave.sums().told[best, :N_STATE, :N_STATE] / self._heave_variance
+        data = self._information[best] + heave - np.linalg.inv(self._start.p[best])
         # what noise of regressors seems to tell is told by nothing
         share = np.ones(N_STATE)
         share[BEYOND] = np.clip(1.0 - self._regressor_noise / np.maximum(np.diag(data)[BEYOND], 1e-300), 0.0, 1.0)

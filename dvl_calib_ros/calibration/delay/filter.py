@@ -15,11 +15,10 @@ import numpy as np
 from ..alignment import Aligner
 from ..bank import ModelCounts
 from ..coarse_mounting import DELAYS_S, CoarseFits
-from ..folds import FOLDS, folds_of
+from ..folds import FOLDS
 from ..frames import ENU_FROM_NED, Array
-from ..heave_waves import HeaveWaves
 from ..kalman import GaussianState
-from ..observations import Assumptions, Observations
+from ..observations import Observations
 from ..parameters import Parameters
 from ..samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
 from ..selection import NO_EVIDENCE, Evidence
@@ -69,7 +68,7 @@ class _Dvl(Table):
 class DelayFilter:
     """Feeds a `DelayBank` from an aligner; tells the aligner which past of its tracks is still wanted.
 
-    coarse, heave: of the same samples, what configuration they fit, and whether they are of waves. restarted: how often
+    coarse: of the same samples, what configuration they fit. restarted: how often
     what was found was not finite, and that of before is kept. n_taken: number of the first row of the aligner that it
     has not copied yet.
     """
@@ -94,7 +93,7 @@ class DelayFilter:
         self._on_block = on_block
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
-        self._bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified)
+        self._bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified, parameters)
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._template = Observations(
@@ -103,11 +102,9 @@ class DelayFilter:
             lever_velocity=None,
             rotation_dvl_from_body=parameters.rotation_dvl_from_body,
             sway_heave=np.zeros(2),
-            assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
         )
         self.coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._reference_clock = ReferenceClock(parameters)
-        self.heave = HeaveWaves(parameters.rotation_dvl_from_body)
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
         self._dvl = _Dvl()
@@ -299,7 +296,6 @@ class DelayFilter:
         dvl, noise_dvl = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         self._compare_coarsely(block_ns, end_ns, dvl, imu)
-        self.heave.add(*dvl, noise_dvl)
         if self._kept is not None:
             from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
             self._kept.append(Kept.between(from_s, to_s, dvl, noise_dvl, reference, imu))
@@ -318,7 +314,7 @@ class DelayFilter:
             max_turn_rate=p.max_turn_rate,
             imu_gap_s=p.imu_timeout,
         )
-        used = self._bank.add(rows, folds_of(stamps_ns[rows.index], p), BLOCK_NS * 1e-9)
+        used = self._bank.add(rows, stamps_ns[rows.index], BLOCK_NS * 1e-9)
         self._reference_clock.add(
             binned_dvl, reference.part(rows.index[used]), imu, noise_dvl, self._bank.likeliest_delay
         )

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
 from ..models import MODELS
-from ..models.own import g1_noise, linearise_g1
+from ..models.own import g1_heave, linearise_g1
 from ..observations import Observations
 from ..samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
@@ -81,7 +81,8 @@ class DelayedRows:
 
     index: (J,) of the reference. z: (J, K, 3) m/s and h: (J, K, 3, 12) on G1's states, lever arm (m, body) and what the
     delay is more (s) than that of its hypothesis. information: (J, 3, 3) inverse of the noise. weight: (J,) share of
-    its own information that a sample adds. regressor_noise: (J, 4) how much of the information on lever arm (3) and
+    its own information that a sample adds. heave: (J, K, 13) (H, z) of what holds of heave in the mean, see heave.py.
+    regressor_noise: (J, 4) how much of the information on lever arm (3) and
     delay is that of noise: angular velocity and slope that only seem to change.
     """
 
@@ -90,6 +91,7 @@ class DelayedRows:
     h: Array
     information: Array
     weight: Array
+    heave: Array
     regressor_noise: Array
 
     def __len__(self) -> int:
@@ -132,9 +134,7 @@ def delayed_rows(
     # references closer together than the DVL's samples share these
     weight = np.clip(interval / spacing, 0.0, 1.0)
     earth = earth[index]
-    return _rows(
-        index, value, slope, body, earth, turning, uncertain, noise + added, interval, weight, template, lever_arm
-    )
+    return _rows(index, value, slope, body, earth, turning, uncertain, noise + added, weight, template, lever_arm)
 
 
 class _Uncertain(NamedTuple):
@@ -199,7 +199,6 @@ def _rows(
     turning: Array,
     uncertain: _Uncertain,
     noise: Array,
-    interval: Array,
     weight: Array,
     template: Observations,
     lever_arm: Vector,
@@ -207,17 +206,6 @@ def _rows(
     n, k = velocity_dvl.shape[:2]
     body_from_dvl = template.rotation_dvl_from_body.T
     lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
-    once = Observations(
-        velocity_dvl=velocity_dvl[:, 0],
-        reference_body=body,
-        lever_velocity=lever,
-        rotation_dvl_from_body=template.rotation_dvl_from_body,
-        sway_heave=template.sway_heave,
-        noise=noise,
-        interval=interval,
-        assumptions=template.assumptions,
-        earth_in_body=earth,
-    )
     # the same reference beside the DVL at every delay
     each = Observations(
         velocity_dvl=velocity_dvl.reshape(n * k, 3),
@@ -225,9 +213,6 @@ def _rows(
         lever_velocity=None if lever is None else np.repeat(lever, k, axis=0),
         rotation_dvl_from_body=template.rotation_dvl_from_body,
         sway_heave=template.sway_heave,
-        noise=np.repeat(noise, k, axis=0),
-        interval=np.repeat(interval, k),
-        assumptions=template.assumptions,
         earth_in_body=np.repeat(earth, k, axis=0),
     )
     z, h_g1 = linearise_g1(each)
@@ -235,8 +220,11 @@ def _rows(
     h[..., :N_G1] = h_g1.reshape(n, k, 3, N_G1)
     h[..., LEVER_ARM] = -skew(turning)[:, None]
     h[..., DELAY] = slope @ body_from_dvl.T
-    information = np.linalg.inv(g1_noise(once))
-    return DelayedRows(index, z.reshape(n, k, 3), h, information, weight, uncertain.information(information))
+    heave = np.zeros((n, k, N_STATE + 1))
+    heave[..., [*range(N_G1), N_STATE]] = g1_heave(each).reshape(n, k, N_G1 + 1)
+    heave[..., BEYOND] = h[:, :, 2, BEYOND]
+    information = np.linalg.inv(noise)
+    return DelayedRows(index, z.reshape(n, k, 3), h, information, weight, heave, uncertain.information(information))
 
 
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:

@@ -60,9 +60,10 @@ class Model:
 
     What a model may change of how it is filtered: noise: observations -> its own R (N or 1, 3, 3) (m/s)², of which a
     model with fewer rows uses the first ones; None: `Observations.noise`. vertical_from_reference: it takes the
-    reference's vertical velocity for a measurement, so does without where there is none (M3, M4 and G1 assume their
-    own). rows_in_body: its three rows are those of the body, else those of the DVL. motion_is_noise: its noise is the
-    vehicle's motion, so samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first
+    reference's vertical velocity for a measurement, so does without where there is none (M3 and M4 assume their own).
+    heave: observations -> (H, z) (N, n+1) of what holds of heave in the mean, see heave.py. rows_in_body: its three
+    rows are those of the body, else those of the DVL. motion_is_noise: its noise is the vehicle's motion, so samples
+    count by `Observations.motion_weight`. in_correction_parameters: its filter's first
     five states are those of the correction, see `correction_parameters`. extends: the model whose states its own begin
     with, and which it equals while the data show nothing more; such a model is filtered by `DelayFilter`.
     sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
@@ -80,6 +81,7 @@ class Model:
     needs_prior: bool = False
     nuisance: tuple[Nuisance, ...] = ()
     noise: Callable[[Observations], Array] | None = None
+    heave: Callable[[Observations], Array] | None = None
     motion_is_noise: bool = False
     vertical_from_reference: bool = False
     rows_in_body: bool = False

@@ -17,7 +17,7 @@ SCALE_SHOWN_FROM = 0.3
 
 
 def linearise_g1(seen: Observations) -> Linearised:
-    """z = Tᵀr' - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), -k, E'] on ψ, κ, h, o; body frame.
+    """z = g - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), 0, E] on ψ, κ, h, o; body frame.
 
     The models of the paper put the noisy GNSS velocity r into H: noise in a regressor pulls its coefficient, here the
     scale, down ("errors in variables"). Here the correction itself is estimated,
@@ -27,38 +27,42 @@ def linearise_g1(seen: Observations) -> Linearised:
     with the DVL's v, twenty times less noisy, in H; what pull is left is σ_dvl²/‖v‖². It is exactly linear in ψ and
     κ; `correction_parameters` turns them into φ and δk.
 
-    r' = g - k g_z is the GNSS velocity as known after the heave assumption 0 = g_z - h + noise, weighed with its own
-    variance against the receiver's. The heave h, constant (trim), is a state. In the row of heave κ acts on level
-    motion only: what is assumed to be near zero must not be read as a scale that makes it so. Nor does an axis say
-    anything of its scale while it moves so slowly that its own noise would pull (SCALE_SHOWN_FROM).
+    An axis says nothing of its scale while it moves so slowly that its own noise would pull (SCALE_SHOWN_FROM). The
+    heave h is only in the rows of `g1_heave`.
 
     A reference in an earth frame is wrong by a constant o (east, north) beside its noise: an inertial navigation by
     some mm/s all along. On one heading no data tell it from yaw and scale, and σ says so; over several it is found
-    (E: its axes in the body, E' = E - k E_z as for r'). Of one in the body frame no such thing is assumed.
+    (E: its axes in the body). Of one in the body frame no such thing is assumed.
     """
     assert seen.reference_body is not None
-    r = seen.reference_body - seen.heave_gain * seen.reference_body[:, 2:]
-    if seen.lever_velocity is not None:
-        r = r + seen.lever_velocity
     body_from_dvl = seen.rotation_dvl_from_body.T
-    measured = seen.velocity_dvl @ body_from_dvl.T
-    level = measured * (1.0, 1.0, 0.0) @ body_from_dvl
     fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
-    h = np.zeros((len(r), 3, 8))
+    h = np.zeros((len(fast), 3, 8))
     h[:, :, :3] = np.matmul(body_from_dvl, skew(seen.velocity_dvl))
-    h[:, :2, 3:5] = -(body_from_dvl[:2] * (fast * seen.velocity_dvl)[:, None, :])[:, :, :2]
-    h[:, 2, 3:5] = -(body_from_dvl[2] * fast * level)[:, :2]
-    h[:, :, 5] = -seen.heave_gain
+    h[:, :, 3:5] = -(body_from_dvl * (fast * seen.velocity_dvl)[:, None, :])[:, :, :2]
     if seen.earth_in_body is not None:
-        h[:, :, 6:] = seen.earth_in_body - seen.heave_gain[:, :, None] * seen.earth_in_body[:, 2:]
-    return r - measured, h
+        h[:, :, 6:] = seen.earth_in_body
+    return seen.reference_body - seen.velocity_in_body, h
 
 
-def g1_noise(seen: Observations) -> Array:
-    """Covariance of r': (I - k e_zᵀ) R, body frame."""
-    r = seen.noise_in_body
-    noise: Array = r - seen.heave_gain[:, :, None] * r[:, 2:3, :]
-    return noise
+def g1_heave(seen: Observations) -> Array:
+    """(H, z) (N, 9) of 0 = g_z - h, of which `heave.HeaveRows` takes means: z = -(Tᵀv)_z, body frame.
+
+    κ acts on level motion only: what is assumed to be near zero must not be read as a scale that makes it so.
+    """
+    body_from_dvl = seen.rotation_dvl_from_body.T
+    fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
+    level = seen.velocity_dvl @ body_from_dvl.T * (1.0, 1.0, 0.0) @ body_from_dvl
+    row = np.zeros((len(fast), 9))
+    row[:, :3] = body_from_dvl[2] @ skew(seen.velocity_dvl)
+    row[:, 3:5] = -(body_from_dvl[2] * fast * level)[:, :2]
+    row[:, 5] = -1.0
+    row[:, 8] = -seen.velocity_in_body[:, 2]
+    return row
+
+
+def _noise_in_body(seen: Observations) -> Array:
+    return seen.noise_in_body
 
 
 # Sway of a vehicle that turns unseen, m/s
@@ -152,10 +156,12 @@ OWN = (
     Model(
         "G1", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS,
         assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
-        wrong_when="trimmed by more than heave_offset_std, or heaving in long waves beyond motion_std",
+        wrong_when="trimmed by more than heave_offset_std, or heaving for minutes beyond motion_std",
         scale_axes=_SCALE_PER_AXIS,
         nuisance=_G1_NUISANCE,
-        noise=g1_noise,
+        noise=_noise_in_body,
+        heave=g1_heave,
+        vertical_from_reference=True,
         rows_in_body=True,
         in_correction_parameters=True,
     ),
@@ -171,7 +177,9 @@ OWN = (
             Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
             Nuisance("time_offset", "s", "initial_std_time_offset", of_the_day=True),
         ),
-        noise=g1_noise,
+        noise=_noise_in_body,
+        heave=g1_heave,
+        vertical_from_reference=True,
         rows_in_body=True,
         in_correction_parameters=True,
         extends="G1",

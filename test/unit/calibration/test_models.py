@@ -13,6 +13,7 @@ from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.bank import groups_of
 from dvl_calib_ros.calibration.error_model import correct, distort
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, skew
+from dvl_calib_ros.calibration.heave import HeaveRows, with_heave
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -75,14 +76,9 @@ def predicted_z(model, state, seen):
     expected = np.column_stack([speed, np.tile(PRIOR, (len(speed), 1))])
     if model.in_correction_parameters:  # G1: the state is ψ, κ, heave, error of the reference east and north
         fast = np.abs(velocity_dvl) > 0.3  # axes that are slower say nothing of their scale
-        level = (velocity_dvl @ t) * [1, 1, 0] @ t.T  # scale acts on level motion only
         body = velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - fast * velocity_dvl @ np.diag(dk) @ t
-        body[:, 2] = (velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - fast * level @ np.diag(dk) @ t)[:, 2]
-        r = t.T @ np.eye(3) @ t
-        variance = seen.assumptions.motion_std**2 * 2 * seen.assumptions.motion_correlation_time / 0.2
-        gain = r[:, 2] / (r[2, 2] + variance)
         error = np.einsum("nei,e->ni", seen.rotation_enu_from_body, [*state[6:8], 0.0])
-        return body - velocity_dvl @ t - gain * state[5] + error - np.outer(error[:, 2], gain)
+        return body - velocity_dvl @ t + error
     if model.aided:  # the measured velocity is what the errors make of the reference
         level = velocity_body * [1, 1, 0] if model.name in ("M3", "M4") else velocity_body
         return level @ t.T - distort(level, phi, dk, t)
@@ -115,6 +111,24 @@ def test_h_is_the_derivative_of_the_nonlinear_error_model(name, mounting, frame,
         state[column] = step
         plus, minus = predicted_z(model, state, seen), predicted_z(model, -state, seen)
         np.testing.assert_allclose(h[:, :, column], (plus - minus) / (2 * step), atol=1e-8)
+
+
+@each_mounting
+@each_frame
+def test_the_row_of_heave_is_the_derivative_of_what_is_taken_for_none(mounting, frame, rng):
+    model, t = MODELS["G1"], rotation_from_rpy(MOUNTINGS[mounting]).T
+    velocity_dvl = rng.normal([1.5, 0.2, 0.1], 0.3, (20, 3)) @ FRAMES[frame].T @ t.T
+    row = model.heave(observations(velocity_dvl, velocity_dvl @ t, t, frame=frame))
+    level = (np.abs(velocity_dvl) > 0.3) * ((velocity_dvl @ t) * [1, 1, 0] @ t.T)  # scale acts on level motion only
+
+    def heave(state):
+        phi, dk = state_to_terms(model, state)
+        corrected = velocity_dvl @ (np.eye(3) - skew(phi)).T - level @ np.diag(dk)
+        return (corrected @ t)[:, 2] - state[5]
+
+    np.testing.assert_allclose(row[:, -1], -heave(np.zeros(model.n_state)), atol=1e-12)
+    for column, step in enumerate(1e-6 * np.eye(model.n_state)):
+        np.testing.assert_allclose(row[:, column], (heave(step) - heave(-step)) / 2e-6, atol=1e-8)
 
 
 @each_model
@@ -206,8 +220,13 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
         kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
     after, k = group.standing(1), group.index[name]
-    np.testing.assert_allclose(after.x[0, k], alone.x[0], atol=1e-12)
-    np.testing.assert_allclose(after.p[0, k], alone.p[0], atol=1e-12)
+    expected = kalman.GaussianState(alone.x, alone.p)
+    if model.heave is not None:
+        rows = HeaveRows(1, model.n_state, parameters)
+        rows.add(np.arange(60), model.heave(seen)[:, None], alone.used[0])
+        expected, _ = with_heave(expected, rows.sums(), parameters.motion_std)
+    np.testing.assert_allclose(after.x[0, k], expected.x[0], atol=1e-12)
+    np.testing.assert_allclose(after.p[0, k], expected.p[0], atol=1e-12)
 
 
 def test_a_tilted_mounting_keeps_its_known_tilt_when_heave_is_zeroed(rng):

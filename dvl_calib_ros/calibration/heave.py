@@ -1,0 +1,179 @@
+"""That a vehicle does not heave, as G1 and G2 take it: a row for every 20 s, with the variance that the run shows.
+
+Heave of a moment is a wave, and sway goes with it: the same water moves both, so what is small in every sample still
+bends the roll. Over many waves both average out, as no vehicle leaves the surface or its depth. So the row is that of
+means over a block of time,
+
+    0 = mean(g_z) - h + noise,  of variance σ² for a block of 20 s, and inversely to its length for a shorter one,
+
+with a constant h (trim) as a state. σ² is learnt with the states, by expectation maximisation: it is the scatter of
+the rows about what they are expected to be, together with `motion_std`² as if that had been seen in PSEUDO_BLOCKS
+blocks. So all rows weigh what is known of them now, and a filter with a variance fixed at each row would not do: what
+is kept are sums, joined with the filter's state when somebody asks for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from .folds import FOLDS, folds_of
+from .frames import Array
+from .kalman import GaussianState
+from .parameters import Parameters
+from .samples import Index, Mask, Stamps
+
+# Waves have periods of up to 20 s.
+BLOCK_NS = 20_000_000_000
+# A block is not continued after so long a pause.
+PAUSE_NS = 5_000_000_000
+# `motion_std` counts as much as so many blocks: after ten it is a sixth of what is known.
+PSEUDO_BLOCKS = 2.0
+# Always as many, whoever asks: each leaves a third of what is missing, or less.
+STEPS = 10
+
+
+class HeaveSums(NamedTuple):
+    """Of rows m = (H, z) with weights w, the length of the block in 20 s, at most 1.
+
+    told: Σ w m mᵀ (..., K, n+1, n+1), what they tell at σ² = 1. scatter: Σ w² m mᵀ, in which blocks count by their
+    length. weight: Σ w (..., 1).
+    """
+
+    told: Array
+    scatter: Array
+    weight: Array
+
+    @staticmethod
+    def stacked(sums: Sequence[HeaveSums]) -> HeaveSums:
+        """Along a new first axis."""
+        return HeaveSums(*(np.stack(each) for each in zip(*sums, strict=True)))
+
+
+class HeaveRows:
+    """Takes samples in order of their stamps, for K hypotheses or models with n states, and makes rows of them.
+
+    Sums are kept by folds: a row is of the fold of its last sample. It holds nothing of the reference, by which a fold
+    is judged.
+    """
+
+    def __init__(self, k: int, n: int, parameters: Parameters) -> None:
+        self._parameters = parameters
+        size = k, n + 1, n + 1
+        self._folds = HeaveSums(np.zeros((FOLDS, *size)), np.zeros((FOLDS, *size)), np.zeros((FOLDS, 1)))
+        self._sum = np.zeros((k, n + 1))
+        self._start()
+        self._last_ns: int | None = None
+
+    def _start(self) -> None:
+        self._count, self._seconds = 0, 0.0
+        self._sum = np.zeros_like(self._sum)
+
+    def starts(self, stamps_ns: Stamps) -> Index:
+        """Which samples (of N) begin a block that is not the one before."""
+        before = np.concatenate([[stamps_ns[0] if self._last_ns is None else self._last_ns], stamps_ns[:-1]])
+        other = (stamps_ns // BLOCK_NS != before // BLOCK_NS) | (stamps_ns - before > PAUSE_NS)
+        return np.flatnonzero(other)
+
+    def add(self, stamps_ns: Stamps, rows: Array, used: Mask, ends: Sequence[int] = ()) -> list[HeaveSums]:
+        """Add N samples of (H, z) (N, K, n+1), as far as they are used (N,).
+
+        Returns the sums after the first `ends` (E ascending numbers) of them.
+        """
+        if not len(stamps_ns):
+            return [self.sums() for _ in ends]
+        starts = set(self.starts(stamps_ns).tolist())
+        last_ns = stamps_ns[0] if self._last_ns is None else self._last_ns
+        seconds = np.diff(stamps_ns, prepend=last_ns) * 1e-9
+        seconds[seconds > PAUSE_NS * 1e-9] = 0.0
+        seconds *= used
+        found = {0: self.sums()} if 0 in ends else {}
+        cuts = sorted({0, len(stamps_ns), *starts, *ends})
+        for start, end in pairwise(cuts):
+            if start in starts:
+                self.close()
+            at = slice(start, end)
+            self._count += int(np.count_nonzero(used[at]))
+            self._seconds += float(seconds[at].sum())
+            self._sum = self._sum + rows[at][used[at]].sum(axis=0)
+            self._last_ns = int(stamps_ns[end - 1])
+            if end in ends:
+                found[end] = self.sums()
+        return [found[end] for end in ends]
+
+    def close(self) -> None:
+        """End the block: what comes is another one's."""
+        fold, row = self._open()
+        for kept, more in zip(self._folds, row, strict=True):
+            kept[fold] += more
+        self._start()
+
+    def _open(self) -> tuple[int, HeaveSums]:
+        """The fold and the row of the block that is not ended."""
+        if not self._count:
+            return 0, HeaveSums(*(np.zeros_like(kept[0]) for kept in self._folds))
+        assert self._last_ns is not None
+        mean = self._sum / self._count
+        weight = min(self._seconds * 1e9 / BLOCK_NS, 1.0)
+        told = weight * mean[:, :, None] * mean[:, None, :]
+        return int(folds_of(np.array([self._last_ns]), self._parameters)[0]), HeaveSums(
+            told, weight * told, np.array([weight])
+        )
+
+    def sums(self, without: int | None = None) -> HeaveSums:
+        """The rows so far, the one of the block that is not ended among them; without a fold, if one is named."""
+        fold, row = self._open()
+        use = np.arange(FOLDS) != (FOLDS if without is None else without)
+        return HeaveSums(
+            *(kept[use].sum(axis=0) + more * (fold != without) for kept, more in zip(self._folds, row, strict=True))
+        )
+
+    def absorb(self) -> tuple[HeaveSums, Array]:
+        """Give the caller the rows of ended blocks, who has them from now on; what they scatter by is kept.
+
+        Returns the rows, and what they tell by folds (FOLDS, K, n+1, n+1).
+        """
+        sums, told = HeaveSums(*(kept.sum(axis=0) for kept in self._folds)), self._folds.told
+        self._folds = self._folds._replace(told=np.zeros_like(told))
+        return sums, told
+
+    def learn_from(self, source: Index) -> None:
+        """Take what rows so far scatter by from others. source: (K,) from which of the K each takes it."""
+        self._folds = self._folds._replace(scatter=self._folds.scatter[:, source].copy())
+
+
+def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tuple[GaussianState, Array]:
+    """States x (..., K, n), P (..., K, n, n) with the rows of heave, and σ² (..., K) (m/s)² as learnt with them.
+
+    motion_std: m/s. Raises numpy.linalg.LinAlgError where P is not positive definite.
+    """
+    x, p = state
+    n = x.shape[-1]
+    told, scatter = sums.told, sums.scatter
+    # in coordinates in which P is 1 and what the rows tell is diagonal
+    root = np.linalg.cholesky(p)
+    share, turn = np.linalg.eigh(np.swapaxes(root, -1, -2) @ told[..., :n, :n] @ root)
+    share = np.maximum(share, 0.0)
+    axes = root @ turn
+    told_more = told[..., :n, n] - _product(told[..., :n, :n], x)
+    pull = _product(np.swapaxes(axes, -1, -2), told_more)
+    spread = np.einsum("...ij,...ik,...kj->...j", axes, scatter[..., :n, :n], axes)
+    variance = np.full(x.shape[:-1], motion_std**2)
+    for _ in range(STEPS):
+        found = x + _product(axes, pull / (variance[..., None] + share))
+        missed = np.concatenate([-found, np.ones((*found.shape[:-1], 1))], axis=-1)
+        misfit = np.maximum((missed * _product(scatter, missed)).sum(axis=-1), 0.0)
+        unsure = (spread * variance[..., None] / (variance[..., None] + share)).sum(axis=-1)
+        variance = (PSEUDO_BLOCKS * motion_std**2 + misfit + unsure) / (PSEUDO_BLOCKS + sums.weight)
+    left = variance[..., None] / (variance[..., None] + share)
+    found = x + _product(axes, pull / (variance[..., None] + share))
+    return GaussianState(found, (axes * left[..., None, :]) @ np.swapaxes(axes, -1, -2)), variance
+
+
+def _product(matrix: Array, vector: Array) -> Array:
+    """(..., m, n) times (..., n)."""
+    product: Array = (matrix @ vector[..., None])[..., 0]
+    return product
