@@ -12,6 +12,7 @@ show (time_blocks.py). (Long, because what a hypothesis knows, of heave and over
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -208,8 +209,10 @@ class DelayBank:
         x = (p @ self._vector[best][..., None])[..., 0]
         sums = self._heave.sums()
         own = HeaveSums(sums.told[best], sums.scatter[best], sums.weight)
-        _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
-        self._heave_variance = float(variance[0])
+        with suppress(np.linalg.LinAlgError):  # numbers that run away: what was learnt before is kept
+            _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
+            if np.isfinite(variance[0]):
+                self._heave_variance = float(variance[0])
 
     def _absorb_heave(self) -> None:
         """Under a random walk what a row tells ages with the rest."""
