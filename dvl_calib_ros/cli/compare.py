@@ -84,7 +84,7 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
 
     discovery = common.discovered(arguments, [path], common.load(arguments))
     with common.progress(f"replaying {name}") as on_progress:
-        replayed = replay([path], discovery.parameters, discovery.topics, on_progress)
+        replayed = replay([path], discovery.parameters, discovery.topics, on_progress, judged=False)
     known = {str(each) for each in replayed.findings}
     common.print_warnings([note for note in replayed.notes if note not in known])  # what is damaged or missing
     found = extrinsics_of_replay(replayed, name)

@@ -141,7 +141,7 @@ def _each_by_itself(
         if len(groups) == 1 or not any(bag.has_dvl for bag in group):
             continue
         try:
-            replayed = replay([bag.path for bag in group], alone, topics, progress_of(index))
+            replayed = replay([bag.path for bag in group], alone, topics, progress_of(index), judged=False)
         except InputError:  # too little of the DVL to be a calibration; all together will say what is wrong with it
             unchecked.append(name)
             continue

@@ -93,6 +93,7 @@ def replay(
     on_progress: Callable[[float], None] = lambda _: None,
     *,
     with_history: bool = False,
+    judged: bool = True,
     on_rows: Callable[[AlignedBlock], None] | None = None,
     on_restart: Callable[[], None] = lambda: None,
     on_finished: Callable[[Calibrator], None] = lambda _: None,
@@ -100,7 +101,8 @@ def replay(
     """Calibrate with the bags at `paths`, read as one in order of log time.
 
     on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way, else on_rows is
-    given the aligned rows, and on_restart told, as by `Calibrator`. on_finished: given that at its end.
+    given the aligned rows, and on_restart told, as by `Calibrator`. judged: say what it is worth on data held out, its
+    verifications and navigation. on_finished: given the calibrator at its end.
     Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
@@ -123,7 +125,7 @@ def replay(
             on_event=events.append,
             on_rows=recorder.take if recorder else on_rows,
             on_restart=recorder.start if recorder else on_restart,
-            verified=True,
+            verified=judged,
             trace=recorder.trace if recorder else None,
             recordings_ns=_between(bag),
         )
@@ -136,11 +138,16 @@ def replay(
         result = replace(result, days=_named(result.days, paths, bag))
     found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator) if recorder else None
-    navigation = navigation_of(calibrator, result.selected, calibrator.parameters)
-    verifications = dict(result.verifications)
-    verifications[result.selected] = verifications[result.selected].with_objections(objections(navigation))
+    navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
+    said = objections(navigation)
     return Replayed(
-        replace(result, verifications=verifications),
+        replace(
+            result,
+            verifications={
+                name: verification.with_objections(said) if name == result.selected else verification
+                for name, verification in result.verifications.items()
+            },
+        ),
         (*bag.notes, *events, *map(str, found)),
         tuple(found),
         decoder.dvl_frame or "dvl_link",
