@@ -154,9 +154,13 @@ class Group:
         after = on_another_day(before, self._assembler.prior, self._of_day)
         self._x, self._p = after
         if self._scatter is not None:
-            self._scatter.end_day(before, after, self._of_day, self._now())
+            try:
+                self._scatter.end_day(before, after, self._of_day, self._now())
+            except np.linalg.LinAlgError:  # numbers that ran away: it looks at the new day alone
+                self._scatter = BlockScatter(*after, BLOCK_S)
         if self._folds is not None:
-            self._folds.end_day(self._assembler.prior, self._of_day)
+            with suppress(np.linalg.LinAlgError):
+                self._folds.end_day(self._assembler.prior, self._of_day)
         self._states.clear()
 
     def _with_heave(

@@ -61,12 +61,14 @@ class FoldInformation:
 
     def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
         """Go on from what is known, but of the states of the day (u,) from `start`, x (K, n), P (K, n, n)."""
+        prior, prior_state = np.empty_like(self._prior), np.empty_like(self._prior_state)
         for fold in range(FOLDS):
             for index in range(start.x.shape[0]):
                 known = GaussianState(start.x[index], start.p[index])
                 x, p = on_another_day(self.without(fold, index), known, of_day)
-                self._prior[fold, index] = np.linalg.inv(p)
-                self._prior_state[fold, index] = self._prior[fold, index] @ x
+                prior[fold, index] = np.linalg.inv(p)
+                prior_state[fold, index] = prior[fold, index] @ x
+        self._prior, self._prior_state = prior, prior_state
         self._information[:] = 0.0
         self._information_state[:] = 0.0
 

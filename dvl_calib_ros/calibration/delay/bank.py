@@ -132,22 +132,27 @@ class DelayBank:
         self._log_prior = -0.5 * (DELAYS_S - prior.x[DELAY]) ** 2 / variance
 
     def end_day(self) -> None:
-        """Go on with what belongs to the vehicle; delay and constant error of the reference are to be found anew."""
+        """Go on with what belongs to the vehicle; delay and constant error of the reference are to be found anew.
+
+        Raises numpy.linalg.LinAlgError, and is as before, where numbers have run away.
+        """
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
         inflation = self._inflation(best, found)
+        shown = self._shown(best, inflation)
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
-        self._ended.append(_Ended(known, self._shown(best, inflation), inflation))
+        begins = [_information(_around_each_delay(on_another_day(each, self._unknown, OF_DAY))) for each in known]
         total = np.linalg.inv(found.p)
         source = np.full(len(DELAYS_S), best)
+        # what can fail has not, and from here on all changes together
         self.blocks.end_day(OF_DAY, total, (total @ found.x[..., None])[..., 0], source)
+        self._ended.append(_Ended(known, shown, inflation))
         self._heave.close()
         self._heave.absorb()  # its rows are in what is known
         self._heave.learn_from(source)
         self.prior = on_another_day(self.prior, self._unknown, OF_DAY)
         self._begin_day()
-        begins = [_information(_around_each_delay(on_another_day(each, self._unknown, OF_DAY))) for each in known]
         self._information, self._vector = begins[0]
         if self._folds is not None:
             for fold, (information, vector) in enumerate(begins[1:]):

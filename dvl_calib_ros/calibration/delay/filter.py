@@ -248,7 +248,10 @@ class DelayFilter:
         while len(self._day_starts_ns) < len(starts_ns):
             if starts_ns[len(self._day_starts_ns)] - LONGEST_DELAY_NS >= block_ns + BLOCK_NS:
                 return
-            self._bank.end_day()
+            try:
+                self._bank.end_day()
+            except np.linalg.LinAlgError:  # numbers that ran away: as if it were the same day
+                self.restarted += 1
             self._reference_clock.start()
             self._day_starts_ns.append(block_ns)
             self._changed = True

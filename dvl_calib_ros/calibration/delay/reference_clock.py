@@ -166,15 +166,24 @@ class ReferenceClock:
         weighted = (h * weight[:, None, None]).reshape(n_late, n_about, 2 * n, _N).swapaxes(2, 3)
         information = weighted @ h.reshape(n_late, n_about, 2 * n, _N)
         vector = (weighted @ z.reshape(n_late, n_about, 2 * n, 1))[..., 0]
+        square = np.einsum("rdji,rdji,j->rd", z, z, weight)
+        if not (np.isfinite(information).all() and np.isfinite(vector).all() and np.isfinite(square).all()):
+            return  # it goes on as before these
         self._blocks.add(information.reshape(-1, _N, _N), vector.reshape(-1, _N), 2.0 * n)
         self._information += information
         self._vector += vector
-        self._square += np.einsum("rdji,rdji,j->rd", z, z, weight)
+        self._square += square
 
     def found(self) -> LateClocks | None:
         """Both clocks, where the reference's is off beyond doubt; else None."""
         if self._around is None or self._blocks.weight < 4.0 * _N:
             return None
+        try:
+            return self._found(self._around)
+        except np.linalg.LinAlgError:  # numbers that ran away
+            return None
+
+    def _found(self, around: float) -> LateClocks | None:
         x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
         misfit = self._square - np.einsum("rdi,rdi->rd", x, self._vector)
         level = max(1.0, float(misfit.min()) / (self._blocks.weight - _N))
@@ -186,10 +195,12 @@ class ReferenceClock:
             inflation = float(self._blocks.inflation(likeliest, x.reshape(-1, _N)[likeliest], own)[_SHOWS].max())
         level *= inflation**2
         evidence = -0.5 * (misfit / level + np.linalg.slogdet(self._information)[1])
+        if not np.isfinite(evidence).all():
+            return None
         each = evidence.max(axis=1)
         share = np.exp(evidence - each[:, None])
         share /= share.sum(axis=1, keepdims=True)
-        delays = self._around + ABOUT_S + x[..., _DELAY]
+        delays = around + ABOUT_S + x[..., _DELAY]
         delay = (share * delays).sum(axis=1)
         variance = np.linalg.inv(self._information)[..., _DELAY, _DELAY] * level + (delays - delay[:, None]) ** 2
         std = np.sqrt((share * variance).sum(axis=1))
