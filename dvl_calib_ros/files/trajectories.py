@@ -29,6 +29,7 @@ N_COLUMNS = 4
 SUFFIXES = ("csv", "npy")
 # What is written in a cell where there is no value, beside nan
 NO_VALUE = ("", "na", "n/a", "null", "none", "-")
+EXPECTED = "time and three values, separated by commas, with decimal points"
 # How much of a bad row is shown, characters
 SHOWN = 200
 # Words of a header that tell which of the three values a column holds
@@ -78,31 +79,37 @@ def _read_npy(path: Path) -> Array:
 def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
     """Rows of numbers, NaN where there is none, and what is said of the file."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        is_finished = text.endswith("\n")
-        # what a power cut leaves may end in zeros
-        rows = [row for row in csv.reader(io.StringIO(text.rstrip("\0"))) if row]
+        text = path.read_text(encoding="utf-8-sig").rstrip("\0")  # what a power cut leaves may end in zeros
+        rows = [row for row in csv.reader(io.StringIO(text)) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as CSV ({error}); save it as such, in UTF-8") from error
     left_out = []
-    if len(rows) > 1 and not is_finished:
+    if len(rows) > 1 and not text.endswith("\n"):
         left_out.append(f"{path}: its last line is not finished, and left out: {','.join(rows.pop())[:SHOWN]}")
     if rows and not _is_number(rows[0][0]):
         _check_header(path, rows.pop(0), unit)
     values = []
     for number, row in enumerate(rows, start=1):
         if len(row) != N_COLUMNS:
-            raise InputError(f"{path}: data row {number} has {len(row)} columns, expected time and three values")
+            raise InputError(f"{path}: data row {number} has {len(row)} columns, expected {EXPECTED}")
         try:
-            values.append([math.nan if cell.strip().lower() in NO_VALUE else float(cell) for cell in row])
+            values.append([math.nan if cell.strip().lower() in NO_VALUE else _number(cell) for cell in row])
         except ValueError:
-            raise InputError(f"{path}: data row {number} is not all numbers: {','.join(row)[:SHOWN]}") from None
+            shown = ",".join(row)[:SHOWN]
+            raise InputError(f"{path}: data row {number} is not all numbers: {shown}; expected {EXPECTED}") from None
     return np.array(values, dtype=float).reshape(-1, N_COLUMNS), left_out
+
+
+def _number(text: str) -> float:
+    """Raises ValueError for what is none, also for 1_0, which Python takes for ten."""
+    if "_" in text:
+        raise ValueError
+    return float(text)
 
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        _number(text)
     except ValueError:
         return False
     return True
@@ -110,10 +117,10 @@ def _is_number(text: str) -> bool:
 
 def _check_header(path: Path, header: list[str], unit: str) -> None:
     if len(header) != N_COLUMNS:
-        raise InputError(f"{path}: has {len(header)} columns, expected time and three values")
+        raise InputError(f"{path}: has {len(header)} columns, expected {EXPECTED}")
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
     for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
-        if found and found.group(1).strip() != expected:
+        if found and found.group(1).strip().lower() != expected:
             raise InputError(f"{path}: column {cell[:SHOWN]!r} is not in {expected}; convert it first")
     if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp"):
         raise InputError(f"{path}: the first column is {header[0][:SHOWN]!r}, expected time")
@@ -129,7 +136,10 @@ def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:
     """Times (N,) s of a file from a start, as integer nanoseconds. Raises InputError for what no stamp can hold."""
     stamps = [start_ns + round(float(t) * 1e9) for t in time]
     if stamps[0] < 0 or stamps[-1] >= 2**31 * 1_000_000_000:
-        raise InputError(f"{path}: from {time[0]:g} to {time[-1]:g} s, after --start, is not in 1970 .. 2038")
+        raise InputError(
+            f"{path}: from {time[0]:.12g} to {time[-1]:.12g} s, after --start, is not in 1970 .. 2038; times are "
+            "seconds, and those since 1970 need --start 0"
+        )
     return stamps
 
 

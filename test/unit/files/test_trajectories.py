@@ -35,6 +35,11 @@ def csv(path: Path, table=TABLE, header: str = HEADER) -> Path:
     return path
 
 
+def windows(path: Path) -> Path:
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    return path
+
+
 def npy(path: Path, table=TABLE) -> Path:
     np.save(path, table)
     return path
@@ -52,7 +57,15 @@ def folder(tmp_path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "write", [csv, npy, lambda path: csv(path, header=""), lambda path: csv(path, header="\ufeff")]
+    "write",
+    [
+        csv,
+        npy,
+        lambda path: csv(path, header=""),
+        lambda path: csv(path, header="\ufeff"),
+        lambda path: csv(path, header=HEADER.upper()),
+        lambda path: windows(csv(path)),
+    ],
 )
 def test_every_kind_of_file_gives_the_same_exact_numbers(tmp_path, write):
     name = "a.npy" if write is npy else "a.csv"
@@ -122,6 +135,9 @@ WRONG = {
     "latin1.csv": ("Zeit [s],°,°,°\n0,1,2,3\n".encode("latin-1"), "cannot be read as CSV"),
     "binary.csv": (bytes(range(256)), "cannot be read as CSV"),
     "nanoseconds.csv": (HEADER + "1600000000000000000,1,2,3\n", "not in 1970 .. 2038"),
+    "since_1970.csv": (HEADER + "1790000000.25,1,2,3\n", "1790000000.25 s, after --start, is not in 1970 .. 2038; times"
+                       " are seconds, and those since 1970 need --start 0"),
+    "underscore.csv": (HEADER + "0,1_0,2,3\n", "data row 1 is not all numbers"),
     "negative.csv": (HEADER + "-1600000001,1,2,3\n", "not in 1970 .. 2038"),
     "text.npy": ("0,1,2,3\n", "not a NumPy array file"),
     "empty.npy": ("", "not a NumPy array file"),
@@ -167,7 +183,7 @@ def test_rows_of_an_array_that_are_not_finite_are_left_out_too_and_the_order_of_
     assert time.tolist() == [0.0, 0.4] and "1 of 3 rows" in left_out[0]
 
 
-@searched(40)
+@searched(80)
 @given(data=st.data())
 def test_of_a_file_that_is_cut_anywhere_no_number_is_taken_that_was_not_in_it(tmp_path_factory, data):
     """A copy that was interrupted, with the zeros that a power cut may leave behind it."""
