@@ -14,7 +14,7 @@ from runs import SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_sa
 from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS, Needs
-from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
+from dvl_calib_ros.calibration.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 
 PHI, SCALE = (2e-5, -3e-5, 4e-5), 3e-5
@@ -616,6 +616,68 @@ def test_no_parameters_make_a_state_that_is_not_finite(options):
     samples = make_samples(NOISY)
     for block_size in (1, STRETCH):
         check_finite(calibrate(samples, Parameters(**options), block_size=block_size, verified=True))
+
+
+@st.composite
+def covariances(draw) -> np.ndarray | None:
+    """Definite with deviations of 1e-9 .. 1e9 m/s and any correlation, mostly; else any nine numbers, or none."""
+    kind = draw(st.sampled_from(["definite", "definite", "definite", "any", "none"]))
+    if kind == "none":
+        return None
+    if kind == "any":
+        return np.array(draw(st.lists(st.floats(), min_size=9, max_size=9))).reshape(3, 3)
+    below = np.tril(np.array(draw(st.lists(st.floats(-1.0, 1.0), min_size=9, max_size=9))).reshape(3, 3), -1)
+    root = below + np.eye(3) * draw(st.sampled_from([1.0, 1e-3, 1e-6]))
+    root *= (np.array(draw(st.tuples(*[st.sampled_from([1e-9, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e9])] * 3))))[:, None]
+    return root @ root.T
+
+
+@st.composite
+def settings_inside_their_bounds(draw) -> dict:
+    """Some parameters, each anywhere inside its bounds, often on one."""
+    values = {}
+    for name in draw(st.lists(st.sampled_from(sorted(SCHEMA)), max_size=8, unique=True)):
+        spec = SCHEMA[name]
+        number = st.sampled_from([spec.low, spec.high]) | st.floats(spec.low or 0.0, spec.high or 0.0)
+        if spec.choices:
+            values[name] = draw(st.sampled_from(spec.choices))
+        elif spec.kind == "bool":
+            values[name] = draw(st.booleans())
+        elif spec.kind == "double":
+            values[name] = draw(number)
+        elif spec.kind == "double_array":
+            values[name] = tuple(draw(number) for _ in range(spec.length))
+    return values
+
+
+@searched(40)
+@given(
+    given_values=settings_inside_their_bounds(),
+    claimed=st.lists(
+        st.tuples(st.sampled_from([DvlSample, ReferenceSample]), st.integers(2, 40), covariances()), max_size=3
+    ),
+    frame=st.sampled_from(VelocityFrame),
+    block_size=st.sampled_from([1, 7, 64]),
+)
+def test_any_parameters_inside_their_bounds_with_any_covariances_leave_every_state_finite_and_every_variance_positive(
+    given_values, claimed, frame, block_size
+):
+    try:
+        parameters = Parameters(**given_values)
+    except ParameterError:  # two that do not go together
+        return
+    samples = make_samples(variant(NOISY, frame=frame, imu_every=1, seconds=12))
+    for kind, every, covariance in claimed:
+        samples = [
+            sample._replace(covariance=covariance)
+            if isinstance(sample, kind) and number % every < every // 2
+            else sample
+            for number, sample in enumerate(samples)
+        ]
+    calibrator = calibrate(samples, parameters, block_size=block_size, verified=True)
+    check_finite(calibrator)
+    for name in MODELS:
+        assert np.linalg.eigvalsh(calibrator.state(name).p)[0] > 0.0, name
 
 
 def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_counted(monkeypatch):
