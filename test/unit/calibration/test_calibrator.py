@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 from conftest import searched
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from runs import SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
@@ -650,6 +650,14 @@ def settings_inside_their_bounds(draw) -> dict:
     return values
 
 
+INDEFINITE = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@example({}, [(DvlSample, 2, INDEFINITE)], VelocityFrame.ENU, 64)
+@example({}, [(ReferenceSample, 2, 0.1 * INDEFINITE)], VelocityFrame.BODY, 1)
+@example(
+    {}, [(DvlSample, 2, np.diag([np.inf, 1.0, 1.0])), (ReferenceSample, 2, 0.5 * INDEFINITE)], VelocityFrame.NED, 7
+)
 @searched(40)
 @given(
     given_values=settings_inside_their_bounds(),
@@ -668,16 +676,24 @@ def test_any_parameters_inside_their_bounds_with_any_covariances_leave_every_sta
         return
     samples = make_samples(variant(NOISY, frame=frame, imu_every=1, seconds=12))
     for kind, every, covariance in claimed:
-        samples = [
-            sample._replace(covariance=covariance)
-            if isinstance(sample, kind) and number % every < every // 2
-            else sample
-            for number, sample in enumerate(samples)
-        ]
+        spoilt = {id(sample) for sample in only(samples, kind)[::every]}
+        samples = [sample._replace(covariance=covariance) if id(sample) in spoilt else sample for sample in samples]
     calibrator = calibrate(samples, parameters, block_size=block_size, verified=True)
     check_finite(calibrator)
     for name in MODELS:
         assert np.linalg.eigvalsh(calibrator.state(name).p)[0] > 0.0, name
+    if not given_values:  # what is no covariance is kept out, and not left to the gate or the last guard
+        assert not any(name.endswith("restarted") for name in calibrator.counts["calibration"])
+        for kind, _, covariance in claimed[-1:]:
+            if covariance is not None and is_indefinite(covariance):
+                assert calibrator.counts["dvl" if kind is DvlSample else "reference"]["invalid"] > 0
+
+
+def is_indefinite(covariance: np.ndarray) -> bool:
+    """Of measured variances that are given, and by far not definite."""
+    variances = np.diag(covariance)
+    given = np.isfinite(covariance).all() and variances.min() > 1e-9 and variances.max() < 1e3
+    return given and np.linalg.eigvalsh(covariance + covariance.T)[0] < -1e-6 * variances.max()
 
 
 def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_counted(monkeypatch):
