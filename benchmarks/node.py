@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +36,8 @@ SOAK_WARM_UP = 0.25
 MEMORY_TARGET_MB_PER_H = 1.0
 CPU_GROWTH_TARGET = 1.1
 ROUNDS = 3
+# CPU is measured in so many windows of so long, once all have had so long to start, s.
+WINDOWS, WINDOW_S, STARTING_S = 12, 3.0, 8.0
 MEGABYTE = 1 << 20
 
 _NODE = [sys.executable, "-m", "dvl_calib_ros.node.main"]
@@ -55,17 +57,17 @@ except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
 
 
 def measure_cpu() -> list[Measurement]:
-    """CPU per DVL sample at 50 Hz with GNSS at 10 Hz, every model in the bank; in turns with the peer."""
-    ours, peer = [], []
-    for _ in range(ROUNDS):
-        ours.append(_cpu_per_sample(_NODE, 50.0, 20.0))
-        peer.append(_cpu_per_sample([sys.executable, "-c", _REPUBLISHER], 50.0, 20.0))
-    ratio = min(ours) / min(peer)
+    """CPU per DVL sample at 50 Hz with GNSS at 10 Hz, every model in the bank.
+
+    Node and peer at once, with the same messages: what else the machine does meets both. The best of some windows.
+    """
+    ours, peer = _cpu_per_sample([_NODE, [sys.executable, "-c", _REPUBLISHER]], 50.0)
+    ratio = ours / peer
     return [
         Measurement(
             "node, CPU per DVL sample at 50 Hz (GNSS at 10 Hz, all models)",
-            f"{1e6 * min(ours):.0f} µs",
-            f"{1e6 * min(peer):.0f} µs (rclpy subscriber that republishes)",
+            f"{1e6 * ours:.0f} µs",
+            f"{1e6 * peer:.0f} µs (rclpy subscriber that republishes)",
             f"{ratio:.2f}",
             f"<= {CPU_TARGET:g}",
             ratio <= CPU_TARGET,
@@ -227,19 +229,25 @@ def _report(publisher: subprocess.Popen[str]) -> dict[str, Any]:
     return json.loads(said)
 
 
-def _cpu_per_sample(command: list[str], rate: float, seconds: float) -> float:
-    """CPU time (s) of a process per message that is published to it, start-up and discovery left out."""
+def _cpu_per_sample(commands: list[list[str]], rate: float) -> list[float]:
+    """CPU time (s) of each of some processes per message that is published to all, start-up and discovery left out."""
     environment = _environment()
-    with _process(command, environment) as process:
-        publisher = _publish(environment, dvl_rate=rate, gnss_rate=10.0, seconds=seconds)
-        time.sleep(5.0)  # both are up and matched: the rest is steady
-        before, started = _cpu_seconds(process.pid), time.monotonic()
-        time.sleep(seconds - 7.0)
-        used, elapsed = _cpu_seconds(process.pid) - before, time.monotonic() - started
+    with ExitStack() as running:
+        processes = [running.enter_context(_process(command, environment)) for command in commands]
+        time.sleep(STARTING_S)
+        publisher = _publish(environment, dvl_rate=rate, gnss_rate=10.0, seconds=WINDOWS * WINDOW_S + 10.0)
+        time.sleep(5.0)  # all are up and matched: the rest is steady
+        used = []
+        for _ in range(WINDOWS):
+            before, started = [_cpu_seconds(process.pid) for process in processes], time.monotonic()
+            time.sleep(WINDOW_S)
+            after, samples = [_cpu_seconds(process.pid) for process in processes], (time.monotonic() - started) * rate
+            used.append((np.array(after) - before) / samples)
         publisher.communicate(timeout=60)
-        process.send_signal(signal.SIGINT)
-        process.wait(30)
-    return used / (elapsed * rate)
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+            process.wait(30)
+    return np.min(used, axis=0).tolist()
 
 
 def _cpu_seconds(pid: int) -> float:
