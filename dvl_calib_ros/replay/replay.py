@@ -1,4 +1,7 @@
-"""The calibration over recorded bags: the same estimator as the node's, fed from files."""
+"""The calibration over recorded bags: the same estimator as the node's, fed from files.
+
+(Long, because what is asked of a bag before it is replayed, and said of it after, belongs to the same door.)
+"""
 
 from __future__ import annotations
 
