@@ -15,6 +15,7 @@ from scipy.interpolate import make_interp_spline
 
 from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
+from ..calibration.spikes import beside, off_neighbours, without_spikes
 from .claims import loudness
 from .settings import SETTINGS
 
@@ -22,8 +23,6 @@ from .settings import SETTINGS
 MIN_SPECTRUM, BANDS = 60, 40
 # Power of a band over that of noise up to which it is noise alone, and from which all of it is kept
 NOISE_ALONE, SOME_MOTION = 1.4, 2.5
-# Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out
-SPIKE, SPIKE_PASSES = 12.0, 3
 # Fourth differences
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Streams slower than this show turns and waves barely; they have no frequencies to spare
@@ -148,23 +147,10 @@ class Curve:
 
         Of a fast stream only: between the samples of a slow one a vehicle can turn (`without_contradicted`).
         """
-        curve = self
-        for _ in range(SPIKE_PASSES):
-            if curve.interval > FAST_ENOUGH_S or len(curve.time) < 10:
-                return curve
-            off = curve.from_neighbours
-            scale = np.maximum(robust_std(off), 1e-9)
-            far = (np.abs(off) / scale).max(axis=1)
-            at = np.flatnonzero(far >= SPIKE)
-            # the good one between two spikes is far from where these tell it to be, and among the five about it
-            about = np.clip(at[:, None] + np.arange(-2, 3), 0, len(far) - 1)
-            alone = np.abs(curve.values[at] - np.median(curve.values[about], axis=1)) / curve.loudness[at]
-            far[at] = (np.minimum(np.abs(off[at]), alone) / scale).max(axis=1)
-            kept = (far < SPIKE) | (far < beside(far))  # what a spike does to its neighbours is not theirs
-            if kept.all():
-                return curve
-            curve = curve.part(kept)
-        return curve
+        if self.interval > FAST_ENOUGH_S:
+            return self
+        kept = without_spikes(self.values, self.loudness)
+        return self if kept.all() else self.part(kept)
 
     @cached_property
     def noise(self) -> Array:
@@ -204,19 +190,6 @@ class Curve:
         if claims is not None:
             claims = np.sqrt(np.add.reduceat(claims**2, starts, axis=0)) / counts[:, None]
         return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed, claims=claims)
-
-
-def off_neighbours(values: Array) -> Array:
-    """(N, k) how far samples are from the cubic through two neighbours on either side; 0 at the ends."""
-    off = np.zeros_like(values)
-    x = values
-    off[2:-2] = x[2:-2] - (4.0 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6.0
-    return off
-
-
-def beside(sizes: Array) -> Array:
-    """(N,) the larger of the two neighbours of each of (N,), which are not negative."""
-    return np.maximum(np.append(sizes[1:], 0.0), np.append(0.0, sizes[:-1]))
 
 
 def _on_cubics(values: Array) -> Array:

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
-from ..diagnosis.curve import FAST_ENOUGH_S, beside, off_neighbours
+from ..calibration.spikes import beside, off_neighbours
+from ..diagnosis.curve import FAST_ENOUGH_S
 from .logs import DITHER_MPS, Log
 from .results import Triple
 from .stream_facts import DROPOUT_INTERVALS

@@ -27,8 +27,15 @@ def motion(time, waves_mps):
     return rate, heading, np.stack([speed, sway, waves_mps * np.cos(wave)], axis=-1)
 
 
-def recorded(path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.02, claimed=CLAIMED):
-    """A bag of it, as a DVL measures that sits, is late and is turned so; nothing in it says where the DVL is."""
+def spike(rng, share):
+    return rng.normal(0, 1.5, 3) if rng.random() < share else 0.0
+
+
+def recorded(path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.02, claimed=CLAIMED, spikes=0.0):
+    """A bag of it, as a DVL measures that sits, is late and is turned so; nothing in it says where the DVL is.
+
+    spikes: share of samples of DVL and reference that are off by metres per second.
+    """
     rng = np.random.default_rng(5)
     time = np.arange(0.0, SECONDS, 1.0 / RATE_HZ)
     dvl_from_body = rotation_from_rpy(mounting_rpy).T
@@ -39,9 +46,11 @@ def recorded(path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.
         rotation = rotation_from_rpy([0.0, 0.0, float(heading)])
         samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), (0.0, 0.0, float(rate))))
         seen = rotation @ body + rng.normal(0, 0.02, 3)
+        seen += spike(rng, spikes)
         samples.append(ReferenceSample(stamp, tuple(seen.tolist()), claimed, VelocityFrame.ENU))
         rate, _, body = motion(np.array(at - late_s), waves_mps)
         there = dvl_from_body @ (body + np.cross([0.0, 0.0, rate], lever_arm)) + rng.normal(0, 0.005, 3)
+        there += spike(rng, spikes)
         samples.append(DvlSample(stamp, tuple(there.tolist())))
     return write_bag(path, tuple(heapq.merge(samples, key=lambda sample: sample.stamp_ns)))
 
@@ -60,9 +69,28 @@ def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp
     np.testing.assert_allclose(mounting.rpy_deg[1:], 0.0, atol=0.5)
 
 
+@pytest.mark.parametrize("late_s", [0.0, 1.3])
+def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path, late_s):
+    calibration = dc.replay(
+        recorded(tmp_path / "bag", (1.3, 0.2, 0.0), late_s, waves_mps=0.1, spikes=0.03), history=False
+    )
+    assert calibration.model == "G2" and calibration.verdict != "reject", calibration.reasons
+    np.testing.assert_allclose(calibration.mounting.xyz_m[:2], (1.3, 0.2), atol=0.05)
+    assert calibration.mounting.time_offset_s == pytest.approx(late_s, abs=0.05)
+    assert calibration.replayed.result.estimate.gated >= 20
+
+
 def test_a_reference_that_claims_no_noise_is_not_suspected_for_being_better_than_the_parameters_say(tmp_path):
     calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.0, 0.0), 0.0, claimed=None), history=False)
     assert calibration.model == "G2" and calibration.verdict == "accept", calibration.reasons
+
+
+def test_what_is_verified_is_what_is_published(tmp_path):
+    # by a noise of 0.2 m/s, which is taken where none is claimed, the run does not show the delay
+    calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.0, 0.0), -2.2, claimed=None), history=False)
+    assert calibration.mounting.time_offset_s == 0.0 and calibration.mounting.time_offset_std_s == pytest.approx(1.0)
+    held_out = calibration.replayed.result.verifications["G2"].held_out
+    assert held_out.corrected > 0.05, "the error of a delay that nobody is told"
 
 
 @pytest.mark.parametrize("late_s", [0.0, 2.0])

@@ -290,13 +290,8 @@ class DelayBank:
         state = self._mixture(found, log_share)
         inflation = self._inflation(best, found)
         shown = self._shown(best, inflation)
-        x, p = state.x, state.p * inflation[:, None] * inflation
-        for index in range(*BEYOND.indices(N_STATE)):
-            if not shown[index]:  # claimed nothing of
-                x[index] = self.prior.x[index]
-                p[index] = p[:, index] = 0.0
-                p[index, index] = self.prior.p[index, index]
-        return Posterior(GaussianState(x, p), shown, inflation)
+        raised = GaussianState(state.x, state.p * inflation[:, None] * inflation)
+        return Posterior(_claimed(raised, shown, np.arange(N_STATE)[BEYOND], self.prior), shown, inflation)
 
     def days(self) -> list[DayState]:
         """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""
@@ -304,22 +299,28 @@ class DelayBank:
         states = self._on_days_before(self._mixture(found, log_share), self._held(found, log_share), 0)
         days = []
         for ended, (x, p) in zip(self._ended, states, strict=True):
-            p = p * ended.inflation[:, None] * ended.inflation
-            for index in OF_DAY[~ended.shown[OF_DAY]]:  # claimed nothing of
-                x[index] = self._unknown.x[index]
-                p[index] = p[:, index] = 0.0
-                p[index, index] = self._unknown.p[index, index]
-            days.append(DayState(GaussianState(x, p), ended.shown))
+            raised = GaussianState(x, p * ended.inflation[:, None] * ended.inflation)
+            days.append(DayState(_claimed(raised, ended.shown, OF_DAY, self._unknown), ended.shown))
         return days
 
     def without_fold(self, fold: int) -> list[GaussianState]:
-        """The states of every day had the bank not seen a fold, the delay's probabilities being those of all data."""
-        _, log_share = self._shares()
+        """The states of every day had the bank not seen a fold, the delay's probabilities being those of all data.
+
+        What all data do not show is taken to be as it was known before, for what is verified is what is published.
+        """
+        of_all, log_share = self._shares()
+        best = int(np.argmax(log_share))
+        shown = self._shown(best, self._inflation(best, of_all))
         found = self._solve(fold)
         last = self._mixture(found, log_share)
-        if not self._ended:
-            return [last]
-        return [*self._on_days_before(last, self._held(found, log_share), 1 + fold), last]
+        before = self._on_days_before(last, self._held(found, log_share), 1 + fold) if self._ended else []
+        of, nothing = np.arange(N_STATE)[BEYOND], np.zeros((N_STATE, N_STATE))
+        is_of_day = np.isin(np.arange(N_STATE), OF_DAY)
+        states = [
+            _claimed(state, np.where(is_of_day, ended.shown, shown), of, GaussianState(self._unknown.x, nothing))
+            for state, ended in zip(before, self._ended, strict=True)
+        ]
+        return [*states, _claimed(last, shown, of, GaussianState(self.prior.x, nothing))]
 
     def _on_days_before(self, last: GaussianState, held: GaussianState, fold: int) -> list[GaussianState]:
         """The states (n,) of days that are over, by what later ones say of the vehicle (Rauch, Tung, Striebel).
@@ -381,6 +382,16 @@ class DelayBank:
         std = np.sqrt(np.diag(np.linalg.inv(data + wide))) * inflation
         shown: Mask = (std <= SHOWN_SHARE * self._unknown_std) | known_before
         return shown
+
+
+def _claimed(state: GaussianState, shown: Mask, of: Index, without: GaussianState) -> GaussianState:
+    """A state (n,) that claims nothing of those `of` its states that are not shown (n,): they are as in another one."""
+    x, p = state.x.copy(), state.p.copy()
+    for index in of[~shown[of]]:
+        x[index] = without.x[index]
+        p[index] = p[:, index] = 0.0
+        p[index, index] = without.p[index, index]
+    return GaussianState(x, p)
 
 
 def _told(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:

@@ -20,8 +20,9 @@ from ..frames import ENU_FROM_NED, Array
 from ..kalman import GaussianState
 from ..observations import Observations
 from ..parameters import Parameters
-from ..samples import FRAME_CODES, FRAMES, Index, Stamps, VelocityFrame, Verdict
+from ..samples import FRAME_CODES, FRAMES, Index, Mask, Stamps, VelocityFrame, Verdict
 from ..selection import NO_EVIDENCE, Evidence
+from ..spikes import without_spikes
 from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
@@ -54,6 +55,11 @@ AXES = ("x", "y", "z")
 # What is less than so many σ from nothing is not worth a word.
 NAMED_FROM = 4.0
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
+
+
+# A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
+# further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
+LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 
 
 class _Dvl(Table):
@@ -110,6 +116,7 @@ class DelayFilter:
         self._dvl = _Dvl()
         self.n_taken = 0  # rows of the aligner that have been looked at
         self._claiming = self._not_claiming = 0  # references
+        self._spikes = 0  # samples of DVL and reference
         self._block_ns: int | None = None  # start of the next block
         self._epoch_ns = 0
         self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
@@ -124,8 +131,8 @@ class DelayFilter:
 
     @property
     def counts(self) -> ModelCounts:
-        """Samples used, those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones."""
-        return ModelCounts(self._bank.used, self._bank.gated, self._bank.mean_nis, 3.0, self.restarted)
+        """Samples used, spikes and those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones."""
+        return ModelCounts(self._bank.used, self._bank.gated + self._spikes, self._bank.mean_nis, 3.0, self.restarted)
 
     @property
     def posterior(self) -> Posterior | None:
@@ -356,9 +363,14 @@ class DelayFilter:
                     )
 
     def _dvl_columns(self, from_ns: int, to_ns: int) -> tuple[DvlColumns, Array]:
-        """DVL samples between two stamps, and their mean covariance (3, 3)."""
+        """DVL samples between two stamps, MARGIN_NS about a block, and their mean covariance (3, 3)."""
         table = self._dvl
-        at = table.between(table.stamps_ns, from_ns, to_ns)
+        rows = table.between(table.stamps_ns, from_ns, to_ns)
+        # one bends the curve that is read between samples for all references about it, and no gate would see that
+        good = _good(table.stamps_ns[rows], table.velocity[rows])
+        at = np.arange(rows.start, rows.stop)[good]
+        spikes = table.stamps_ns[rows][~good]
+        self._spikes += int(np.count_nonzero((spikes >= from_ns + MARGIN_NS) & (spikes < to_ns - MARGIN_NS)))
         covariance = table.covariance[at]
         given = ~np.isnan(covariance[:, 0, 0])
         noise: Array = np.eye(3) * self._parameters.gnss_free_std**2
@@ -378,6 +390,11 @@ class DelayFilter:
         track = self._aligner.reference
         at = track.in_time(from_ns, to_ns)
         at = at[thinned(track.stamps_ns[at])]
+        around = track.in_time(from_ns - MARGIN_NS, to_ns + MARGIN_NS)
+        measured = (track.unmeasured[around, None] & _BITS) == 0
+        good = np.isin(at, around[_good(track.stamps_ns[around], np.where(measured, track.values[around, :3], 0.0))])
+        self._spikes += int(np.count_nonzero(~good))
+        at = at[good]
         values, frames = track.values[at], track.frames[at]
         noise = values[:, 3:12].reshape(-1, 3, 3)
         given = ~np.isnan(noise[:, 0, 0]) & self._parameters.use_message_covariance
@@ -432,3 +449,10 @@ class DelayFilter:
         recording = Recording.of(self._kept)
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + self._epoch_ns
         return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), self._bank, self._parameters)
+
+
+def _good(stamps_ns: Stamps, velocity: Array) -> Mask:
+    """Which samples of a stream are no spikes, (N,) of (N,) ns and (N, 3) m/s."""
+    is_slow = len(stamps_ns) > 1 and float(np.median(np.diff(stamps_ns))) > SLOW_S * 1e9
+    smallest = LEAST_SCATTER_SLOW_MPS if is_slow else LEAST_SCATTER_MPS
+    return without_spikes(velocity, smallest=smallest, also_at_ends=True)
