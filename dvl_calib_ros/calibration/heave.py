@@ -8,7 +8,8 @@ means over a block of time,
 
 with a constant h (trim) as a state. σ² is learnt with the states, by expectation maximisation: it is the scatter of
 the rows about what they are expected to be, together with `motion_std`² as if that had been seen in PSEUDO_BLOCKS
-blocks. So all rows weigh what is known of them now, and a filter with a variance fixed at each row would not do: what
+blocks. It is never below that: in turns a vehicle heaves in proportion to its sway, which is a roll to all rows alike and
+scatters by nothing. So all rows weigh what is known of them now, and a filter with a variance fixed at each row would not do: what
 is kept are sums, joined with the filter's state when somebody asks for it.
 """
 
@@ -168,6 +169,7 @@ def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tupl
         misfit = np.maximum((missed * _product(scatter, missed)).sum(axis=-1), 0.0)
         unsure = (spread * variance[..., None] / (variance[..., None] + share)).sum(axis=-1)
         variance = (PSEUDO_BLOCKS * motion_std**2 + misfit + unsure) / (PSEUDO_BLOCKS + sums.weight)
+        variance = np.maximum(variance, motion_std**2)
     left = variance[..., None] / (variance[..., None] + share)
     found = x + _product(axes, pull / (variance[..., None] + share))
     return GaussianState(found, (axes * left[..., None, :]) @ np.swapaxes(axes, -1, -2)), variance
