@@ -8,9 +8,9 @@ means over a block of time,
 
 with a constant h (trim) as a state. σ² is learnt with the states, by expectation maximisation: it is the scatter of
 the rows about what they are expected to be, together with `motion_std`² as if that had been seen in PSEUDO_BLOCKS
-blocks. It is never below that: in turns a vehicle heaves in proportion to its sway, which is a roll to all rows alike and
-scatters by nothing. So all rows weigh what is known of them now, and a filter with a variance fixed at each row would not do: what
-is kept are sums, joined with the filter's state when somebody asks for it.
+blocks. It is never below that: in turns a vehicle heaves in proportion to its sway, which is a roll to all rows alike
+and scatters by nothing. So all rows weigh what is known of them now, and a filter with a variance fixed at each row
+would not do: what is kept are sums, joined with the filter's state when somebody asks for it.
 """
 
 from __future__ import annotations
