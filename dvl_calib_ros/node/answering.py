@@ -1,4 +1,4 @@
-"""A node that no request of a service can end."""
+"""A node that no request of a service can end, and that says which topic it cannot have."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from ..errors import printable
+from ..errors import InputError, printable
 
 
 class AnsweringNode(Node):  # type: ignore[misc]
@@ -25,3 +25,23 @@ class AnsweringNode(Node):  # type: ignore[misc]
                 return srv_type.Response()
 
         return super().create_service(srv_type, srv_name, answer, **options)
+
+    def create_publisher(self, msg_type: Any, topic: str, *arguments: Any, **options: Any) -> Any:
+        """As rclpy's. Raises InputError."""
+        make = super().create_publisher
+        return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
+
+    def create_subscription(self, msg_type: Any, topic: str, *arguments: Any, **options: Any) -> Any:
+        """As rclpy's. Raises InputError."""
+        make = super().create_subscription
+        return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
+
+
+def _or_refused(topic: str, make: Callable[[], Any]) -> Any:
+    try:
+        return make()
+    except Exception as error:  # rclpy has an error for names, and the middleware's own for one topic of two types
+        why = printable(" ".join(str(error).split()))
+        raise InputError(
+            f"topic {topic!r} cannot be had ({why}); name another: one for each sensor, of letters, digits, _ and /"
+        ) from error

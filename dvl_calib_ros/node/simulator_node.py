@@ -145,7 +145,7 @@ def run_until(
     follow: odometry topic, None for a run of the scenario's own motion, that many times as fast as real time. wait:
     begin when every topic has a subscriber.
     """
-    run = None if follow else simulate(scenario)
+    run = simulate(scenario) if follow is None else None
     samples: list[Sample] = [] if run is None else in_order(run)
     try:
         rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
@@ -159,7 +159,7 @@ def run_until(
         ending.tell(lambda: executor.create_task(lambda: None))
         while wait and not node.is_heard and not ending.requested:
             executor.spin_once(timeout_sec=BREATH_S)
-        if follow:
+        if follow is not None:
             node.follow(follow, scenario)
             while not ending.requested:
                 executor.spin_once()

@@ -21,7 +21,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros import PATIENCE_S, World, until
+from ros import PATIENCE_S, World, refused_at_start, until
 from sensor_msgs.msg import Imu
 
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation
@@ -203,6 +203,24 @@ def test_a_request_that_ros_itself_cannot_read_ends_no_simulator(world):
         request = SetParameters.Request(parameters=[unknown])
         assert world.call(SetParameters, "dvl_simulator/set_parameters", request).results == []
         assert process.poll() is None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--dvl-topic", "//bad//"), ("--follow", ""), ("--follow", "a b"), ("--imu-topic", "dvl/twist")],
+    ids=" ".join,
+)
+def test_a_topic_that_cannot_be_had_is_refused_in_one_line(world, options):
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "simulate", "--live", *options]
+    environment = os.environ | {"ROS_DOMAIN_ID": str(world.domain), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE_S)
+    assert done.returncode == 2 and "name another" in done.stderr
+    assert sum("topic" in line for line in done.stderr.splitlines()) == 1 and "Traceback" not in done.stderr
+
+
+def test_two_sensors_on_one_topic_are_refused_at_the_start_of_the_node(world, monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(world.domain))
+    assert "name another" in refused_at_start("-r", "dvl/twist:=/x", "-r", "imu/data:=/x")
 
 
 def test_another_type_of_the_dvls_messages_can_be_had(world):
