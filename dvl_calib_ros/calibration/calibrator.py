@@ -402,7 +402,7 @@ class Calibrator:
         if self._source(MODELS[name]) is None:  # its own has been raised
             return state
         factor = self.inflation(name)
-        return GaussianState(state.x, state.p * factor[:, None] * factor)
+        return state.raised(factor)
 
     def _source(self, model: Model) -> str | None:
         """The linear model whose estimate a model's is; None for a model of its own that claims more."""

@@ -31,6 +31,8 @@ DRAWN = math.pi / 4.0
 CLEARLY = 40.0
 # Of the sum of squares that the nominal mounting is given: turns about the direction of travel do not show, and stay.
 NOMINAL_SHARE = 1e-3
+# What a lever arm is allowed to explain leaves a misalignment (rad) and a scale below these.
+MISALIGNED, SCALED = math.radians(10.0), 0.1
 # Fewer samples fit anything.
 ENOUGH = 20
 # By how much the DVL's stamps may be late, s: within G2's range, at a step that is short beside turns and waves.
@@ -96,7 +98,7 @@ class CoarseFits:
         if self._count[declared] < ENOUGH:
             return None
         given = float(self._misfits(declared, self._nominal).min())
-        if given < WRONG_FROM:
+        if given < WRONG_FROM or self._fits[0].left_by_little() < WRONG_FROM * self._gg[declared, 0]:
             return self._flipped(given)
         rotations = [self._rotations(index) for index in range(len(_FRAMES))]
         misfits = np.stack([self._misfits(index, each) for index, each in enumerate(rotations)])
@@ -187,9 +189,19 @@ class _AxesFit:
 
     def left(self) -> float:
         """Sum of squares (m/s)² that is left at the best delay."""
-        found = np.linalg.pinv(self._normal, rcond=1e-9, hermitian=True) @ self._vector[:, :, None]
-        left = self._square - (self._vector * found[:, :, 0]).sum(axis=1)
-        return float(np.maximum(left, 1e-12 * np.maximum(self._square, 1e-12)).min())
+        return float(self._solved()[1].min())
+
+    def left_by_little(self) -> float:
+        """The same of those delays at which turn and scale are those of a misalignment; infinite without any."""
+        found, left = self._solved()
+        little = (np.linalg.norm(found[:, :3], axis=1) < MISALIGNED) & (np.abs(found[:, 3]) < SCALED)
+        return float(left[little].min(initial=math.inf)) if self.samples >= ENOUGH else math.inf
+
+    def _solved(self) -> tuple[Array, Array]:
+        """At each delay what fits best (K, 4 or 7), and the sum of squares that it leaves (K,)."""
+        found = (np.linalg.pinv(self._normal, rcond=1e-9, hermitian=True) @ self._vector[:, :, None])[:, :, 0]
+        left = self._square - (self._vector * found).sum(axis=1)
+        return found, np.maximum(left, 1e-12 * np.maximum(self._square, 1e-12))
 
 
 def _as_drawn(rotation: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Tails and quantiles of the usual distributions, and a robust spread, on `scipy.special` alone.
+"""Tails and quantiles of the usual distributions, on `scipy.special` alone.
 
 `scipy.stats` says the same, but importing it takes longer (half a second of CPU) than most of what it is asked here: so
 no module that a command needs for its everyday answer imports it, nor `scipy.signal`, which imports it (a test says
@@ -12,9 +12,6 @@ from numpy.typing import ArrayLike
 from scipy.special import bdtrc, betaincinv, chdtr, chdtrc, chdtri, fdtrc, gammaincinv, ndtr, ndtri
 
 from .frames import Array
-
-# Median of a normal variable's distance from its median, in standard deviations
-_MEDIAN_DISTANCE = float(ndtri(0.75))
 
 
 def chi2_sf(x: ArrayLike, dof: ArrayLike) -> Array:
@@ -60,10 +57,3 @@ def binomial_interval(count: int, n: int) -> tuple[float, float]:
     low = 0.0 if count == 0 else float(betaincinv(count, n - count + 1, 0.025))
     high = 1.0 if count == n else float(betaincinv(count + 1, n - count, 0.975))
     return low, high
-
-
-def robust_std(values: Array) -> Array:
-    """(...) standard deviation of normal values (N, ...), by the median distance from the median; nan of none."""
-    if not len(values):
-        return np.full(values.shape[1:], np.nan)
-    return np.asarray(np.median(np.abs(values - np.median(values, axis=0)), axis=0) / _MEDIAN_DISTANCE)

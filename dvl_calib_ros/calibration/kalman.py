@@ -39,6 +39,10 @@ class GaussianState(NamedTuple):
     x: Array
     p: Array
 
+    def raised(self, factor: Array) -> GaussianState:
+        """The same with each standard deviation times a factor (n,); symmetric to the last bit, as P is."""
+        return GaussianState(self.x, self.p * (factor[:, None] * factor))
+
 
 @dataclass(frozen=True)
 class Measurements:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .distributions import robust_std
 from .frames import Array
+from .robust import robust_std
 from .samples import Mask
 
 # Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out.

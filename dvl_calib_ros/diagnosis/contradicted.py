@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
+from ..calibration.robust import robust_std
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn
 from ..effects.composition import late

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
+from ..calibration.robust import robust_std
 from .recursion import recursion
 
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)

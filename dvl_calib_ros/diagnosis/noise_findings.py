@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf, robust_std
+from ..calibration.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf
 from ..calibration.frames import Array
+from ..calibration.robust import robust_std
 from .claims import claims_of, followed, stretches_of
 from .closure import claimed_std, high_frequency_variance
 from .composed import Problem

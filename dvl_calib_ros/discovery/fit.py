@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.coarse_mounting import DELAYS_S
+from ..calibration.coarse_mounting import DELAYS_S, MISALIGNED, SCALED
 from ..calibration.frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
@@ -39,8 +39,6 @@ KEPT_SHARE = 0.9
 CLEARLY = 0.5
 # ... and fits in itself: what it leaves is below this share of the speed (17 degrees of misalignment).
 FITS = 0.3
-# A misalignment or a scale beyond this is no longer that of the mounting that is declared.
-MISALIGNED, SCALED = math.radians(10.0), 0.1
 # Rounds in which rotation and lever arm are found in turns.
 ROUNDS = 3
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import robust_std
 from ..calibration.frames import Array
+from ..calibration.robust import robust_std
 from ..diagnosis.closure import FOLD_STEPS
 from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
 from ..diagnosis.selection import Selection

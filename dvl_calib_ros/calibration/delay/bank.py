@@ -290,7 +290,7 @@ class DelayBank:
         state = self._mixture(found, log_share)
         inflation = self._inflation(best, found)
         shown = self._shown(best, inflation)
-        raised = GaussianState(state.x, state.p * inflation[:, None] * inflation)
+        raised = state.raised(inflation)
         return Posterior(_claimed(raised, shown, np.arange(N_STATE)[BEYOND], self.prior), shown, inflation)
 
     def days(self) -> list[DayState]:
@@ -299,7 +299,7 @@ class DelayBank:
         states = self._on_days_before(self._mixture(found, log_share), self._held(found, log_share), 0)
         days = []
         for ended, (x, p) in zip(self._ended, states, strict=True):
-            raised = GaussianState(x, p * ended.inflation[:, None] * ended.inflation)
+            raised = GaussianState(x, p).raised(ended.inflation)
             days.append(DayState(_claimed(raised, ended.shown, OF_DAY, self._unknown), ended.shown))
         return days
 
@@ -379,7 +379,8 @@ class DelayBank:
         share[BEYOND] = np.clip(1.0 - self._regressor_noise / np.maximum(np.diag(data)[BEYOND], 1e-300), 0.0, 1.0)
         data = data * np.sqrt(share)[:, None] * np.sqrt(share)
         wide = np.diag((WIDER * self._unknown_std) ** -2)
-        std = np.sqrt(np.diag(np.linalg.inv(data + wide))) * inflation
+        variance = np.diag(np.linalg.inv(data + wide))  # below zero where a random walk has taken more than data gave
+        std = np.sqrt(np.where(variance > 0.0, variance, np.inf)) * inflation
         shown: Mask = (std <= SHOWN_SHARE * self._unknown_std) | known_before
         return shown
 
@@ -421,7 +422,8 @@ def _one(states: GaussianState, kept: Index, share: Array) -> GaussianState:
     x[:, DELAY] += DELAYS_S[kept]
     mean = share @ x
     apart = x - mean
-    return GaussianState(mean, np.einsum("k,kij->ij", share, states.p) + np.einsum("k,ki,kj->ij", share, apart, apart))
+    p = np.einsum("k,kij->ij", share, states.p) + np.einsum("k,ki,kj->ij", share, apart, apart)
+    return GaussianState(mean, 0.5 * (p + p.T))
 
 
 def _information(states: GaussianState) -> tuple[Array, Array]:

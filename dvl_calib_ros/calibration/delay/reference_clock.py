@@ -205,6 +205,9 @@ class ReferenceClock:
         variance = np.linalg.inv(self._information)[..., _DELAY, _DELAY] * level + (delays - delay[:, None]) ** 2
         std = np.sqrt((share * variance).sum(axis=1))
         best = int(np.argmax(each))
+        other_side = ON_TIME + (1 if best < ON_TIME else -1)
+        if each[other_side] > each[ON_TIME]:  # a clock that might as well be off the other way is not shown to be off
+            return None
         if best in (0, len(each) - 1):
             if each[best] - each[ON_TIME] < SAID_FROM_EVIDENCE:
                 return None

@@ -53,6 +53,13 @@ def test_how_samples_are_gathered_changes_nothing(block_size):
         np.testing.assert_allclose(*found, rtol=1e-7, atol=1e-12)
 
 
+def test_a_covariance_is_symmetric_to_the_last_bit_however_much_each_sigma_is_raised():
+    calibrator = calibrate(run(0.1), CLAIMED)
+    for name in MODELS:
+        covariance = calibrator.published(name).p
+        assert (covariance == covariance.T).all(), name
+
+
 def test_a_random_walk_is_left_as_the_filter_has_it():
     estimate = calibrate(run(0.1), CLAIMED.replace(process_std_misalignment=1e-4)).estimate("G1")
     np.testing.assert_allclose(estimate.std, estimate.filter_std)
