@@ -75,7 +75,7 @@ class Mounting:
         Lever arm: position of the DVL in the body, m, as it was found, else as it was given; its standard deviations,
         nan where the model has no lever arm.
     time_offset_s, time_offset_std_s
-        By how much the DVL's stamps are late, s, likewise.
+        By how much the DVL's stamps are late, s, likewise; of several recordings in the last one (`Result.delays`).
     scale_percent, scale_std_percent
         How much too long a motion ahead is measured; nan where the model has no scale.
     base_frame, dvl_frame

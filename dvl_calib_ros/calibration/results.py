@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -125,6 +125,18 @@ class Day:
     name: str = ""
 
 
+class Delay(NamedTuple):
+    """By how much the DVL's stamps are late, s: as the parameters say, and what was found; σ; whether it was shown.
+
+    day: whose it is, None where there is one only.
+    """
+
+    day: Day | None
+    seconds: float
+    std: float
+    shown: bool
+
+
 @dataclass(frozen=True)
 class Result:
     """All models' estimates, which one is selected, and what the data went through.
@@ -151,3 +163,15 @@ class Result:
     def estimate(self) -> Estimate:
         """The selected model's estimate."""
         return self.estimates[self.selected]
+
+    @property
+    def delays(self) -> tuple[Delay, ...]:
+        """What the selected model found of the DVL's clock: one of each day, one if there is one, none without."""
+        estimate = self.estimate
+        if self.days and self.selected == DAYS_OF:
+            return tuple(Delay(day, day.dvl_time_offset, day.dvl_time_offset_std, day.shown) for day in self.days)
+        std = estimate.std_of("time_offset")
+        if std is None:
+            return ()
+        shown = all(each.observed for each in estimate.observability if each.axis == "time offset")
+        return (Delay(None, estimate.dvl_time_offset(self.parameters["dvl_time_offset"]), float(std[0]), shown),)

@@ -92,7 +92,6 @@ def _table(replayed: Replayed) -> Table:
     from ..calibration.models import MODELS
     from ..calibration.observability import body_angle_std, scale_std_ahead
     from ..calibration.parameters import Parameters
-    from ..calibration.results import DAYS_OF
 
     result = replayed.result
     estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
@@ -121,18 +120,12 @@ def _table(replayed: Replayed) -> Table:
                 f"lever arm {axis}", f"{parameters.lever_arm[index]:.2f} m", f"{arm[index]:+.2f} m",
                 f"{arm_std[index]:.2f} m{mark}",
             )  # fmt: skip
-    offset_std = estimate.std_of("time_offset")
-    if result.days and result.selected == DAYS_OF:
-        for day in result.days:
-            table.add_row(
-                f"stamps late, {day.name or date(day.first_ns)}", f"{parameters.dvl_time_offset:.2f} s",
-                f"{day.dvl_time_offset:+.2f} s", f"{day.dvl_time_offset_std:.2f} s{'' if day.shown else ' ?'}",
-            )  # fmt: skip
-    elif offset_std is not None:
-        offset, mark = estimate.dvl_time_offset(parameters.dvl_time_offset), " ?" if "time offset" in unseen else ""
+    for delay in result.delays:
+        of_day = "" if delay.day is None else f", {delay.day.name or date(delay.day.first_ns)}"
         table.add_row(
-            "stamps late", f"{parameters.dvl_time_offset:.2f} s", f"{offset:+.2f} s", f"{offset_std[0]:.2f} s{mark}"
-        )
+            f"stamps late{of_day}", f"{parameters.dvl_time_offset:.2f} s", f"{delay.seconds:+.2f} s",
+            f"{delay.std:.2f} s{'' if delay.shown else ' ?'}",
+        )  # fmt: skip
     return table
 
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,6 +144,7 @@ def _facts(replayed: Replayed, mounting: Mapping[str, Any], bags: Sequence[Path]
         ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
         ("Corrected mounting", _rpy(mounting["corrected_rpy"])),
         ("Nominal mounting", _rpy(mounting["nominal_rpy"])),
+        *_place_and_clock(result),
         ("Recorded", _when(result)),
         ("DVL data", replayed.dvl_data),
         ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
@@ -156,6 +157,27 @@ def _facts(replayed: Replayed, mounting: Mapping[str, Any], bags: Sequence[Path]
 def _rpy(angles: Iterable[float]) -> str:
     named = zip(("roll", "pitch", "yaw"), angles, strict=True)
     return ", ".join(f"{name} {signed(math.degrees(angle), 3)}°" for name, angle in named)
+
+
+def _place_and_clock(result: Result) -> Iterator[tuple[str, str]]:
+    """Lever arm and delays, of a model that has them."""
+    estimate = result.estimate
+    std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
+    if std is not None:
+        unseen = {entry.axis for entry in estimate.observability if not entry.observed}
+        arm = estimate.lever_arm(result.parameters["lever_arm"])
+        each = [
+            f"{axis} {signed(value, 2)} m ± {sigma:.2f}{' (not shown)' if f'lever arm {axis}' in unseen else ''}"
+            for axis, value, sigma in zip("xyz", arm.tolist(), std.tolist(), strict=True)
+        ]
+        yield "Lever arm", ", ".join(each)
+    if result.delays:
+        names = ["" if each.day is None else f"{each.day.name or _utc(each.day.first_ns)} " for each in result.delays]
+        delays = [
+            f"{name}{signed(delay.seconds, 2)} s ± {delay.std:.2f}{'' if delay.shown else ' (not shown)'}"
+            for name, delay in zip(names, result.delays, strict=True)
+        ]
+        yield "DVL stamps late by", ", ".join(delays)
 
 
 def _when(result: Result) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import re
 
 import numpy as np
 import pytest
@@ -78,6 +79,15 @@ def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path, la
     np.testing.assert_allclose(calibration.mounting.xyz_m[:2], (1.3, 0.2), atol=0.05)
     assert calibration.mounting.time_offset_s == pytest.approx(late_s, abs=0.05)
     assert calibration.replayed.result.estimate.gated >= 20
+
+
+def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path):
+    calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.2, 0.0), -2.2))
+    page = calibration.report(tmp_path / "report.html").read_text().replace("\N{MINUS SIGN}", "-")
+    arm = re.search(r"<dt>Lever arm</dt>\s*<dd>x ([+-][\d.]+) m ± [\d.]+, y ([+-][\d.]+) m ± .*\(not shown\)", page)
+    np.testing.assert_allclose([float(value) for value in arm.groups()], (1.3, 0.2), atol=0.05)
+    late = re.search(r"<dt>DVL stamps late by</dt>\s*<dd>([+-][\d.]+) s ± [\d.]+</dd>", page)
+    assert float(late.group(1)) == pytest.approx(-2.2, abs=0.05)
 
 
 def test_a_reference_that_claims_no_noise_is_not_suspected_for_being_better_than_the_parameters_say(tmp_path):

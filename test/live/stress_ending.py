@@ -77,7 +77,9 @@ def unclean(domain: int, seed: int) -> str:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "result.yaml"
         command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args", "-p", f"result_file:={file}"]
-        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+        environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "PYTHONFAULTHANDLER": "1",
+        }  # fmt: skip
         process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT
         )
@@ -95,8 +97,8 @@ def unclean(domain: int, seed: int) -> str:
         try:
             said += process.communicate(timeout=PATIENCE_S)[0]
         except subprocess.TimeoutExpired:
-            process.kill()
-            return f"seed {seed}: did not end"
+            process.send_signal(signal.SIGABRT)  # which tells where each thread is
+            return f"seed {seed}: did not end\n{said}{process.communicate()[0]}"
         others = [line for line in said.splitlines() if "[INFO]" not in line and f"saved to {file}" not in line]
         if process.returncode or others:
             return f"seed {seed} ({number.name}, {'start' if at_start else 'data'}): {process.returncode}, {others}"
