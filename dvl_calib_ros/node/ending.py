@@ -14,6 +14,8 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# Who is told and does not end is told again, s: a wake-up that the middleware loses would be waited for for ever.
+AGAIN_S = 1.0
 
 
 class Ending:
@@ -58,10 +60,14 @@ class Ending:
         return self._requested.is_set()
 
     def tell(self, function: Callable[[], object]) -> None:
-        """Call a function, from another thread, when it is asked for; now, if it has been."""
+        """Call a function, from another thread, when it is asked for, and again until `heard`; now, if it has been."""
         self._told.append(function)
         if self.requested:
             function()
+
+    def heard(self) -> None:
+        """Tell nobody any more."""
+        self._told.clear()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self._requested.set()
@@ -69,7 +75,10 @@ class Ending:
     def _watch(self) -> None:
         watched = [self._reading.fileno(), *([] if self._closed is None else [self._closed])]
         while True:
-            ready, _, _ = select.select(watched, [], [])
+            ready, _, _ = select.select(watched, [], [], AGAIN_S if self.requested else None)
+            if not ready:
+                self._tell()
+                continue
             numbers = self._reading.recv(64) if watched[0] in ready else b"\0"
             if not numbers:  # left
                 return
@@ -77,5 +86,8 @@ class Ending:
                 watched.remove(self._closed)
             if self._closed in ready or not set(ENDING).isdisjoint(numbers):
                 self._requested.set()
-                for function in self._told:
-                    function()
+                self._tell()
+
+    def _tell(self) -> None:
+        for function in list(self._told):
+            function()

@@ -64,6 +64,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     except (ParameterError, InputError) as error:
         return _refused(error)
     finally:
+        ending.heard()
         if node is not None:
             node.finish()
             node.destroy_node()

@@ -167,6 +167,7 @@ def run_until(
             _play(node, executor, ending, samples, speed)
         return node.sent
     finally:
+        ending.heard()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -51,6 +51,22 @@ def test_a_signal_becomes_a_flag_wakes_who_waits_and_raises_nothing(number):
     signal.signal(number, before)
 
 
+def test_who_is_told_is_told_again_until_it_has_heard():
+    """A wake-up that the middleware loses must not leave a node that waits for ever."""
+    before = signal.getsignal(signal.SIGINT)
+    told = threading.Semaphore(0)
+    with Ending() as ending:
+        ending.tell(told.release)
+        os.kill(os.getpid(), signal.SIGINT)
+        assert all(told.acquire(timeout=10.0) for _ in range(3))
+        ending.heard()
+        time.sleep(0.1)  # a call that is under way
+        while told.acquire(blocking=False):
+            pass
+        assert not told.acquire(timeout=2.5)
+    signal.signal(signal.SIGINT, before)
+
+
 def test_without_a_signal_everything_is_afterwards_as_it_was():
     before = [signal.getsignal(number) for number in ENDING]
     threads = threading.active_count()
