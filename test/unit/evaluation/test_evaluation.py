@@ -324,7 +324,7 @@ BAD = {
     ),
     "a short trajectory": (lambda f: keep_rows(f / "T03_dvl.csv", 20), "T03_dvl.csv: ends at row 20", "needs 60 s"),
     "an empty trajectory": (lambda f: keep_rows(f / "T03_dvl.csv", 0), "T03_dvl.csv", "expected rows"),
-    "a row of NaN": (lambda f: edit(f / "T05_dvl.csv", 17, "16.0,nan,0.1,0.0"), "T05_dvl.csv: row 17", "finite"),
+    "a row of NaN": (lambda f: edit(f / "T05_dvl.csv", 17, "16.0,nan,0.1,0.0"), "T05_dvl.csv: ", "the first is row 17"),
     "a row cut off": (lambda f: edit(f / "T05_dvl.csv", 17, "16.0,1.5"), "T05_dvl.csv: data row 17", "columns"),
     "other units by name": (
         lambda f: edit(f / "T09_dvl.csv", 0, "Time [s],X [m/s],Y [cm/s],Z [m/s]"), "T09_dvl.csv: column 'Y [cm/s]'",
