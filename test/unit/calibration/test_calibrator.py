@@ -678,7 +678,11 @@ def test_any_parameters_inside_their_bounds_with_any_covariances_leave_every_sta
     for kind, every, covariance in claimed:
         spoilt = {id(sample) for sample in only(samples, kind)[::every]}
         samples = [sample._replace(covariance=covariance) if id(sample) in spoilt else sample for sample in samples]
-    calibrator = calibrate(samples, parameters, block_size=block_size, verified=True)
+    try:
+        calibrator = calibrate(samples, parameters, block_size=block_size, verified=True)
+    except ParameterError:  # a prior that needs a recording
+        assert parameters.prior_source == "reference"
+        return
     check_finite(calibrator)
     for name in MODELS:
         assert np.linalg.eigvalsh(calibrator.state(name).p)[0] > 0.0, name
