@@ -104,6 +104,7 @@ class DelayBank:
         self._unknown_std = np.sqrt(np.diag(unknown.p))
         self._gate = gate
         self._process_rate = process_rate
+        self._solved: Hypotheses | None = None
         self._begin_day()
         self._information, self._vector = _information(self._start)
         self._ended: list[_Ended] = []
@@ -162,6 +163,7 @@ class DelayBank:
         self._square = found.misfit[best] + np.einsum("ki,ki->k", self._vector, x)
         self._log_det = np.zeros(len(DELAYS_S))
         self._regressor_noise[-1] = 0.0
+        self._solved = None
 
     @property
     def mean_nis(self) -> float:
@@ -193,6 +195,7 @@ class DelayBank:
             square += told[2]
         if not (np.isfinite(total).all() and np.isfinite(total_vector).all() and np.isfinite(square).all()):
             return np.zeros(len(rows), dtype=bool)  # it goes on as before these rows
+        self._solved = None
         self._square += square
         self._information += total
         self._regressor_noise += rows.weight[use] @ rows.regressor_noise[use]
@@ -218,6 +221,7 @@ class DelayBank:
             _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
             if np.isfinite(variance[0]):
                 self._heave_variance = float(variance[0])
+                self._solved = None
 
     def _absorb_heave(self) -> None:
         """Under a random walk what a row tells ages with the rest."""
@@ -230,6 +234,7 @@ class DelayBank:
         self._information += told[:, :N_STATE, :N_STATE]
         self._vector += told[:, :N_STATE, N_STATE]
         self._square += told[:, N_STATE, N_STATE]
+        self._solved = None
         self._log_det += np.linalg.slogdet(self._information)[1] - before
 
     def _drift(self, seconds: float) -> None:
@@ -241,6 +246,7 @@ class DelayBank:
         self._information = np.linalg.inv(p + self._process_rate * seconds)
         self._vector = (self._information @ x[..., None])[..., 0]
         self._square = misfit + np.einsum("ki,ki->k", self._vector, x)
+        self._solved = None
 
     def _gated(self, rows: DelayedRows) -> Mask:
         """Which rows are used (J,): those that any hypothesis explains, by the level of recent innovations.
@@ -265,6 +271,9 @@ class DelayBank:
         return use
 
     def _solve(self, without: int | None = None) -> Hypotheses:
+        """All hypotheses by what is known; remembered, but for those without a fold, until more is."""
+        if without is None and self._solved is not None:
+            return self._solved
         information, vector = self._information, self._vector
         if without is not None:
             assert self._folds is not None
@@ -277,7 +286,10 @@ class DelayBank:
         p = 0.5 * (p + p.swapaxes(1, 2))
         x = (p @ vector[..., None])[..., 0]
         misfit = self._square + heave[:, N_STATE, N_STATE] - np.einsum("ki,ki->k", x, vector)
-        return Hypotheses(x, p, misfit, -0.5 * (misfit + log_det))
+        found = Hypotheses(x, p, misfit, -0.5 * (misfit + log_det))
+        if without is None:
+            self._solved = found
+        return found
 
     def _level(self, found: Hypotheses, best: int) -> float:
         freedom = 3.0 * self.blocks.weight - N_STATE
@@ -303,24 +315,27 @@ class DelayBank:
             days.append(DayState(_claimed(raised, ended.shown, OF_DAY, self._unknown), ended.shown))
         return days
 
-    def without_fold(self, fold: int) -> list[GaussianState]:
-        """The states of every day had the bank not seen a fold, the delay's probabilities being those of all data.
+    def without_folds(self) -> list[list[GaussianState]]:
+        """For every fold the states of every day had the bank not seen it, delays being as likely as by all data.
 
         What all data do not show is taken to be as it was known before, for what is verified is what is published.
         """
         of_all, log_share = self._shares()
         best = int(np.argmax(log_share))
         shown = self._shown(best, self._inflation(best, of_all))
-        found = self._solve(fold)
-        last = self._mixture(found, log_share)
-        before = self._on_days_before(last, self._held(found, log_share), 1 + fold) if self._ended else []
         of, nothing = np.arange(N_STATE)[BEYOND], np.zeros((N_STATE, N_STATE))
         is_of_day = np.isin(np.arange(N_STATE), OF_DAY)
-        states = [
-            _claimed(state, np.where(is_of_day, ended.shown, shown), of, GaussianState(self._unknown.x, nothing))
-            for state, ended in zip(before, self._ended, strict=True)
-        ]
-        return [*states, _claimed(last, shown, of, GaussianState(self.prior.x, nothing))]
+        folds = []
+        for fold in range(FOLDS):
+            found = self._solve(fold)
+            last = self._mixture(found, log_share)
+            before = self._on_days_before(last, self._held(found, log_share), 1 + fold) if self._ended else []
+            states = [
+                _claimed(state, np.where(is_of_day, ended.shown, shown), of, GaussianState(self._unknown.x, nothing))
+                for state, ended in zip(before, self._ended, strict=True)
+            ]
+            folds.append([*states, _claimed(last, shown, of, GaussianState(self.prior.x, nothing))])
+        return folds
 
     def _on_days_before(self, last: GaussianState, held: GaussianState, fold: int) -> list[GaussianState]:
         """The states (n,) of days that are over, by what later ones say of the vehicle (Rauch, Tung, Striebel).

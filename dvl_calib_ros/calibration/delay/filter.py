@@ -15,7 +15,6 @@ import numpy as np
 from ..alignment import Aligner
 from ..bank import ModelCounts
 from ..coarse_mounting import DELAYS_S, CoarseFits
-from ..folds import FOLDS
 from ..frames import ENU_FROM_NED, Array
 from ..kalman import GaussianState
 from ..observations import Observations
@@ -440,14 +439,14 @@ class DelayFilter:
 
     def without_folds(self) -> list[list[GaussianState]]:
         """For every fold the states of every day had it not seen that fold."""
-        return [self._bank.without_fold(fold) for fold in range(FOLDS)]
+        return self._bank.without_folds()
 
     def held_out_error(self) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
-        if not self._kept:
+        if self.recording is None:
             return None
-        recording = Recording.of(self._kept)
-        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + self._epoch_ns
+        recording, epoch_ns = self.recording
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), self._bank, self._parameters)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..error_model import CORRECTION_JACOBIAN, correction_matrix
-from ..folds import FOLDS, folds_of
+from ..folds import folds_of
 from ..frames import Array, cross, skew
 from ..parameters import Parameters
 from ..samples import Index, Mask, Stamps
@@ -60,11 +60,11 @@ def held_out_error(
     nominal = np.zeros(len(bank.prior.x))
     sums = np.zeros(4)
     samples = 0
-    for fold in range(FOLDS):
-        try:
-            states = bank.without_fold(fold)
-        except np.linalg.LinAlgError:  # as in `posterior`
-            return None
+    try:
+        without_folds = bank.without_folds()
+    except np.linalg.LinAlgError:  # as in `posterior`
+        return None
+    for fold, states in enumerate(without_folds):
         for day, state in enumerate(states):
             at = np.flatnonzero((folds == fold) & (days == day))
             before = recording.errors(at, nominal, p)
