@@ -9,7 +9,7 @@ import numpy as np
 
 from .comparison import date
 from .findings import Finding, finding
-from .results import DAYS_OF, Day, Estimate
+from .results import Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -100,17 +100,18 @@ def consistency_advice(estimate: Estimate) -> list[Finding]:
 
 
 def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Finding]:
-    """Whether the reference is wrong by a constant that several headings have shown, on each of several days."""
+    """Whether the reference is wrong by a constant that several headings have shown, on each of several days.
+
+    days: that the model found something of, if there are several.
+    """
     names = "reference_east", "reference_north"
     std = estimate.std_of(*names)
     if std is None:
         return []
-    found = [("", np.array([estimate.state_of(name) for name in names]), std)]
-    if days and estimate.model == DAYS_OF:
-        found = []
-        for day in days:
-            where = f" on {day.name or date(day.first_ns)}"
-            found.append((where, np.array(day.reference_offset), np.array(day.reference_offset_std)))
+    found = [
+        (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
+        for day in days
+    ] or [("", np.array([estimate.state_of(name) for name in names]), std)]
     said = []
     for where, offset, own_std in found:
         size = float(np.linalg.norm(offset))

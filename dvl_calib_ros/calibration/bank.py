@@ -18,7 +18,7 @@ import numpy as np
 
 from . import kalman
 from .assembly import Assembler
-from .folds import FOLDS, FoldInformation, Moments, folds_of, on_another_day
+from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .frames import Array
 from .heave import HeaveRows, HeaveSums, with_heave
 from .history import Counts, Standing
@@ -152,7 +152,7 @@ class Group:
         if not len(self._of_day):
             return
         before = GaussianState(self._x, self._p)
-        after = on_another_day(before, self._assembler.prior, self._of_day)
+        after = with_states_of(before, self._assembler.prior, self._of_day)
         self._x, self._p = after
         if self._scatter is not None:
             try:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import Array, skew
+from .frames import Array, product, skew
 from .kalman import GaussianState
 from .samples import Index
 
@@ -157,20 +157,18 @@ class PriorOnErrors:
             jacobian = _extended(mapped.jacobian, x.shape[-1])
             weighted = np.swapaxes(jacobian, -1, -2) @ self._information
             information = gained + weighted @ jacobian
-            step = (
-                _solve(information, gained_state + _product(weighted, _product(jacobian, x) + self._mean - errors)) - x
-            )
+            step = _solve(information, gained_state + product(weighted, product(jacobian, x) + self._mean - errors)) - x
             x = x + step
             if np.abs(step).max() < _LAST_STEP:
                 break
         # the last step is so small that the errors after it need no new linearisation
-        return GaussianState(errors + _product(jacobian, step), _propagated(jacobian, np.linalg.inv(information)))
+        return GaussianState(errors + product(jacobian, step), _propagated(jacobian, np.linalg.inv(information)))
 
 
 def _information(state: GaussianState) -> tuple[Array, Array]:
     """P⁻¹ and P⁻¹x."""
     inverse = np.linalg.inv(state.p)
-    return inverse, _product(inverse, state.x)
+    return inverse, product(inverse, state.x)
 
 
 def _extended(jacobian: Array, n: int) -> Array:
@@ -189,12 +187,6 @@ def _extended(jacobian: Array, n: int) -> Array:
 def _identity(n: int) -> Array:
     """(n, n); not to be written to."""
     return np.eye(n)
-
-
-def _product(matrix: Array, vector: Array) -> Array:
-    """(..., n, n) times (..., n)."""
-    product: Array = (matrix @ vector[..., None])[..., 0]
-    return product
 
 
 def _solve(matrix: Array, vector: Array) -> Array:

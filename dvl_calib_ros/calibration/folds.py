@@ -65,7 +65,7 @@ class FoldInformation:
         for fold in range(FOLDS):
             for index in range(start.x.shape[0]):
                 known = GaussianState(start.x[index], start.p[index])
-                x, p = on_another_day(self.without(fold, index), known, of_day)
+                x, p = with_states_of(self.without(fold, index), known, of_day)
                 prior[fold, index] = np.linalg.inv(p)
                 prior_state[fold, index] = prior[fold, index] @ x
         self._prior, self._prior_state = prior, prior_state
@@ -73,13 +73,13 @@ class FoldInformation:
         self._information_state[:] = 0.0
 
 
-def on_another_day(state: GaussianState, start: GaussianState, of_day: NDArray[np.intp]) -> GaussianState:
-    """A state x (..., n), P (..., n, n) of which those of the day (u,) are as in `start` (of one shape with it)."""
+def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np.intp]) -> GaussianState:
+    """A state x (..., n), P (..., n, n) of which some (u,) are as in another of one shape with it: of another day."""
     x, p = state.x.copy(), state.p.copy()
-    x[..., of_day] = start.x[..., of_day]
-    p[..., of_day, :] = 0.0
-    p[..., :, of_day] = 0.0
-    p[..., of_day[:, None], of_day] = start.p[..., of_day[:, None], of_day]
+    x[..., which] = other.x[..., which]
+    p[..., which, :] = 0.0
+    p[..., :, which] = 0.0
+    p[..., which[:, None], which] = other.p[..., which[:, None], which]
     return GaussianState(x, p)
 
 

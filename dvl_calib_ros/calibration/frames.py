@@ -46,6 +46,12 @@ def cross(a: Array, b: Array) -> Array:
     return product
 
 
+def product(matrix: Array, vector: Array) -> Array:
+    """(..., m, n) times (..., n)."""
+    found: Array = (matrix @ vector[..., None])[..., 0]
+    return found
+
+
 def rotation_from_rpy(rpy: ArrayLike) -> Array:
     """Rotation of a URDF ``origin rpy``: turns about the fixed axes X, then Y, then Z.
 

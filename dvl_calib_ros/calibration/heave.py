@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .folds import FOLDS, folds_of
-from .frames import Array
+from .frames import Array, product
 from .kalman import GaussianState
 from .parameters import Parameters
 from .samples import Index, Mask, Stamps
@@ -159,23 +159,17 @@ def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tupl
     share, turn = np.linalg.eigh(np.swapaxes(root, -1, -2) @ told[..., :n, :n] @ root)
     share = np.maximum(share, 0.0)
     axes = root @ turn
-    told_more = told[..., :n, n] - _product(told[..., :n, :n], x)
-    pull = _product(np.swapaxes(axes, -1, -2), told_more)
+    told_more = told[..., :n, n] - product(told[..., :n, :n], x)
+    pull = product(np.swapaxes(axes, -1, -2), told_more)
     spread = np.einsum("...ij,...ik,...kj->...j", axes, scatter[..., :n, :n], axes)
     variance = np.full(x.shape[:-1], motion_std**2)
     for _ in range(STEPS):
-        found = x + _product(axes, pull / (variance[..., None] + share))
+        found = x + product(axes, pull / (variance[..., None] + share))
         missed = np.concatenate([-found, np.ones((*found.shape[:-1], 1))], axis=-1)
-        misfit = np.maximum((missed * _product(scatter, missed)).sum(axis=-1), 0.0)
+        misfit = np.maximum((missed * product(scatter, missed)).sum(axis=-1), 0.0)
         unsure = (spread * variance[..., None] / (variance[..., None] + share)).sum(axis=-1)
         variance = (PSEUDO_BLOCKS * motion_std**2 + misfit + unsure) / (PSEUDO_BLOCKS + sums.weight)
         variance = np.maximum(variance, motion_std**2)
     left = variance[..., None] / (variance[..., None] + share)
-    found = x + _product(axes, pull / (variance[..., None] + share))
+    found = x + product(axes, pull / (variance[..., None] + share))
     return GaussianState(found, (axes * left[..., None, :]) @ np.swapaxes(axes, -1, -2)), variance
-
-
-def _product(matrix: Array, vector: Array) -> Array:
-    """(..., m, n) times (..., n)."""
-    product: Array = (matrix @ vector[..., None])[..., 0]
-    return product

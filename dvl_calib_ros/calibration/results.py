@@ -165,11 +165,16 @@ class Result:
         return self.estimates[self.selected]
 
     @property
+    def own_days(self) -> tuple[Day, ...]:
+        """Days that the selected model found something of; none where there is one."""
+        return self.days if self.selected == DAYS_OF else ()
+
+    @property
     def delays(self) -> tuple[Delay, ...]:
         """What the selected model found of the DVL's clock: one of each day, one if there is one, none without."""
         estimate = self.estimate
-        if self.days and self.selected == DAYS_OF:
-            return tuple(Delay(day, day.dvl_time_offset, day.dvl_time_offset_std, day.shown) for day in self.days)
+        if self.own_days:
+            return tuple(Delay(day, day.dvl_time_offset, day.dvl_time_offset_std, day.shown) for day in self.own_days)
         std = estimate.std_of("time_offset")
         if std is None:
             return ()

@@ -17,14 +17,14 @@ import yaml
 
 from .. import __version__
 from ..calibration.assembly import prior
-from ..calibration.folds import on_another_day
+from ..calibration.folds import with_states_of
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import mounting_pose, scale_and_delay
 from ..calibration.observability import Convergence
 from ..calibration.parameters import FLU, FRD, Parameters
-from ..calibration.results import DAYS_OF, Estimate, Result
+from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
 from ..errors import InputError, printable
 from .atomic import own_stream, save_bytes
@@ -107,7 +107,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
 
 def days_document(result: Result) -> dict[str, Any]:
     """What belongs to each day, in order, where there were several: the mounting holds the delay of the last."""
-    if not result.days or result.selected != DAYS_OF:
+    if not result.own_days:
         return {}
     return {
         "days": [
@@ -120,7 +120,7 @@ def days_document(result: Result) -> dict[str, Any]:
                 "reference_velocity_offset": list(day.reference_offset),
                 "reference_velocity_offset_std": list(day.reference_offset_std),
             }
-            for day in result.days
+            for day in result.own_days
         ]
     }
 
@@ -249,7 +249,7 @@ def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = 
 
 def _another_day(name: str, state: GaussianState) -> GaussianState:
     model = MODELS[name]
-    return on_another_day(state, prior(model, Parameters()), model.not_handed_on)
+    return with_states_of(state, prior(model, Parameters()), model.not_handed_on)
 
 
 def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any], dict[str, GaussianState]]:

@@ -335,7 +335,7 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[F
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_advice(estimate)
-    return found + reference_advice(result.estimate, result.days)
+    return found + reference_advice(result.estimate, result.own_days)
 
 
 def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:

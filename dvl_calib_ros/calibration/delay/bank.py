@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..correction_parameters import PriorOnErrors, to_correction
-from ..folds import FOLDS, folds_of, on_another_day
+from ..folds import FOLDS, folds_of, with_states_of
 from ..frames import Array
 from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState
@@ -38,6 +38,9 @@ MEDIAN_NIS = 2.366
 SMALLEST_SHARE = 1e-9
 # A state is shown by the data if these alone, with priors of all else wider by this, have halved its prior σ.
 WIDER, SHOWN_SHARE = 100.0, 0.5
+
+
+_BEYOND: Index = np.arange(N_STATE)[BEYOND]
 
 
 class Hypotheses(NamedTuple):
@@ -143,7 +146,7 @@ class DelayBank:
         shown = self._shown(best, inflation)
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
-        begins = [_information(_around_each_delay(on_another_day(each, self._unknown, OF_DAY))) for each in known]
+        begins = [_information(_around_each_delay(with_states_of(each, self._unknown, OF_DAY))) for each in known]
         total = np.linalg.inv(found.p)
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
@@ -152,7 +155,7 @@ class DelayBank:
         self._heave.close()
         self._heave.absorb()  # its rows are in what is known
         self._heave.learn_from(source)
-        self.prior = on_another_day(self.prior, self._unknown, OF_DAY)
+        self.prior = with_states_of(self.prior, self._unknown, OF_DAY)
         self._begin_day()
         self._information, self._vector = begins[0]
         if self._folds is not None:
@@ -303,7 +306,8 @@ class DelayBank:
         inflation = self._inflation(best, found)
         shown = self._shown(best, inflation)
         raised = state.raised(inflation)
-        return Posterior(_claimed(raised, shown, np.arange(N_STATE)[BEYOND], self.prior), shown, inflation)
+        # of what is not shown nothing is claimed
+        return Posterior(with_states_of(raised, self.prior, _without(shown, _BEYOND)), shown, inflation)
 
     def days(self) -> list[DayState]:
         """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""
@@ -312,7 +316,8 @@ class DelayBank:
         days = []
         for ended, (x, p) in zip(self._ended, states, strict=True):
             raised = GaussianState(x, p).raised(ended.inflation)
-            days.append(DayState(_claimed(raised, ended.shown, OF_DAY, self._unknown), ended.shown))
+            claimed = with_states_of(raised, self._unknown, _without(ended.shown, OF_DAY))
+            days.append(DayState(claimed, ended.shown))
         return days
 
     def without_folds(self) -> list[list[GaussianState]]:
@@ -323,7 +328,8 @@ class DelayBank:
         of_all, log_share = self._shares()
         best = int(np.argmax(log_share))
         shown = self._shown(best, self._inflation(best, of_all))
-        of, nothing = np.arange(N_STATE)[BEYOND], np.zeros((N_STATE, N_STATE))
+        nothing = np.zeros((N_STATE, N_STATE))
+        known, unknown = GaussianState(self.prior.x, nothing), GaussianState(self._unknown.x, nothing)
         is_of_day = np.isin(np.arange(N_STATE), OF_DAY)
         folds = []
         for fold in range(FOLDS):
@@ -331,10 +337,10 @@ class DelayBank:
             last = self._mixture(found, log_share)
             before = self._on_days_before(last, self._held(found, log_share), 1 + fold) if self._ended else []
             states = [
-                _claimed(state, np.where(is_of_day, ended.shown, shown), of, GaussianState(self._unknown.x, nothing))
+                with_states_of(state, unknown, _without(np.where(is_of_day, ended.shown, shown), _BEYOND))
                 for state, ended in zip(before, self._ended, strict=True)
             ]
-            folds.append([*states, _claimed(last, shown, of, GaussianState(self.prior.x, nothing))])
+            folds.append([*states, with_states_of(last, known, _without(shown, _BEYOND))])
         return folds
 
     def _on_days_before(self, last: GaussianState, held: GaussianState, fold: int) -> list[GaussianState]:
@@ -400,14 +406,9 @@ class DelayBank:
         return shown
 
 
-def _claimed(state: GaussianState, shown: Mask, of: Index, without: GaussianState) -> GaussianState:
-    """A state (n,) that claims nothing of those `of` its states that are not shown (n,): they are as in another one."""
-    x, p = state.x.copy(), state.p.copy()
-    for index in of[~shown[of]]:
-        x[index] = without.x[index]
-        p[index] = p[:, index] = 0.0
-        p[index, index] = without.p[index, index]
-    return GaussianState(x, p)
+def _without(shown: Mask, of: Index) -> Index:
+    """Those `of` the states that are not shown (n,)."""
+    return of[~shown[of]]
 
 
 def _told(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:

@@ -12,7 +12,7 @@ from test_delay import LEVER_ARM, NOISE, PHI, late
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.delay.rows import OF_DAY
-from dvl_calib_ros.calibration.folds import on_another_day
+from dvl_calib_ros.calibration.folds import with_states_of
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.new_days import NewDays
 from dvl_calib_ros.calibration.samples import ReferenceSample
@@ -172,7 +172,7 @@ def test_another_day_leaves_what_belongs_to_the_vehicle_as_it_is():
     root = rng.normal(size=(12, 12))
     state = GaussianState(rng.normal(size=12), root @ root.T)
     start = GaussianState(np.zeros(12), np.eye(12))
-    x, p = on_another_day(state, start, OF_DAY)
+    x, p = with_states_of(state, start, OF_DAY)
     on = np.setdiff1d(np.arange(12), OF_DAY)
     np.testing.assert_array_equal(x[on], state.x[on])
     np.testing.assert_array_equal(p[np.ix_(on, on)], state.p[np.ix_(on, on)])
