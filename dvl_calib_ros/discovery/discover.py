@@ -23,7 +23,19 @@ from ..messages.decode import EARTH_FRAMES
 from ..messages.drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES
 from ..replay.replay import Topics
 from . import choose
-from .fit import CLEARLY, FITS, Fit, Hypothesis, ImuFrame, best_rotation, explained, fit, nominal_rpy, together
+from .fit import (
+    CLEARLY,
+    FITS,
+    Fit,
+    Hypothesis,
+    ImuFrame,
+    at_delays,
+    best_rotation,
+    explained,
+    fit,
+    nominal_rpy,
+    together,
+)
 from .survey import Look, Survey, survey
 from .transforms import FrameTree, Placed
 
@@ -321,7 +333,8 @@ class _Search:
         if decided is None or own is None or decided is own:
             return decided
         mounting = None if known is None else known.T
-        best, as_declared = (explained(dvl, reference, imu, each.hypothesis, mounting).left for each in (decided, own))
+        delayed = at_delays(dvl, reference, imu)
+        best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (decided, own))
         return decided if best < CLEARLY * as_declared else own
 
     def _take(
@@ -356,8 +369,8 @@ class _Search:
         found = chosen.rotation_dvl_from_body.T
         if known is None:
             if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-                as_it_is = explained(dvl, reference, imu, hypothesis, np.eye(3))
-                turned = explained(dvl, reference, imu, hypothesis, None)
+                delayed = at_delays(dvl, reference, imu)
+                as_it_is, turned = (explained(delayed, hypothesis, mounting) for mounting in (np.eye(3), None))
                 if turned.left < CLEARLY * as_it_is.left:
                     agree = "where DVL and reference agree best"
                     self._mounting_found(nominal_rpy(turned.rotation_dvl_from_body.T), agree)

@@ -189,18 +189,19 @@ class Explained:
 NOT_EXPLAINED = Explained(math.inf, np.eye(3))
 
 
-def explained(
-    dvl: Look, reference: Look, imu: Look | None, hypothesis: Hypothesis, rotation_dvl_from_body: Array | None
-) -> Explained:
+def at_delays(dvl: Look, reference: Look, imu: Look | None) -> list[Together]:
+    """The looks side by side at each delay of the DVL at which they have enough in common."""
+    each = (together(replace(dvl, stamps_s=dvl.stamps_s - late_s), reference, imu) for late_s in DELAYS_S.tolist())
+    return [data for data in each if data is not None]
+
+
+def explained(delayed: Sequence[Together], hypothesis: Hypothesis, rotation_dvl_from_body: Array | None) -> Explained:
     """What is left under a hypothesis with any lever arm, any delay, and a small misalignment and scale.
 
-    rotation_dvl_from_body: the mounting (3, 3), which stands if it is not None; else the best is found.
+    delayed: of `at_delays`. rotation_dvl_from_body: the mounting (3, 3), which stands if it is not None; else the best
+    is found.
     """
-    found = [
-        _explained(data, hypothesis, rotation_dvl_from_body)
-        for late_s in DELAYS_S.tolist()
-        if (data := together(replace(dvl, stamps_s=dvl.stamps_s - late_s), reference, imu)) is not None
-    ]
+    found = [_explained(data, hypothesis, rotation_dvl_from_body) for data in delayed]
     return min(found, key=lambda each: each.left, default=NOT_EXPLAINED)
 
 

@@ -54,8 +54,6 @@ AXES = ("x", "y", "z")
 # What is less than so many σ from nothing is not worth a word.
 NAMED_FROM = 4.0
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
-
-
 # A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
 # further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
 LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
@@ -73,9 +71,8 @@ class _Dvl(Table):
 class DelayFilter:
     """Feeds a `DelayBank` from an aligner; tells the aligner which past of its tracks is still wanted.
 
-    coarse: of the same samples, what configuration they fit. restarted: how often
-    what was found was not finite, and that of before is kept. n_taken: number of the first row of the aligner that it
-    has not copied yet.
+    restarted: how often what was found was not finite, and that of before is kept. n_taken: number of the first row of
+    the aligner that it has not copied yet.
     """
 
     def __init__(
@@ -108,8 +105,9 @@ class DelayFilter:
             rotation_dvl_from_body=parameters.rotation_dvl_from_body,
             sway_heave=np.zeros(2),
         )
-        self.coarse = CoarseFits(parameters.rotation_dvl_from_body)
+        self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._reference_clock = ReferenceClock(parameters)
+        self._suggestion: str | None = None  # until another block
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
         self._dvl = _Dvl()
@@ -176,7 +174,12 @@ class DelayFilter:
     @property
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
-        found = self.coarse.suggestion()
+        if self._suggestion is None:
+            self._suggestion = self._suggested()
+        return self._suggestion
+
+    def _suggested(self) -> str:
+        found = self._coarse.suggestion()
         if found is not None:
             return found.says
         late = self._reference_clock.found()
@@ -259,6 +262,7 @@ class DelayFilter:
             except np.linalg.LinAlgError:  # numbers that ran away: as if it were the same day
                 self.restarted += 1
             self._reference_clock.start()
+            self._suggestion = None
             self._day_starts_ns.append(block_ns)
             self._changed = True
 
@@ -300,6 +304,7 @@ class DelayFilter:
         reference, stamps_ns = self._reference(block_ns, end_ns)
         if not len(stamps_ns) or self._dvl_is_silent(end_ns):
             return False
+        self._suggestion = None
         self._claiming += int(np.count_nonzero(reference.claimed))
         self._not_claiming += int(np.count_nonzero(~reference.claimed))
         dvl, noise_dvl = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
@@ -336,7 +341,7 @@ class DelayFilter:
         return at == len(stamps_ns) or int(stamps_ns[at]) - stamp_ns > LONGEST_NS // 2
 
     def _compare_coarsely(self, block_ns: int, end_ns: int, dvl: DvlColumns, imu: ImuColumns) -> None:
-        """Give the block's references, as their messages had them, to `coarse`."""
+        """Give the block's references, as their messages had them, to `_coarse`."""
         track = self._aligner.reference
         at = track.in_time(block_ns, end_ns)
         at = at[thinned(track.stamps_ns[at])]
@@ -357,7 +362,7 @@ class DelayFilter:
                 use = moving & (track.frames[at] == code) & (oriented == has_attitude) & ~unmeasured
                 if use.any():
                     attitude = rotation[use] if has_attitude else None
-                    self.coarse.add(
+                    self._coarse.add(
                         FRAMES[code], raw[use], attitude, velocity[use], None if rates is None else rates[use]
                     )
 
