@@ -24,10 +24,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-# A busy machine takes its time over an example. Who waits for the suite sees fewer of them than CI:
-# --hypothesis-profile=ci
-settings.register_profile("patient", deadline=None, max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+# A busy machine takes its time over an example. Who waits for the suite sees fewer of them than CI, and both the same
+# ones each time, so that what fails is what was changed; who searches for new ones takes --hypothesis-profile=search.
+settings.register_profile(
+    "patient", deadline=None, max_examples=40, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.register_profile("ci", settings.get_profile("patient"), max_examples=200)
+settings.register_profile("search", settings.get_profile("ci"), max_examples=2000, derandomize=False)
 settings.load_profile("patient")
 ROOT = Path(__file__).resolve().parents[1]
 # What nohup and a shell's & make ignored, the processes that tests end by a signal would ignore as well.

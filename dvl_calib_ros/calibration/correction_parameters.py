@@ -27,6 +27,10 @@ _IDENTITY: Array = np.eye(3)
 _NEWTON_STEPS = 20
 # After a step as small as this what is left is smaller by orders of magnitude, below what anybody reads.
 _LAST_STEP = 1e-10
+# Where the prior hardly binds and the data do not either, the map is so curved that full steps run away to a DVL that
+# measures nothing, with a σ of nothing, or go to and fro: no step is longer than this in an angle (rad) or a scale, and
+# from the eighth on (good data need three) they are half as long.
+_LONGEST_STEP, _FULL_STEPS, _STEPS = 0.2, 8, 60
 
 
 class Mapped(NamedTuple):
@@ -147,20 +151,27 @@ class PriorOnErrors:
         return some
 
     def to_errors(self, held: GaussianState) -> GaussianState:
-        """States x (..., n), P (..., n, n) of the filter -> of the errors."""
+        """States x (..., n), P (..., n, n) of the filter -> of the errors.
+
+        Raises numpy.linalg.LinAlgError where the maximum is not found.
+        """
         information, state = _information(held)
         gained, gained_state = information - self._started, state - self._started_state
         x = held.x
-        for _ in range(_NEWTON_STEPS):
+        for n in range(_STEPS):
             mapped = errors_from_correction(x[..., :_N])
             errors = np.concatenate([mapped.errors, x[..., _N:]], axis=-1)
             jacobian = _extended(mapped.jacobian, x.shape[-1])
             weighted = np.swapaxes(jacobian, -1, -2) @ self._information
             information = gained + weighted @ jacobian
             step = _solve(information, gained_state + product(weighted, product(jacobian, x) + self._mean - errors)) - x
+            longest = np.abs(step[..., :_N]).max(axis=-1, keepdims=True)
+            step *= _LONGEST_STEP / np.maximum(longest, _LONGEST_STEP) * (1.0 if n < _FULL_STEPS else 0.5)
             x = x + step
             if np.abs(step).max() < _LAST_STEP:
                 break
+        else:
+            raise np.linalg.LinAlgError("no maximum of the posterior is found")
         # the last step is so small that the errors after it need no new linearisation
         return GaussianState(errors + product(jacobian, step), _propagated(jacobian, np.linalg.inv(information)))
 
