@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import pytest
 import rclpy
 from conftest import ROOT
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -20,6 +21,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 
 from dvl_calib_ros.node.domain import give_back, take_domain
+from dvl_calib_ros.node.main import main
 
 PATIENCE_S = 60.0
 RETRY_S = 3.0
@@ -36,12 +38,11 @@ def until(condition: Callable[[], Any], what: str | Callable[[], str]) -> Any:
     return value
 
 
-def refused_at_start(*arguments: str) -> str:
-    """What a node says on standard error that refuses to start with ROS arguments."""
-    command = [sys.executable, "-m", "dvl_calib_ros.node.main", "--ros-args", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
-    assert done.returncode == 2
-    return done.stderr
+def refused_at_start(capfd: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What a node says on standard error that refuses to start, in this process, with ROS arguments."""
+    capfd.readouterr()
+    assert main(["--ros-args", *arguments]) == 2
+    return capfd.readouterr().err
 
 
 class World:

@@ -30,6 +30,8 @@ START_NS = 1_700_000_000_123_456_789
 SECOND = 1_000_000_000
 # Samples of a stretch of a recording, and those that models are updated by at once.
 STRETCH = 512
+# For what is tried sample by sample: as much time in fewer samples.
+ONE_HERTZ = {"dvl_every": 100, "gnss_every": 100, "imu_every": 50}
 
 
 def claimed_covariance(estimate: Estimate) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ MAY_IMPORT = {
 WIRING = {"cli", "node", "demo"}
 
 
+@cache
 def siblings_imported_by(path: Path) -> set[str]:
     """Packages and modules of ours, beside the one that the file is in, which it imports, also within functions."""
     inside = path.relative_to(PACKAGE).parent.parts

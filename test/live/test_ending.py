@@ -100,7 +100,7 @@ def test_parameter_files_are_found_where_rcl_looks_for_them():
 def test_an_interrupt_under_data_cuts_no_sample_short_so_the_saved_result_is_a_replay_of_what_was_received(
     world, tmp_path
 ):
-    run = simulate(Scenario(trajectory="figure8", seconds=800, dvl_rate=5, gnss_rate=5, imu_rate=5))
+    run = simulate(Scenario(trajectory="figure8", seconds=400, dvl_rate=5, gnss_rate=5, imu_rate=5))
     samples = sorted([*run.imu, *run.gnss, *run.dvl], key=lambda sample: sample.stamp_ns)
     messages = [sent(sample) for sample in samples]
     saved = tmp_path / "result.yaml"

@@ -128,12 +128,11 @@ def test_a_node_that_gets_no_data_leaves_the_result_before_and_its_backup_as_the
         save_result(saved, result_document(good), 3)
     before = {path.name: path.read_bytes() for path in tmp_path.glob("live*")}
     assert len(before) == 2
-    for _ in range(2):
-        with world.calibration_node(f"result_file:={saved}") as process:
-            diagnostics = world.received(DiagnosticArray, "/diagnostics")
-            until(lambda diagnostics=diagnostics: diagnostics, "the node to run")
-        assert process.returncode == 0 and "no sample was used" in process.output
-        assert {path.name: path.read_bytes() for path in tmp_path.glob("live*")} == before
+    with world.calibration_node(f"result_file:={saved}") as process:
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        until(lambda: diagnostics, "the node to run")
+    assert process.returncode == 0 and "no sample was used" in process.output
+    assert {path.name: path.read_bytes() for path in tmp_path.glob("live*")} == before
 
 
 def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_lost(world, tmp_path):
@@ -160,8 +159,8 @@ def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_l
         (["--params-file", "/no/such/file.yaml"], "/no/such/file.yaml"),
     ],
 )
-def test_a_bad_configuration_is_refused_at_the_start_in_one_line(arguments, said):
-    errors = refused_at_start(*arguments)
+def test_a_bad_configuration_is_refused_at_the_start_in_one_line(capfd, arguments, said):
+    errors = refused_at_start(capfd, *arguments)
     assert said in errors
     own = [line for line in errors.splitlines() if "[rcl]" not in line]  # rcl may add a line of its own
     assert len(own) == 1 and own[0].startswith("calibration_node: ")
@@ -177,12 +176,12 @@ PARAMETER_FILES = {
 
 
 @pytest.mark.parametrize("what", PARAMETER_FILES)
-def test_a_parameter_file_that_would_leave_the_node_on_its_defaults_is_refused(tmp_path, what):
+def test_a_parameter_file_that_would_leave_the_node_on_its_defaults_is_refused(capfd, tmp_path, what):
     text, said = PARAMETER_FILES[what]
     path = tmp_path / "params.yaml"
     path.write_text(text.replace("FILE", str(path)))
     before = path.read_bytes()
-    errors = refused_at_start("--params-file", str(path))
+    errors = refused_at_start(capfd, "--params-file", str(path))
     assert said.replace("FILE", str(path)) in errors and "Traceback" not in errors
     assert [line for line in errors.splitlines() if "[rcl]" not in line][-1].startswith("calibration_node: ")
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["params.yaml"]

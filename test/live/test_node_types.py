@@ -45,8 +45,8 @@ def world():
         (["-p", "gnss_type:=dvl_msgs/DVL"], "gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs/msg/Twist"),
     ],
 )
-def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(arguments, said):
-    errors = refused_at_start(*arguments)
+def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(capfd, arguments, said):
+    errors = refused_at_start(capfd, *arguments)
     assert len(errors.splitlines()) == 1 and said in errors
 
 

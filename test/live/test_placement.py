@@ -40,7 +40,7 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
     bag, saved = tmp_path / "bag", tmp_path / "live.yaml"
     errors = DvlErrors((0.0, 0.01, 0.02), beam_std=0.005)
     scenario = Scenario(
-        seconds=60.0, mounting_rpy=(0.0, 0.0, YAW), errors=errors, gnss_std=0.05,
+        seconds=5.0 if given else 60.0, mounting_rpy=(0.0, 0.0, YAW), errors=errors, gnss_std=0.05,
         effects=(injection("lever_arm:x_m=-0.6,y_m=0.1,z_m=-0.2"),),
     )  # fmt: skip
     write_bag(scenario, bag, Storage.MCAP, Compression.NONE)

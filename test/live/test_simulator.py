@@ -26,6 +26,7 @@ from sensor_msgs.msg import Imu
 
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Run, Scenario, motion_of, simulate
@@ -210,17 +211,17 @@ def test_a_request_that_ros_itself_cannot_read_ends_no_simulator(world):
     [("--dvl-topic", "//bad//"), ("--follow", ""), ("--follow", "a b"), ("--imu-topic", "dvl/twist")],
     ids=" ".join,
 )
-def test_a_topic_that_cannot_be_had_is_refused_in_one_line(world, options):
-    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "simulate", "--live", *options]
-    environment = os.environ | {"ROS_DOMAIN_ID": str(world.domain), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=ROOT, timeout=PATIENCE_S)
-    assert done.returncode == 2 and "name another" in done.stderr
-    assert sum("topic" in line for line in done.stderr.splitlines()) == 1 and "Traceback" not in done.stderr
-
-
-def test_two_sensors_on_one_topic_are_refused_at_the_start_of_the_node(world, monkeypatch):
+def test_a_topic_that_cannot_be_had_is_refused_in_one_line(world, options, monkeypatch, capfd):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(world.domain))
-    assert "name another" in refused_at_start("-r", "dvl/twist:=/x", "-r", "imu/data:=/x")
+    capfd.readouterr()
+    assert main(["simulate", "--live", *options]) == 2
+    errors = capfd.readouterr().err
+    assert "name another" in errors and sum("topic" in line for line in errors.splitlines()) == 1
+
+
+def test_two_sensors_on_one_topic_are_refused_at_the_start_of_the_node(world, monkeypatch, capfd):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(world.domain))
+    assert "name another" in refused_at_start(capfd, "-r", "dvl/twist:=/x", "-r", "imu/data:=/x")
 
 
 def test_another_type_of_the_dvls_messages_can_be_had(world):
@@ -233,8 +234,14 @@ def test_another_type_of_the_dvls_messages_can_be_had(world):
     assert heard[3].twist.linear.x == pytest.approx(1.0, abs=0.6)
 
 
-@pytest.mark.parametrize("mode", [["--trajectory", "box"], ["--follow", "odom"], ["--wait"]])
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("mode", "stop"),
+    [
+        (["--trajectory", "box", "--duration", "60"], signal.SIGTERM),
+        (["--follow", "odom"], signal.SIGINT),
+        (["--wait"], signal.SIGINT),
+    ],
+)
 def test_it_ends_at_once_and_well_when_it_is_told_to(world, mode, stop):
     with simulator(world, *mode, ends_by_itself=True) as process:
         world.received(Imu, "imu/data", DEEP)

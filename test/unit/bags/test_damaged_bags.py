@@ -119,24 +119,22 @@ def test_corrupt_bytes_anywhere_never_give_a_message_that_was_not_recorded(tmp_p
     assert len(found) == len(messages()) or notes
 
 
-@pytest.mark.parametrize("case", damage.cases(), ids=lambda case: case.name)
-def test_all_that_is_whole_comes_out_and_nothing_else(tmp_path, case):
-    assert damage.recover(case, "ours", tmp_path) == (len(case.whole), 0)
+def test_all_that_is_whole_comes_out_and_nothing_else(tmp_path):
+    """And how much was read and how much is lost is said in one note."""
+    for case in damage.cases():
+        suffix = "mcap" if case.name.startswith("MCAP") else "db3"
+        found, notes = read(tmp_path, case.content, f"damaged.{suffix}")
+        assert set(found) == set(case.whole), case.name
+        (note,) = notes
+        assert f"{len(found)} whole messages" in note, case.name
+        said = ("bytes skipped", "bytes short", "damaged pages")
+        assert any(words in note for words in said) or len(found) == 1800, case.name
 
 
 def test_the_table_in_the_documentation_says_what_is_recovered():
     table = section("damage")
     for case in damage.cases():
         assert f"| {case.name} | {len(case.whole)} | {len(case.whole)} | " in table
-
-
-@pytest.mark.parametrize("case", damage.cases(), ids=lambda case: case.name)
-def test_how_much_was_read_and_how_much_is_lost_is_said_in_one_note(tmp_path, case):
-    suffix = "mcap" if case.name.startswith("MCAP") else "db3"
-    found, notes = read(tmp_path, case.content, f"damaged.{suffix}")
-    (note,) = notes
-    assert f"{len(found)} whole messages" in note
-    assert ("bytes skipped" in note or "bytes short" in note or "damaged pages" in note) or len(found) == 1800
 
 
 @pytest.mark.parametrize("compression", [NONE, LZ4, ZSTD])

@@ -7,9 +7,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from runs import START_NS, MatchedRun, calibrate, make_samples
+from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.advice import reference_advice
+from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.days import day_covariance
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.models import MODELS
@@ -23,23 +24,29 @@ CLAIMED = Parameters(gnss_aided_std=0.03, **OF_THE_DAY)
 
 
 @cache
-def run(wander: float):
+def run(wander: float, **rates: int):
     """A box of 300 s whose reference has white noise as claimed and one that wanders over half a minute (m/s)."""
-    samples = make_samples(MatchedRun("box", 300.0, gnss_std=0.03, dvl_std=0.005, imu_every=20))
+    samples = make_samples(MatchedRun("box", 300.0, gnss_std=0.03, dvl_std=0.005, **{"imu_every": 20} | rates))
     rng = np.random.default_rng(4)
     error, found = np.zeros(3), []
     for sample in samples:
         if isinstance(sample, ReferenceSample):
-            keep = np.exp(-0.2 / 30.0)
+            keep = np.exp(-0.01 * rates.get("gnss_every", 20) / 30.0)
             error = keep * error + wander * np.sqrt(1.0 - keep**2) * rng.normal(size=3)
             sample = sample._replace(velocity=tuple((sample.velocity + error).tolist()))
         found.append(sample)
     return tuple(found)
 
 
+@cache
+def calibrated(wander: float) -> Calibrator:
+    """Of such a run as claimed; not to be fed any more."""
+    return calibrate(run(wander), CLAIMED)
+
+
 @pytest.mark.parametrize("name", ["M3", "G1", "G2"])
 def test_noise_that_lasts_raises_sigma_and_noise_as_claimed_hardly_does(name):
-    lasting, white = (calibrate(run(wander), CLAIMED).estimate(name) for wander in (0.1, 0.0))
+    lasting, white = (calibrated(wander).estimate(name) for wander in (0.1, 0.0))
     assert lasting.std[2] > 2.0 * lasting.filter_std[2]
     assert np.all(white.std >= white.filter_std * (1.0 - 1e-12))
     assert white.std[2] < 1.6 * white.filter_std[2]
@@ -47,14 +54,14 @@ def test_noise_that_lasts_raises_sigma_and_noise_as_claimed_hardly_does(name):
 
 @pytest.mark.parametrize("block_size", [1, 500])
 def test_how_samples_are_gathered_changes_nothing(block_size):
-    one, other = (calibrate(run(0.1), CLAIMED, block_size=size) for size in (64, block_size))
+    one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size) for size in (64, block_size))
     for name in ("M3", "G1", "F1", "A1"):
         found = one.estimate(name).covariance, other.estimate(name).covariance
         np.testing.assert_allclose(*found, rtol=1e-7, atol=1e-12)
 
 
 def test_a_covariance_is_symmetric_to_the_last_bit_however_much_each_sigma_is_raised():
-    calibrator = calibrate(run(0.1), CLAIMED)
+    calibrator = calibrated(0.1)
     for name in MODELS:
         covariance = calibrator.published(name).p
         assert (covariance == covariance.T).all(), name
@@ -66,11 +73,17 @@ def test_a_random_walk_is_left_as_the_filter_has_it():
 
 
 def test_the_state_is_the_same_and_the_result_file_has_both_sigmas():
-    calibrator = calibrate(run(0.1), CLAIMED)
+    calibrator = calibrated(0.1)
     np.testing.assert_array_equal(calibrator.published("G1").x, calibrator.state("G1").x)
     document = result_document(calibrator.result())
     yaw, by_filter = (float(document[key]["phi_z"].split()[0]) for key in ("std", "std_by_filter"))
     assert yaw > 2.0 * by_filter
+
+
+@cache
+def on_course(offset: tuple[float, float], headings: bool) -> Calibrator:
+    """Of `level_course` as claimed; not to be fed any more."""
+    return calibrate(level_course(offset, headings), CLAIMED)
 
 
 @cache
@@ -90,23 +103,23 @@ def level_course(offset: tuple[float, float], headings: bool):
 
 
 def test_a_constant_error_of_the_reference_is_found_over_several_headings():
-    estimate = calibrate(level_course((0.012, -0.009), True), CLAIMED).estimate("G1")
+    estimate = on_course((0.012, -0.009), True).estimate("G1")
     assert estimate.state_of("reference_east") == pytest.approx(0.012, abs=0.003)
     assert estimate.state_of("reference_north") == pytest.approx(-0.009, abs=0.003)
     assert abs(estimate.state[2]) < 2.5 * estimate.std[2] < np.radians(0.25)
 
 
 def test_a_reference_that_is_off_is_said_with_size_and_course_and_one_that_is_not_is_not():
-    (found,) = reference_advice(calibrate(level_course((0.03, 0.0), True), CLAIMED).estimate("G1"))
+    (found,) = reference_advice(on_course((0.03, 0.0), True).estimate("G1"))
     assert re.match(r"the reference is off by (2[789]|3[0123]) mm/s towards (8[6-9]|9[0-4])° all along", found.says)
-    assert not reference_advice(calibrate(level_course((0.0, 0.0), True), CLAIMED).estimate("G1"))
-    assert not reference_advice(calibrate(level_course((0.03, 0.0), False), CLAIMED).estimate("G1"))
-    assert not reference_advice(calibrate(level_course((0.03, 0.0), True), CLAIMED).estimate("M3"))
+    assert not reference_advice(on_course((0.0, 0.0), True).estimate("G1"))
+    assert not reference_advice(on_course((0.03, 0.0), False).estimate("G1"))
+    assert not reference_advice(on_course((0.03, 0.0), True).estimate("M3"))
 
 
 def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may_be_wrong():
     """5 mm/s across 1.5 m/s are 0.19 degrees, ahead 0.33 per cent; data of any length do not tell them."""
-    estimate = calibrate(level_course((0.006, 0.004), False), CLAIMED).estimate("G1")
+    estimate = on_course((0.006, 0.004), False).estimate("G1")
     assert np.radians(0.18) < estimate.std[2] < np.radians(0.25)
     assert abs(estimate.state[2]) < 2.0 * estimate.std[2] and abs(estimate.state[3]) < 2.0 * estimate.std[3]
     trusting = calibrate(level_course((0.006, 0.004), False), CLAIMED.replace(reference_offset_std=1e-6))
@@ -126,7 +139,7 @@ def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed
 def test_the_sigma_that_is_published_is_that_of_the_next_recording_and_the_recordings_own_stands_beside():
     """0.1 degrees of heading about the body's vertical, 0.3 per cent of scale: no length of data takes them out."""
     mounted = Parameters(gnss_aided_std=0.03, mounting_rpy=(0.0, 0.0, 0.6))
-    calibrator = calibrate(run(0.0), CLAIMED), calibrate(run(0.0), CLAIMED.replace(day_std_heading=np.radians(0.1)))
+    calibrator = calibrated(0.0), calibrate(run(0.0), CLAIMED.replace(day_std_heading=np.radians(0.1)))
     alone, another_day = (each.estimate("G1") for each in calibrator)
     np.testing.assert_array_equal(alone.covariance, alone.recording_covariance)
     np.testing.assert_array_equal(another_day.recording_covariance, alone.covariance)

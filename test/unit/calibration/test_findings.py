@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import string
+from functools import cache
 
 import pytest
 from conftest import ROOT
@@ -22,16 +23,21 @@ def fields(kind: FindingKind) -> set[str]:
     return {name for _, name, _, _ in parsed if name}
 
 
+@cache
+def nodes() -> list[ast.AST]:
+    """All of the package's code."""
+    return [node for path in MODULES for node in ast.walk(ast.parse(path.read_text()))]
+
+
 def literal_calls() -> list[tuple[str, set[str], bool]]:
     """(code, keywords, whether there are others by **) of each call of `finding` with a code in place."""
     found = []
-    for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "finding":
-                first = node.args[0]
-                if isinstance(first, ast.Constant):
-                    names = {keyword.arg for keyword in node.keywords if keyword.arg}
-                    found.append((first.value, names, any(keyword.arg is None for keyword in node.keywords)))
+    for node in nodes():
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "finding":
+            first = node.args[0]
+            if isinstance(first, ast.Constant):
+                names = {keyword.arg for keyword in node.keywords if keyword.arg}
+                found.append((first.value, names, any(keyword.arg is None for keyword in node.keywords)))
     return found
 
 
@@ -56,12 +62,7 @@ def test_every_call_gives_its_entry_exactly_the_fields_it_has():
 
 
 def test_every_entry_of_the_table_is_said_somewhere():
-    constants = {
-        node.value
-        for path in MODULES
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    }
+    constants = {node.value for node in nodes() if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     assert [code for code in FINDINGS if code not in constants] == []
 
 

@@ -95,7 +95,7 @@ def test_the_variance_is_as_set_until_the_run_shows_a_larger_one(rng, std, expec
 
 @pytest.mark.parametrize("random_walk", [0.0, 1e-4], ids=["constant", "random walk"])
 def test_live_and_in_blocks_say_the_same_of_heave_under_a_random_walk_too(random_walk):
-    run = simulate(Scenario("box", 130.0, seed=4, dvl_rate=2.0, gnss_rate=1.0, imu_rate=4.0, waves=Waves(0.5, 7.0)))
+    run = simulate(Scenario("box", 70.0, seed=4, dvl_rate=2.0, gnss_rate=1.0, imu_rate=4.0, waves=Waves(0.5, 7.0)))
     samples = sorted([*run.imu, *run.gnss, *run.dvl], key=lambda sample: sample.stamp_ns)
     parameters = Parameters(process_std_misalignment=random_walk)
     live, blocks = (feed(Calibrator(parameters, block_size=size), samples) for size in (1, 97))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from filter_problems import random_problem
-from runs import MatchedRun, calibrate, make_samples
+from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.error_model import correct, correction_jacobian
@@ -108,7 +108,7 @@ def test_without_a_reference_a_calibration_is_marginal_at_best():
 
 @pytest.mark.parametrize("block_size", [1, 512])
 def test_verification_does_not_depend_on_how_samples_are_gathered(block_size):
-    samples = make_samples(MatchedRun("box", 60.0, phi=(0.01, 0.0, 0.02), gnss_std=0.05))
+    samples = make_samples(MatchedRun("box", 60.0, phi=(0.01, 0.0, 0.02), gnss_std=0.05, **ONE_HERTZ))
     one = calibrate(samples, verified=True, block_size=7).verification("G1").held_out
     other = calibrate(samples, verified=True, block_size=block_size).verification("G1").held_out
     assert other.samples == one.samples
