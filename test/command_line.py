@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import resource
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from dvl_calib_ros.cli.main import main
 
@@ -25,6 +29,19 @@ def fail(capsys, *arguments) -> str:
     assert code == 2 and output.out == ""
     assert output.err.count("\n") == 1 and output.err.startswith("dvl-calib")
     return output.err
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """No file grows beyond so many bytes, by the kernel's limit: the same calls fail half-way as on a full disk."""
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
 
 
 def in_fresh_process(statement: str, modules: list[str]) -> list[str]:

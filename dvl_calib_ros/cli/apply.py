@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
-    from ..files.atomic import backup_of, own_stream, save_bytes
+    from ..files.atomic import backup_of, own_stream, save_all
     from ..files.mounting import load_calibrated_mounting
 
     calibrated = load_calibrated_mounting(arguments.result)
@@ -60,14 +60,12 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError(f"{arguments.result}: {'; '.join(calibrated.objections)}; to apply it all the same: --force")
     contents = _contents(arguments, calibrated)
     _print(calibrated, arguments)
-    for path, content in contents.items():
-        is_there = own_stream(path) is None and path.exists()
-        if is_there and path.read_bytes() == content:
-            print(f"{path}: is so already")
-            continue
-        kept = f"; the one before is {backup_of(path).name}" if is_there else ""
-        save_bytes(path, content)
-        print(f"{path}: written{kept}")
+    there = [path for path in contents if own_stream(path) is None and path.exists()]
+    new = {path: content for path, content in contents.items() if path not in there or path.read_bytes() != content}
+    save_all(new)  # a URDF that is turned beside parameters that are not would turn the DVL twice, or not at all
+    for path in contents:
+        kept = f"; the one before is {backup_of(path).name}" if path in there else ""
+        print(f"{path}: written{kept}" if path in new else f"{path}: is so already")
 
 
 def _targets(arguments: argparse.Namespace) -> list[Path]:
@@ -136,7 +134,7 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
 
 def _roll_back(arguments: argparse.Namespace) -> None:
     from ..errors import InputError
-    from ..files.atomic import backup_of, save_bytes
+    from ..files.atomic import backup_of, save_all
 
     targets = _targets(arguments)
     if not targets:
@@ -148,6 +146,6 @@ def _roll_back(arguments: argparse.Namespace) -> None:
             before[path] = backup.read_bytes()
         except OSError as error:
             raise InputError(f"{backup}: cannot be read ({error.strerror}); there is nothing to go back to") from error
-    for path, content in before.items():
-        save_bytes(path, content)  # and what is there now becomes the backup
+    save_all(before)  # and what is there now becomes the backup
+    for path in before:
         print(f"{path}: as before; what it was is now {backup_of(path).name}")

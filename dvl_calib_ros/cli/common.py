@@ -206,10 +206,40 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write JSON, whole or not at all; numbers that are not finite become null."""
+    """Write JSON, whole or not at all."""
     from ..files.atomic import save_text
 
-    save_text(path, json.dumps(_finite(document), indent=1, allow_nan=False) + "\n")
+    save_text(path, as_json(document))
+
+
+def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Path], object]]) -> None:
+    """Write what was found, and print it, each also where another fails.
+
+    writes: where to, None for nowhere, and how. Raises InputError of what could not be written, in the end.
+    """
+    from ..errors import InputError
+
+    failed = []
+    for path, write in writes:
+        try:
+            if path is not None:
+                write(path)
+        except InputError as error:
+            failed.append(str(error))
+    try:
+        answer()
+        sys.stdout.flush()
+    except OSError:
+        if not failed:
+            raise
+        give_up(sys.stdout)
+    if failed:
+        raise InputError("; ".join(failed))
+
+
+def as_json(document: Any) -> str:
+    """JSON, in which numbers that are not finite are null."""
+    return json.dumps(_finite(document), indent=1, allow_nan=False) + "\n"
 
 
 def _finite(value: Any) -> Any:

@@ -55,13 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
     write_report = report_writer(arguments, "write_comparison_report")
     names = _names(paths)
     comparison = compare([_loaded(arguments, path, name) for path, name in zip(paths, names, strict=True)])
-    if arguments.json is not None:
-        common.write_json(arguments.json, comparison_document(comparison))
-    if write_report is not None:
-        write_report(arguments.report, comparison)
     try:
-        _print(comparison)
-        sys.stdout.flush()
+        common.deliver(
+            lambda: _print(comparison),
+            (arguments.json, lambda path: common.write_json(path, comparison_document(comparison))),
+            (arguments.report, lambda path: write_report(path, comparison)),
+        )
     except BrokenPipeError:  # | head: the answer is the exit code all the same
         give_up(sys.stdout)
     return 0 if comparison.same_mounting else 1

@@ -70,10 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")
-        offline = _offline(bag, latency, with_history=write_report is not None)
+        offline = _offline(bag, latency, with_history=arguments.report is not None)
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
-    if write_report is not None:
+    if arguments.report is not None:
         write_report(arguments.report, offline, [bag], list(MODELS))
         out.print(f"The replay's report is in {arguments.report}.")
     return 0 if agree else 1

@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.recordings import recording_names
     from ..diagnosis.results import diagnosis_document
-    from ..files.atomic import save_text
+    from ..files.atomic import save_all
     from ..simulation.twin_bags import write_twins
 
     parameters = common.load(arguments)
@@ -90,22 +90,30 @@ def run(arguments: argparse.Namespace) -> None:
             common.load(arguments, DEFAULTS).replace(**discovery.values),
             discovery.topics,
             on_progress,
-            with_series=write_report is not None,
+            with_series=arguments.report is not None,
         )
-    if arguments.json is not None:
-        common.write_json(arguments.json, diagnosis_document(diagnosis))
-    if arguments.apply is not None:
-        save_text(arguments.apply, parameter_file(compensated(parameters, diagnosis)))
+
+    def answer() -> None:
+        _print(diagnosis)
+        common.print_found(discovery, arguments.bags)
+
+    def apply(path: Path) -> None:
+        days: dict[Path, int | None] = {path: None}
         if any(effect.by_recording for effect in diagnosis.effects):
-            for index, (name, _) in enumerate(diagnosis.recordings):
-                save_text(of_each[name], parameter_file(compensated(parameters, diagnosis, index)))
-    if arguments.twin is not None:
+            days |= {of_each[name]: index for index, (name, _) in enumerate(diagnosis.recordings)}
+        save_all({at: parameter_file(compensated(parameters, diagnosis, day)).encode() for at, day in days.items()})
+
+    def write_all_twins(folder: Path) -> None:
         for twin in diagnosis.twins:
-            write_twins(arguments.twin, twin)
-    if write_report is not None:
-        write_report(arguments.report, diagnosis)
-    _print(diagnosis)
-    common.print_found(discovery, arguments.bags)
+            write_twins(folder, twin)
+
+    common.deliver(
+        answer,
+        (arguments.json, lambda path: common.write_json(path, diagnosis_document(diagnosis))),
+        (arguments.apply, apply),
+        (arguments.twin, write_all_twins),
+        (arguments.report, lambda path: write_report(path, diagnosis)),
+    )
 
 
 def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]:

@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> None:
 
     common.check_outputs(arguments, "json")
     examination = examine(arguments.bags, common.load(arguments), common.given(arguments))
-    if arguments.json is not None:
-        common.write_json(arguments.json, examination.document())
-    _print(examination)
+    common.deliver(
+        lambda: _print(examination), (arguments.json, lambda path: common.write_json(path, examination.document()))
+    )
 
 
 def _print(examined: Examination) -> None:

@@ -51,8 +51,10 @@ def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
     from ..calibration.models import MODELS
     from ..errors import InputError
+    from ..evaluation.documents import evaluation_csv, evaluation_document
     from ..evaluation.evaluate import DEFAULTS, EVALUATED, evaluate
     from ..evaluation.protocol import SETS
+    from ..files.atomic import save_text
     from ..parallel import Workers
 
     are_bags = _are_bags(arguments.paths)
@@ -80,10 +82,12 @@ def run(arguments: argparse.Namespace) -> None:
             workers=workers,
             on_progress=on_progress,
         )
-    _save(arguments, evaluation)
-    if write_report is not None:
-        write_report(arguments.report, evaluation)
-    _print(evaluation)
+    common.deliver(
+        lambda: _print(evaluation),
+        (arguments.json, lambda path: common.write_json(path, evaluation_document(evaluation))),
+        (arguments.csv, lambda path: save_text(path, evaluation_csv(evaluation))),
+        (arguments.report, lambda path: write_report(path, evaluation)),
+    )
 
 
 def _are_bags(paths: list[Path]) -> bool:
@@ -100,16 +104,6 @@ def _are_bags(paths: list[Path]) -> bool:
     if len(paths) == 1:
         raise InputError(f"{paths[0]}: one bag cannot be checked against another; name two at least, or use replay")
     return True
-
-
-def _save(arguments: argparse.Namespace, evaluation: Evaluation) -> None:
-    from ..evaluation.documents import evaluation_csv, evaluation_document
-    from ..files.atomic import save_text
-
-    if arguments.json is not None:
-        common.write_json(arguments.json, evaluation_document(evaluation))
-    if arguments.csv is not None:
-        save_text(arguments.csv, evaluation_csv(evaluation))
 
 
 # ------------------------------------------------------------------ tables
@@ -286,8 +280,8 @@ def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Work
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
         check = cross_check(arguments.paths, common.load(arguments), models, topics, workers, on_progress)
-    if arguments.json is not None:
-        common.write_json(arguments.json, cross_check_document(check))
-    if write_report is not None:
-        write_report(arguments.report, check)
-    print_cross_check(check)
+    common.deliver(
+        lambda: print_cross_check(check),
+        (arguments.json, lambda path: common.write_json(path, cross_check_document(check))),
+        (arguments.report, lambda path: write_report(path, check)),
+    )

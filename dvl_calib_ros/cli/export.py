@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..export.description import load_description
     from ..export.simulator import export, export_document
     from ..export.simulators import SIMULATORS
-    from ..files.atomic import own_stream, save_text
+    from ..files.atomic import own_stream, save_all
 
     missing = None
     if own_stream(arguments.output) is None:
@@ -44,9 +44,11 @@ def run(arguments: argparse.Namespace) -> None:
     common.check_outputs(arguments, "output", also_written=beside)
     description = load_description(arguments.source)
     exported = export(arguments.simulator, SIMULATORS[arguments.simulator], description)
-    save_text(arguments.output, exported.settings.text)
+    files = {arguments.output: exported.settings.text.encode()}
     if missing is not None:
-        common.write_json(missing, export_document(exported, description, __version__))
+        files[missing] = common.as_json(export_document(exported, description, __version__)).encode()
+    save_all(files)
+    if missing is not None:
         _print(exported, arguments)
 
 

@@ -130,6 +130,10 @@ def _complete() -> NoReturn:
 def _fail(command: str, message: str) -> int:
     from ..errors import printable
 
+    try:
+        sys.stdout.flush()  # what was printed before, which the interpreter could only complain of
+    except OSError:
+        give_up(sys.stdout)
     say(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}")
     return 2
 

@@ -59,9 +59,10 @@ def run(arguments: argparse.Namespace) -> None:
             with_history=True,
         )
     result = replayed.result
-    if arguments.json is not None:
+
+    def write(path: Path) -> None:
         common.write_json(
-            arguments.json,
+            path,
             replay_document(result, models)
             | {
                 "dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned},
@@ -71,12 +72,17 @@ def run(arguments: argparse.Namespace) -> None:
                 "navigation": navigation_document(replayed.navigation),
             },
         )
-    if arguments.save is not None:
+
+    def save(path: Path) -> None:
         document = result_document(result, replayed.dvl_frame, replayed.turned)
-        save_result(arguments.save, document, round(parameters.result_backups))
-    if write_report is not None:
-        write_report(arguments.report, replayed, arguments.bags, models)
-    _print(arguments, replayed, discovery, models if arguments.verbose else asked)
+        save_result(path, document, round(parameters.result_backups))
+
+    common.deliver(
+        lambda: _print(arguments, replayed, discovery, models if arguments.verbose else asked),
+        (arguments.json, write),
+        (arguments.save, save),
+        (arguments.report, lambda path: write_report(path, replayed, arguments.bags, models)),
+    )
 
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:

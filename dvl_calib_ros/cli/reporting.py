@@ -12,13 +12,13 @@ def add_report_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
 
 
-def report_writer(arguments: argparse.Namespace, name: str) -> Callable[..., None] | None:
-    """A function of the package report, None if no report is asked for.
+def report_writer(arguments: argparse.Namespace, name: str) -> Callable[..., None]:
+    """A function of the package report, which nobody is to call if no report is asked for.
 
     Raises InputError, before any work is done, if a library is missing that reports are made with.
     """
     if arguments.report is None:
-        return None
+        return _no_report
     from ..errors import InputError
 
     try:
@@ -27,3 +27,7 @@ def report_writer(arguments: argparse.Namespace, name: str) -> Callable[..., Non
         raise InputError(f"--report needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2") from error
     write: Callable[..., None] = getattr(report, name)
     return write
+
+
+def _no_report(*_: object) -> None:
+    raise AssertionError("no report was asked for")

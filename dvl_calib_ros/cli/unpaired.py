@@ -49,14 +49,18 @@ def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
     real = _source(arguments, arguments.bags, arguments.params, defaults)
     made = _source(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
-        comparison = compare(real[0], made[0], on_progress, with_series=write_report is not None)
-    if arguments.json is not None:
-        common.write_json(arguments.json, unpaired_document(comparison))
-    if write_report is not None:
-        write_report(arguments.report, comparison)
-    _print(comparison)
-    common.print_found(real[1], arguments.bags)
-    common.print_found(made[1], arguments.simulator)
+        comparison = compare(real[0], made[0], on_progress, with_series=arguments.report is not None)
+
+    def answer() -> None:
+        _print(comparison)
+        common.print_found(real[1], arguments.bags)
+        common.print_found(made[1], arguments.simulator)
+
+    common.deliver(
+        answer,
+        (arguments.json, lambda path: common.write_json(path, unpaired_document(comparison))),
+        (arguments.report, lambda path: write_report(path, comparison)),
+    )
 
 
 def _source(

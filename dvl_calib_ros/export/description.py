@@ -9,16 +9,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import rotation_from_rpy, rpy_from_rotation
 from ..effects.base import ActsOn, AnyEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
+from ..files.mounting import load_calibrated_mounting
 from ..files.parameter_files import load_parameters
 from ..files.reading import read_file
-from ..files.result_file import FORMAT, load_result
+from ..files.result_file import FORMAT
 
 Three = tuple[float, float, float]
 # What a description holds as numbers, and simulators may have settings for; everything else is `others`
@@ -54,7 +54,8 @@ class DvlDescription:
     DVL from the reference point, body frame. scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
     noise_std: (3,) m/s, of its axes; rate_hz: None where not known. speed: (3,) m/s, RMS along its axes. sizes: m/s, by
     name (`misalignment`, `scale`, effects). others: effects that are none of these. source: file that it is from.
-    ambiguous: sets of effects that the data could not tell apart, of which the first is taken.
+    ambiguous: sets of effects that the data could not tell apart, of which the first is taken. doubts: what is to be
+    known before it is used, in sentences.
 
     Raises InputError for numbers that are not finite, or no rate or noise.
     """
@@ -70,6 +71,7 @@ class DvlDescription:
     sizes: Mapping[str, float] = field(default_factory=dict)
     others: tuple[Other, ...] = ()
     ambiguous: tuple[tuple[str, ...], ...] = ()
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         vectors = (self.mounting_rpy, self.lever_arm, self.scale, self.velocity_bias, self.noise_std or ())
@@ -196,19 +198,16 @@ def _three(values: Sequence[float] | Any) -> Three:
 
 
 def _of_result(path: Path) -> DvlDescription:
-    content, _ = load_result(path)
-    try:
-        mounting = content["mounting"]
-        late = float(mounting.get("dvl_time_offset") or 0.0)
-        return DvlDescription(
-            source=str(path),
-            mounting_rpy=_three(mounting["corrected_rpy"]),
-            lever_arm=_three(mounting["lever_arm"]),
-            scale=_three(np.asarray(mounting["scale_error_xyz"], dtype=float)),
-            others=(Other("dvl_time_offset", {"seconds": late}),) if late else (),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged, it holds no mounting ({type(error).__name__}: {error})") from error
+    calibrated = load_calibrated_mounting(path)
+    late = calibrated.dvl_time_offset
+    return DvlDescription(
+        source=str(path),
+        mounting_rpy=_three(rpy_from_rotation(calibrated.rotation_body_from_dvl)),
+        lever_arm=_three(calibrated.lever_arm),
+        scale=_three(calibrated.scale),
+        others=(Other("dvl_time_offset", {"seconds": late}),) if late else (),
+        doubts=(*calibrated.objections, *calibrated.doubts),
+    )
 
 
 def _of_parameters(path: Path) -> DvlDescription:

@@ -72,7 +72,7 @@ def export(name: str, simulator: Simulator, description: DvlDescription) -> Expo
     ambiguous = tuple(
         f"the data could not tell {', '.join(names)} apart; {names[0]} is taken" for names in description.ambiguous
     )
-    return Export(name, settings, tuple(missing), (*settings.remarks, *ambiguous, simulator.where))
+    return Export(name, settings, tuple(missing), (*description.doubts, *settings.remarks, *ambiguous, simulator.where))
 
 
 def export_document(export: Export, description: DvlDescription, version: str) -> dict[str, Any]:

@@ -13,9 +13,10 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from ..errors import InputError
 
@@ -55,12 +56,34 @@ def save_bytes(path: Path, content: bytes, keep: Keep = newest_only) -> None:
     InputError: If it cannot be written; then the old file is untouched and no other is left.
 
     """
+    save_all({path: content}, keep)
+
+
+def save_all(contents: Mapping[Path, bytes], keep: Keep = newest_only) -> None:
+    """Write files that belong together as `save_bytes` does. If one of them cannot be written, all are as before."""
+    path = Path()
     try:
-        stream = own_stream(path)
-        if stream is not None:
-            _write_stream(stream, content)
-        else:
-            _replace(_target(path), content, keep)
+        with ExitStack() as stack:
+            saves: dict[Path, _Save] = {}
+            alone: dict[Path, bool] = {}
+            for path, content in contents.items():  # all that takes space, before anything is replaced
+                stream = own_stream(path)
+                if stream is not None:
+                    _write_stream(stream, content)
+                    continue
+                target = _target(path)
+                if target.parent not in alone:
+                    alone[target.parent] = stack.enter_context(_locked(target.parent))
+                saves[path] = stack.enter_context(_prepared(target, content))
+            try:
+                for path in saves:  # named if it fails
+                    os.replace(saves[path].temporary, saves[path].target)
+            except BaseException:
+                for save in saves.values():
+                    save.undo()
+                raise
+            for save in saves.values():
+                _tidy(save, keep, alone[save.target.parent])
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         full = isinstance(error, OSError) and error.errno in NO_SPACE
         remedy = "free some space, or name a file on another disk" if full else "name another place"
@@ -159,29 +182,52 @@ def _target(path: Path) -> Path:
 # ---------------------------------------------------------------------- the order of a save
 
 
-def _replace(target: Path, content: bytes, keep: Keep) -> None:
-    """Write beside, rename, then see to the backups.
+class _Save(NamedTuple):
+    """A file to be replaced, the hidden one that replaces it, and another name of the one before, if there is one."""
 
-    Until the renaming every failure leaves the old file alone. Killed after it, the file before is stranded under a
-    hidden name, from which the next save takes it.
-    """
-    with _locked(target.parent) as is_alone:
-        before = None
-        with _written_beside(target, content) as temporary:
-            try:
-                before = _second_name(target, temporary) if target.exists() else None
-                os.replace(temporary, target)
-            except BaseException:
-                if before is not None and os.path.exists(temporary):
-                    os.unlink(before)
-                raise
-        with suppress(OSError):  # from here on the new file is there
-            _rotate(target, before, keep, is_alone)
+    target: Path
+    temporary: str
+    before: Path | None
+
+    @property
+    def is_done(self) -> bool:
+        return not os.path.exists(self.temporary)
+
+    def undo(self) -> None:
+        """Put the file before in its place again."""
         with suppress(OSError):
-            if is_alone:
-                _remove_leftovers(target.parent)
-        with suppress(OSError):  # not every file system can sync a folder
-            _sync(target.parent)
+            if self.is_done and self.before is None:
+                os.unlink(self.target)
+            elif self.is_done and self.before is not None:
+                os.replace(self.before, self.target)
+
+
+@contextmanager
+def _prepared(target: Path, content: bytes) -> Iterator[_Save]:
+    """All of a save but the renaming.
+
+    Until that every failure leaves the old file alone. Killed after it, the file before is stranded under a hidden
+    name, from which the next save takes it.
+    """
+    with _written_beside(target, content) as temporary:
+        save = _Save(target, temporary, _second_name(target, temporary) if target.exists() else None)
+        try:
+            yield save
+        except BaseException:
+            if save.before is not None and not save.is_done:
+                os.unlink(save.before)
+            raise
+
+
+def _tidy(save: _Save, keep: Keep, is_alone: bool) -> None:
+    """See to the backups; the new file is there."""
+    with suppress(OSError):
+        _rotate(save.target, save.before, keep, is_alone)
+    with suppress(OSError):
+        if is_alone:
+            _remove_leftovers(save.target.parent)
+    with suppress(OSError):  # not every file system can sync a folder
+        _sync(save.target.parent)
 
 
 @contextmanager

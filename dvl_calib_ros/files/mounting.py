@@ -113,7 +113,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         objections, doubts = _judged(content.get("verification"), convergence)
         if "verification" not in content:
             objections += _unverified(content, model)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     except ParameterError as error:
         raise InputError(f"{path}: parameters: {error}") from error

@@ -30,7 +30,8 @@ from ..errors import InputError, printable
 from .atomic import own_stream, save_bytes
 from .yaml_files import load_yaml
 
-FORMAT = "dvl_calib_ros result 1"
+_ANY_FORMAT = "dvl_calib_ros result"
+FORMAT = f"{_ANY_FORMAT} 1"
 # The last entry of a result file, which its head announces: what of a copy was cut off would else go unseen
 _END = "complete"
 
@@ -258,7 +259,12 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     of_recording: covariances of the recording, without what another day makes of them.
     """
     content = load_yaml(path, "result file")
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    known_as = content.get("format") if isinstance(content, dict) else None
+    if known_as != FORMAT and str(known_as).startswith(_ANY_FORMAT):
+        raise InputError(
+            f"{path}: is of another version of this software ({known_as!r}, this reads {FORMAT!r}); update"
+        )
+    if known_as != FORMAT:
         raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
     models = content.get("models")
     if not isinstance(models, dict) or not models:
@@ -273,7 +279,22 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     }
     if not known:
         raise InputError(f"{path}: none of its models {', '.join(map(str, models))} is one of {', '.join(MODELS)}")
+    _check_says_one_thing(path, content)
     return content, known
+
+
+def _check_says_one_thing(path: Path, content: Mapping[str, Any]) -> None:
+    """Raise InputError if what stands in the file twice differs: only one of the two is read, and who changed it does
+    not know which."""
+    try:
+        selected = content["models"][content["model"]]
+        places = [(name, content[name], selected[name]) for name in selected if name in content]
+        places.append(("mounting", content["mounting"]["nominal_rpy"], content["parameters"]["mounting_rpy"]))
+    except (LookupError, TypeError):  # what is missing is missed by who reads it
+        return
+    for name, one, other in places:
+        if one != other:
+            raise InputError(f"{path}: its {name} is another in two places; was it changed by hand? save it again")
 
 
 def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequence[float] | None) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from command_line import room_for
 from io_fixtures import replayed, run, write_bag
 from scipy.spatial.transform import Rotation
 
@@ -355,6 +356,19 @@ def test_rollback_brings_every_file_back_and_a_second_one_undoes_that(tmp_path, 
     assert [path.read_bytes() for path in (urdf, launch)] == after
 
 
+@pytest.mark.parametrize("room", [100, 500, 2000])
+def test_on_a_full_disk_all_files_are_as_before_or_all_are_written(tmp_path, saved, capsys, room):
+    """A URDF that is turned beside parameters that are not turns the DVL twice, or not at all."""
+    urdf, params, fusion = robot(tmp_path / "robot.urdf"), tmp_path / "p.yaml", tmp_path / "f.yaml"
+    params.write_text("/**:\n  ros__parameters:\n    min_speed: 0.2\n" + "# a long story\n" * 300)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with room_for(room + len(before["robot.urdf"])):
+        assert apply(saved, "--urdf", urdf, "--params", params, "--fusion", fusion) == 2
+    shown, error = capsys.readouterr()
+    assert "p.yaml: could not be written" in error and "free some space" in error and "written" not in shown
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_rollback_touches_nothing_when_one_file_has_no_backup(tmp_path, saved, capsys):
     urdf = robot(tmp_path / "robot.urdf")
     assert apply(saved, "--urdf", urdf, "--fusion", tmp_path / "f.yaml") == 0
@@ -397,6 +411,7 @@ def test_bad_options_are_refused_in_one_line(saved, monkeypatch, capsys, argumen
         {"parameters": {"min_speed": -1}},
         {"parameters": []},
         {"verification": {"verdict": "splendid", "reasons": []}},
+        {"verification": {"verdict": "reject", "reasons": []}},
         {"verification": []},
         {"models": {"G1": 3}},
     ],

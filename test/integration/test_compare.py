@@ -94,6 +94,7 @@ def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp
         assert says in fail(capsys, "compare", place / "a.yaml", bad)
     for estimate in document["models"].values():
         estimate["used"] = 0
+    document["used"] = 0
     empty = tmp_path / "empty.yaml"
     empty.write_text(yaml.safe_dump(document, sort_keys=False))
     assert "used no sample" in fail(capsys, "compare", place / "a.yaml", empty)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import resource
 import signal
 import socket
 import subprocess
@@ -15,11 +14,12 @@ import time
 from pathlib import Path
 
 import pytest
-from command_line import fail
+from command_line import fail, room_for
 from conftest import ROOT
 from io_fixtures import run, write_bag
 
 from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.cli.main import main
 
 PATIENCE_S = 60.0
 
@@ -125,7 +125,6 @@ def test_a_link_that_leads_nowhere_is_refused_before_any_work(bag, tmp_path, mon
 def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
     bag, tmp_path, monkeypatch, capsys, command, storage, compression
 ):
-    """The kernel's limit on a file's size stands in for the disk: the same calls fail half-way."""
     monkeypatch.chdir(tmp_path)
     rows = "".join(f"{0.01 * i},1.5,{i % 7},0\n" for i in range(5000))
     Path("T.csv").write_text(rows)
@@ -134,16 +133,32 @@ def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
         "simulate": ("simulate", "new", "--duration", 100),
         "import": ("import", "T.csv", "-o", "made/for/it"),
     }[command]
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, limits[1]))
-    try:
+    with room_for(30_000):
         error = fail(capsys, *arguments, "--storage", storage, "--compression", compression)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, before)
     assert "free some space" in error
     assert os.listdir(tmp_path) == ["T.csv"]
+
+
+def test_what_a_full_disk_does_not_take_is_printed_and_the_other_files_are_written(bag, tmp_path, capsys):
+    """The answer of hours must not be lost with a file of it."""
+    small, large = tmp_path / "o.json", tmp_path / "r.yaml"
+    large.write_text("the one before")
+    assert main(["replay", str(bag), "--json", str(small)]) == 0
+    answer = capsys.readouterr().out
+    with room_for(8192):
+        assert main(["doctor", str(bag), "--json", str(small)]) == 0
+        capsys.readouterr()
+        assert main(["replay", str(bag), "--json", str(small), "--save", str(large)]) == 2
+    shown, error = capsys.readouterr()
+    assert shown.split("next")[0] == answer.split("next")[0] and "samples used" in shown
+    assert error.splitlines()[-1].count("free some space") == 2 and "verdict" in json.loads(small.read_text())
+    assert large.read_text() == "the one before" and len(os.listdir(tmp_path)) == 3
+
+
+def test_a_full_disk_is_said_in_one_line_also_when_nobody_reads_the_answer(bag, tmp_path):
+    done = shell("> >(true)", "replay", bag, "--json", tmp_path / "o.json", before="ulimit -f 1; trap '' XFSZ;")
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith("name a file on another disk")
+    assert "Exception ignored" not in done.stderr and os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize("place", ["/proc/new", "T.csv/new", "T.csv/new/deeper"])

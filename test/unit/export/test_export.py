@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 
 import numpy as np
 import pytest
-from command_line import fail, succeed
+import yaml
+from command_line import fail, room_for, succeed
 from conftest import searched
 from hypothesis import given
 from hypothesis import strategies as st
@@ -252,6 +254,32 @@ def test_what_is_no_diagnosis_is_refused_in_one_line_and_nothing_is_written(cont
     path.write_text(content)
     assert said in fail(capsys, "export", "gazebo", path, "-o", tmp_path / "dvl.sdf")
     assert [each.name for each in tmp_path.iterdir()] == ["d.json"]
+
+
+def test_of_a_result_file_is_written_what_apply_would_write_and_what_speaks_against_it_is_said(tmp_path, capsys):
+    bag, saved = tmp_path / "bag", tmp_path / "r.yaml"
+    succeed(capsys, "simulate", bag, "--trajectory", "straight", "--duration", "20", "--misalignment", 0, 0, 9)
+    succeed(capsys, "replay", bag, "--save", saved)
+    content = yaml.safe_load(saved.read_text())
+    succeed(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
+    remarks = json.loads((tmp_path / "dvl.sdf.missing.json").read_text())["remarks"]
+    assert any(f"its verdict is {content['verification']['verdict']}" in each for each in remarks)
+    for part, key, value, said in (
+        ("mounting", "corrected_rpy", [0.0, 0.0, 45.0], "changed by hand"),  # degrees
+        ("parameters", "lever_arm", [1300.0, 0.0, 0.0], "1300 is outside"),  # millimetres
+        ("verification", "verdict", "splendid", "splendid"),
+    ):
+        changed = copy.deepcopy(content)
+        changed[part][key] = value
+        (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed, sort_keys=False))
+        assert said in fail(capsys, "export", "gazebo", tmp_path / "changed.yaml", "-o", tmp_path / "other.sdf")
+
+
+def test_on_a_full_disk_neither_settings_nor_what_they_lack_are_written(diagnosis, tmp_path, capsys):
+    with room_for(700):  # enough for the settings
+        error = fail(capsys, "export", "holoocean", diagnosis, "-o", tmp_path / "dvl.json")
+    assert "dvl.json.missing.json" in error and "free some space" in error
+    assert [each.name for each in tmp_path.iterdir()] == [diagnosis.name]
 
 
 def test_it_does_not_write_over_what_it_reads(diagnosis, capsys):

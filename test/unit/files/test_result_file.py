@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 import shlex
@@ -216,6 +217,10 @@ def change(path: Path, edit) -> Path:
 
 
 DAMAGE = {
+    "newer format": (lambda c: c.update(format="dvl_calib_ros result 2"), "another version of this software"),
+    "top only": (lambda c: c["state"].__setitem__(2, 0.5), "its state is another in two places"),
+    "below only": (lambda c: c["models"][c["model"]].update(used=7), "its used is another in two places"),
+    "nominal only": (lambda c: c["parameters"].update(mounting_rpy=[0.0, 0.0, 0.1]), "mounting is another in two"),
     "foreign format": (lambda c: c.update(format="other 2"), "not a result file of this software"),
     "no models": (lambda c: c.pop("models"), "holds no models"),
     "models a list": (lambda c: c.update(models=[1]), "holds no models"),
@@ -232,7 +237,10 @@ DAMAGE = {
     "covariance flat": (lambda c: c["models"]["M3"].update(covariance=np.zeros((4, 4)).tolist()), "positive definite"),
     "model a number": (lambda c: c["models"].update(M3=3), "models: M3: damaged"),
     "mounting gone": (lambda c: c.pop("mounting"), "no mounting"),
-    "mounting other": (lambda c: c["mounting"].update(nominal_rpy=[0.0, 0.0, 0.7]), "set the same"),
+    "mounting other": (
+        lambda c: c["mounting"].update(nominal_rpy=[0, 0, 0.7]) or c["parameters"].update(mounting_rpy=[0, 0, 0.7]),
+        "set the same",
+    ),
 }  # fmt: skip
 
 
@@ -269,6 +277,9 @@ def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_pri
         g1 = content["models"]["G1"]
         g1["state_names"], g1["state"] = g1["state_names"][:6], g1["state"][:6]
         g1["covariance"] = [row[:6] for row in g1.pop("covariance_of_recording")[:6]]
+        if content["model"] == "G1":
+            del content["covariance_of_recording"]
+            content.update(copy.deepcopy(g1))
 
     before = load_initial_calibration(change(saved, as_before))["G1"]
     np.testing.assert_array_equal(before.x, [*now.x[:6], 0.0, 0.0])
