@@ -1,4 +1,7 @@
-"""Files that are always the old or the new one, whole, whatever happens while they are written."""
+"""Files that are always the old or the new one, whole, whatever happens while they are written.
+
+(Long, because the calls of a save, and what each leaves if it is the last, are to be seen in one place.)
+"""
 
 from __future__ import annotations
 

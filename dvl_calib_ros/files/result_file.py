@@ -260,11 +260,9 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     """
     content = load_yaml(path, "result file")
     known_as = content.get("format") if isinstance(content, dict) else None
-    if known_as != FORMAT and str(known_as).startswith(_ANY_FORMAT):
-        raise InputError(
-            f"{path}: is of another version of this software ({known_as!r}, this reads {FORMAT!r}); update"
-        )
     if known_as != FORMAT:
+        if str(known_as).startswith(_ANY_FORMAT):
+            raise InputError(f"{path}: {known_as!r} is of another version of this software ({FORMAT!r}); update that")
         raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
     models = content.get("models")
     if not isinstance(models, dict) or not models:
@@ -284,8 +282,7 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
 
 
 def _check_says_one_thing(path: Path, content: Mapping[str, Any]) -> None:
-    """Raise InputError if what stands in the file twice differs: only one of the two is read, and who changed it does
-    not know which."""
+    """Raise InputError if what stands in it twice differs: who changed one by hand does not know which is read."""
     try:
         selected = content["models"][content["model"]]
         places = [(name, content[name], selected[name]) for name in selected if name in content]
