@@ -46,13 +46,16 @@ _BEYOND: Index = np.arange(N_STATE)[BEYOND]
 class Hypotheses(NamedTuple):
     """State (K, n) and covariance (K, n, n), on ψ and κ, with the last state relative to the hypothesis' own delay.
 
-    misfit: (K,) zᵀR⁻¹z that is left, prior included. log_evidence: (K,), of the data as claimed.
+    misfit: (K,) zᵀR⁻¹z that is left, prior included. log_evidence: (K,), of the data as claimed. information, vector:
+    Λ (K, n, n) and Λx (K, n).
     """
 
     x: Array
     p: Array
     misfit: Array
     log_evidence: Array
+    information: Array
+    vector: Array
 
 
 @dataclass(frozen=True)
@@ -213,6 +216,20 @@ class DelayBank:
                 self._folds[1][fold] += vector
         return use
 
+    def misfits(self, rows: DelayedRows) -> tuple[Array, Array]:
+        """What all hypotheses would make of further rows, nothing being changed.
+
+        Returns by how much the rows raise zᵀR⁻¹z of each (K,), and the logarithm (K,) of how likely each then is.
+        """
+        found = self._solve()
+        level = self._level(found, int(np.argmax(found.log_evidence)))
+        told, told_vector, square = _told(rows, np.ones(len(rows), dtype=bool))
+        information, vector = found.information + told, found.vector + told_vector
+        x = np.linalg.solve(information, vector[..., None])[..., 0]
+        raised = square + np.einsum("ki,ki->k", found.x, found.vector) - np.einsum("ki,ki->k", x, vector)
+        log_det = np.linalg.slogdet(information)[1] - np.linalg.slogdet(found.information)[1]
+        return raised, (found.log_evidence - 0.5 * (raised + log_det)) / level + self._log_prior
+
     def _learn_heave(self) -> None:
         """One variance for all hypotheses, that of the best: else a wrong one would excuse itself by its own."""
         best = [int(np.argmax(self._shares()[1]))]
@@ -289,7 +306,7 @@ class DelayBank:
         p = 0.5 * (p + p.swapaxes(1, 2))
         x = (p @ vector[..., None])[..., 0]
         misfit = self._square + heave[:, N_STATE, N_STATE] - np.einsum("ki,ki->k", x, vector)
-        found = Hypotheses(x, p, misfit, -0.5 * (misfit + log_det))
+        found = Hypotheses(x, p, misfit, -0.5 * (misfit + log_det), information, vector)
         if without is None:
             self._solved = found
         return found

@@ -8,6 +8,7 @@ waits for it. (Long, because what is taken from the aligner and what is told of 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +27,7 @@ from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
 from .bank import DayState, DelayBank, Posterior
+from .contradicted import without_contradicted
 from .hold_out import NOT_MEASURED, Kept, Recording, held_out_error, thinned
 from .reference_clock import ReferenceClock
 from .rows import (
@@ -35,6 +37,7 @@ from .rows import (
     LONGEST_DELAY_S,
     MARGIN_S,
     N_STATE,
+    DelayedRows,
     DvlColumns,
     ImuColumns,
     ReferenceColumns,
@@ -60,12 +63,18 @@ LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 
 
 class _Dvl(Table):
-    """Usable DVL samples that blocks to come need."""
+    """Usable DVL samples that blocks to come need; contradicted: by the references of an earlier one."""
 
-    LAYOUT: ClassVar = {"stamps_ns": (np.int64, ()), "velocity": (np.float64, (3,)), "covariance": (np.float64, (3, 3))}
+    LAYOUT: ClassVar = {
+        "stamps_ns": (np.int64, ()),
+        "velocity": (np.float64, (3,)),
+        "covariance": (np.float64, (3, 3)),
+        "contradicted": (np.bool_, ()),
+    }
     stamps_ns: Stamps
     velocity: Array
     covariance: Array
+    contradicted: Mask
 
 
 class DelayFilter:
@@ -292,6 +301,7 @@ class DelayFilter:
         self._dvl.stamps_ns[slots] = rows.stamps_ns[at]
         self._dvl.velocity[slots] = rows.velocity_dvl[at]
         self._dvl.covariance[slots] = rows.covariance[at]
+        self._dvl.contradicted[slots] = False
         self.n_taken = aligner.n_judged
 
     def _seconds(self, stamps_ns: Stamps) -> Array:
@@ -307,18 +317,34 @@ class DelayFilter:
         self._suggestion = None
         self._claiming += int(np.count_nonzero(reference.claimed))
         self._not_claiming += int(np.count_nonzero(~reference.claimed))
-        dvl, noise_dvl = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
+        dvl, noise_dvl, slots = self._dvl_columns(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         self._compare_coarsely(block_ns, end_ns, dvl, imu)
-        if self._kept is not None:
-            from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
-            self._kept.append(Kept.between(from_s, to_s, dvl, noise_dvl, reference, imu))
-        if len(dvl.times) < 6 or len(imu.times) < 2:
-            return False
-        p = self._parameters
+        from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
         binned_dvl = DvlColumns(*binned(*dvl))
-        rows = delayed_rows(
-            binned_dvl,
+        rows = None
+        if len(dvl.times) >= 6 and len(imu.times) >= 2:
+            rows_of = partial(self._rows, reference=reference, imu=imu, noise_dvl=noise_dvl)
+            if _is_slow(dvl.times):
+                good, rows = without_contradicted(dvl, reference.times, rows_of, self._bank.misfits)
+                self._leave_out(slots[~good])
+                dvl = binned_dvl = DvlColumns(*(column[good] for column in dvl))
+            else:
+                rows = rows_of(binned_dvl)
+        if self._kept is not None:
+            self._kept.append(Kept.between(from_s, to_s, dvl, noise_dvl, reference, imu))
+        if rows is None:
+            return False
+        used = self._bank.add(rows, stamps_ns[rows.index], BLOCK_NS * 1e-9)
+        self._reference_clock.add(
+            binned_dvl, reference.part(rows.index[used]), imu, noise_dvl, self._bank.likeliest_delay
+        )
+        return len(rows) > 0
+
+    def _rows(self, dvl: DvlColumns, *, reference: ReferenceColumns, imu: ImuColumns, noise_dvl: Array) -> DelayedRows:
+        p = self._parameters
+        return delayed_rows(
+            dvl,
             reference,
             imu,
             noise_dvl=noise_dvl,
@@ -328,11 +354,15 @@ class DelayFilter:
             max_turn_rate=p.max_turn_rate,
             imu_gap_s=p.imu_timeout,
         )
-        used = self._bank.add(rows, stamps_ns[rows.index], BLOCK_NS * 1e-9)
-        self._reference_clock.add(
-            binned_dvl, reference.part(rows.index[used]), imu, noise_dvl, self._bank.likeliest_delay
-        )
-        return len(rows) > 0
+
+    def _leave_out(self, slots: Index) -> None:
+        """Leave some DVL samples out from now on, and where they are kept for verification already."""
+        self._dvl.contradicted[slots] = True
+        self._spikes += len(slots)
+        if self._kept and len(slots):
+            last = self._kept[-1]
+            good = ~np.isin(last.dvl.times, self._seconds(self._dvl.stamps_ns[slots]))
+            self._kept[-1] = last._replace(dvl=DvlColumns(*(column[good] for column in last.dvl)))
 
     def _dvl_is_silent(self, stamp_ns: int) -> bool:
         """Whether the DVL stops here for so long that tracks forget what was before."""
@@ -366,21 +396,22 @@ class DelayFilter:
                         FRAMES[code], raw[use], attitude, velocity[use], None if rates is None else rates[use]
                     )
 
-    def _dvl_columns(self, from_ns: int, to_ns: int) -> tuple[DvlColumns, Array]:
-        """DVL samples between two stamps, MARGIN_NS about a block, and their mean covariance (3, 3)."""
+    def _dvl_columns(self, from_ns: int, to_ns: int) -> tuple[DvlColumns, Array, Index]:
+        """DVL samples between two stamps, MARGIN_NS about a block, their mean covariance (3, 3), and their slots."""
         table = self._dvl
         rows = table.between(table.stamps_ns, from_ns, to_ns)
+        at = np.flatnonzero(~table.contradicted[rows]) + rows.start
         # one bends the curve that is read between samples for all references about it, and no gate would see that
-        good = _good(table.stamps_ns[rows], table.velocity[rows])
-        at = np.arange(rows.start, rows.stop)[good]
-        spikes = table.stamps_ns[rows][~good]
+        good = _good(table.stamps_ns[at], table.velocity[at])
+        spikes = table.stamps_ns[at[~good]]
+        at = at[good]
         self._spikes += int(np.count_nonzero((spikes >= from_ns + MARGIN_NS) & (spikes < to_ns - MARGIN_NS)))
         covariance = table.covariance[at]
         given = ~np.isnan(covariance[:, 0, 0])
         noise: Array = np.eye(3) * self._parameters.gnss_free_std**2
         if given.any() and self._parameters.use_message_covariance:
             noise = covariance[given].mean(axis=0)
-        return DvlColumns(self._seconds(table.stamps_ns[at]), table.velocity[at]), noise
+        return DvlColumns(self._seconds(table.stamps_ns[at]), table.velocity[at]), noise, at
 
     def _imu(self, from_ns: int, to_ns: int) -> ImuColumns:
         track = self._aligner.imu
@@ -455,8 +486,12 @@ class DelayFilter:
         return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), self._bank, self._parameters)
 
 
+def _is_slow(times: Array) -> bool:
+    """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
+    return len(times) > 1 and float(np.median(np.diff(times))) > SLOW_S
+
+
 def _good(stamps_ns: Stamps, velocity: Array) -> Mask:
     """Which samples of a stream are no spikes, (N,) of (N,) ns and (N, 3) m/s."""
-    is_slow = len(stamps_ns) > 1 and float(np.median(np.diff(stamps_ns))) > SLOW_S * 1e9
-    smallest = LEAST_SCATTER_SLOW_MPS if is_slow else LEAST_SCATTER_MPS
+    smallest = LEAST_SCATTER_SLOW_MPS if _is_slow(1e-9 * stamps_ns) else LEAST_SCATTER_MPS
     return without_spikes(velocity, smallest=smallest, also_at_ends=True)

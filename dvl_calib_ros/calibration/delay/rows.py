@@ -7,7 +7,7 @@ at s + τ, where it is 20 times less noisy than GNSS. So hypotheses of τ are to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -96,6 +96,10 @@ class DelayedRows:
 
     def __len__(self) -> int:
         return len(self.z)
+
+    def part(self, at: Mask) -> DelayedRows:
+        """Those of some references."""
+        return DelayedRows(*(getattr(self, each.name)[at] for each in fields(self)))
 
 
 def delayed_rows(

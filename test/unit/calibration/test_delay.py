@@ -10,6 +10,8 @@ from runs import START_NS, calibrate, feed, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.correction import lever_arm
+from dvl_calib_ros.calibration.delay import contradicted
+from dvl_calib_ros.calibration.delay import filter as delay_filter
 from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.delay.rows import BEYOND
 from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
@@ -28,14 +30,18 @@ GNSS_STD, DVL_STD = 0.02, 0.005
 
 
 @cache
-def late(seconds: float, seed: int = 0, arm=LEVER_ARM, duration: float = 150.0):
-    """A figure of eight with changes of speed, smooth at any time; the DVL's stamps late by so many seconds."""
+def late(seconds: float, seed: int = 0, arm=LEVER_ARM, duration: float = 150.0, bursts=()):
+    """A figure of eight with changes of speed, smooth at any time; the DVL's stamps late by so many seconds.
+
+    bursts: times, s, about which the vehicle is faster by 0.8 m/s for a second or so.
+    """
     rng = np.random.default_rng(seed)
     time = np.arange(0.0, duration, 0.05)
     yaw_rate = 0.16 * np.sin(2.0 * np.pi * time / 50.0)
     roll, pitch = 0.04 * np.sin(2.0 * np.pi * time / 6.0), 0.02 * np.sin(2.0 * np.pi * time / 4.7)
     yaw = 0.16 * 50.0 / (2.0 * np.pi) * (1.0 - np.cos(2.0 * np.pi * time / 50.0))
     speed = 1.5 + 0.5 * np.sin(2.0 * np.pi * time / 23.0)
+    speed += sum(0.8 * np.exp(-(((time - at) / 0.7) ** 2)) for at in bursts)
     body = np.column_stack([speed, -0.25 * yaw_rate * speed, np.zeros_like(speed)])
     rates = body_rates(time, roll, pitch, yaw_rate)
     rotation = rotation_from_rpy(np.column_stack([roll, pitch, yaw]))
@@ -189,6 +195,52 @@ def test_outliers_are_gated_and_a_large_effect_is_not_taken_for_them():
     estimate = calibrate(spoilt, NOISE).estimate("G2")
     assert 0.02 < estimate.gated / (estimate.used + estimate.gated) < 0.12
     np.testing.assert_allclose(estimate.state[8:10], LEVER_ARM[:2], atol=0.1)
+
+
+def slow(samples, off_every=0):
+    """The same with every third DVL sample, 1.7 a second, of which every so many is off by 0.5 to 1.2 m/s."""
+    rng = np.random.default_rng(4)
+    left, n_dvl = [], 0
+    for sample in samples:
+        if isinstance(sample, DvlSample):
+            n_dvl += 1
+            if n_dvl % 3:
+                continue
+            if off_every and n_dvl // 3 % off_every == 0:
+                way = rng.normal(0.0, 1.0, 3)
+                off = rng.uniform(0.5, 1.2) * way / np.linalg.norm(way)
+                sample = sample._replace(velocity=tuple(np.add(sample.velocity, off).tolist()))
+        left.append(sample)
+    return left
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.4, 2.5])
+def test_a_slow_dvl_that_is_off_now_and_then_costs_no_calibration(seconds):
+    samples = slow(late(seconds), off_every=24)
+    calibrator = calibrate(samples, NOISE, verified=True)
+    estimate = calibrator.estimate("G2")
+    error = estimate.state[BEYOND] - [*LEVER_ARM, seconds]
+    assert np.all(np.abs(error) < 3.5 * estimate.std[BEYOND])
+    assert np.all(np.abs(error[[0, 1, 3]]) < 0.05)
+    assert estimate.gated >= 8
+    assert calibrator.verification("G2").held_out.corrected < 0.06
+    one_by_one = calibrate(samples, NOISE, block_size=1).estimate("G2")
+    np.testing.assert_allclose(one_by_one.state, estimate.state, rtol=0, atol=1e-12)
+
+
+def test_what_a_vehicle_does_between_two_samples_of_a_slow_dvl_is_not_left_out(monkeypatch):
+    looked_at, left_out = [], []
+
+    def watched(dvl, *others):
+        kept, rows = contradicted.without_contradicted(dvl, *others)
+        looked_at.extend(contradicted._suspicious(dvl.velocity))
+        left_out.extend(np.flatnonzero(~kept))
+        return kept, rows
+
+    monkeypatch.setattr(delay_filter, "without_contradicted", watched)
+    for seconds in (0.0, -1.4):
+        calibrate(slow(late(seconds, bursts=(20.3, 41.1, 42.0, 66.6, 90.2, 110.9))), NOISE)
+    assert len(looked_at) > 10 and not left_out
 
 
 def test_a_random_walk_lets_go_of_the_past():
