@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, skew
+from .frames import ENU_FROM_NED, FLU_FROM_FRD, Array, product, rotation_from_rpy, rpy_from_rotation, skew
 from .samples import VelocityFrame
 
 # A configuration is wrong from here on: what is left of the motion, as a share of its square, is that of 10 degrees.
@@ -33,6 +33,10 @@ CLEARLY = 40.0
 NOMINAL_SHARE = 1e-3
 # What a lever arm is allowed to explain leaves a misalignment (rad) and a scale below these.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
+# What is likely of a misalignment (rad), a scale and a lever arm (m). It decides what the motion does not: on a circle at
+# one speed a lever arm looks like a turned DVL. It counts by 0.005 of the speed in every sample, which moves what is
+# shown by a hundredth.
+LIKELY: Array = np.array([0.05] * 3 + [0.02] + [1.0] * 3) / 0.005
 # Fewer samples fit anything.
 ENOUGH = 20
 # By how much the DVL's stamps may be late, s: within G2's range, at a step that is short beside turns and waves.
@@ -168,7 +172,7 @@ class _AxesFit:
         self._with_lever_arm = with_lever_arm
         n = 7 if with_lever_arm else 4
         self._normal, self._vector = np.zeros((len(DELAYS_S), n, n)), np.zeros((len(DELAYS_S), n))
-        self._square = np.zeros(len(DELAYS_S))
+        self._square, self._speed = np.zeros(len(DELAYS_S)), np.zeros(len(DELAYS_S))  # sums of squares, (m/s)²
         self.samples = 0
 
     def add(self, reference: Array, velocity: Array, rates: Array) -> None:
@@ -185,6 +189,7 @@ class _AxesFit:
         self._normal += turned @ h
         self._vector += (turned @ r)[:, :, 0]
         self._square += (r * r).sum(axis=(1, 2))
+        self._speed += np.einsum("nka,nka->k", in_body, in_body)
         self.samples += int(known.sum())
 
     def left(self) -> float:
@@ -199,8 +204,10 @@ class _AxesFit:
 
     def _solved(self) -> tuple[Array, Array]:
         """At each delay what fits best (K, 4 or 7), and the sum of squares that it leaves (K,)."""
-        found = (np.linalg.pinv(self._normal, rcond=1e-9, hermitian=True) @ self._vector[:, :, None])[:, :, 0]
-        left = self._square - (self._vector * found).sum(axis=1)
+        n = self._vector.shape[1]
+        likely = np.maximum(self._speed, 1e-12)[:, None, None] * np.diag(LIKELY[:n] ** -2)
+        found = np.linalg.solve(self._normal + likely, self._vector[:, :, None])[:, :, 0]
+        left = self._square - ((2.0 * self._vector - product(self._normal, found)) * found).sum(axis=1)
         return found, np.maximum(left, 1e-12 * np.maximum(self._square, 1e-12))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +46,13 @@ class BagPlayer:
                     raise InputError(f"nobody subscribes to {topic} within {timeout_s:.0f} s; is the node running?")
                 time.sleep(0.01)
 
-    def play(self, speed: float, on_time: Callable[[float], None] = lambda _: None) -> dict[str, int]:
-        """Publish all messages, `speed` times as fast as recorded; topic -> number sent.
+    def play(
+        self, speed: float, on_time: Callable[[float, Mapping[str, int]], None] = lambda at, sent: None
+    ) -> dict[str, int]:
+        """Publish all messages, at most `speed` times as fast as recorded; topic -> number sent.
 
-        on_time is called before every message with its time in s since the first.
+        on_time is called before every message with its time in s since the first and the numbers sent so far; as long
+        as it takes, so long the bag stands still.
         """
         sent = dict.fromkeys(self._publishers, 0)
         with BagReader(self._paths) as bag:
@@ -58,7 +61,9 @@ class BagPlayer:
             for log_ns, channel, data in bag.raw_messages(self._publishers):
                 first_ns = log_ns if first_ns is None else first_ns
                 at = (log_ns - first_ns) * 1e-9
-                on_time(at)
+                asked = time.monotonic()
+                on_time(at, sent)
+                started += time.monotonic() - asked
                 wait = started + at / speed - time.monotonic()
                 if wait > 0.0:
                     time.sleep(wait)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.coarse_mounting import DELAYS_S, MISALIGNED, SCALED
+from ..calibration.coarse_mounting import DELAYS_S, LIKELY, MISALIGNED, SCALED
 from ..calibration.frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
@@ -227,19 +227,20 @@ def _with_lever_arm(data: Together, hypothesis: Hypothesis, known: Array | None)
     if data.rates is not None and hypothesis.imu is not None:
         rates = np.nan_to_num(data.rates @ hypothesis.imu.rotation_body_from_imu.T)
     dvl = data.dvl @ FLU_FROM_FRD if hypothesis.turned else data.dvl
+    likely = np.diag((_rms(dvl) / LIKELY) ** 2)
     rotation = best_rotation(dvl, body, np.eye(3)) if known is None else known
     for last in range(ROUNDS if known is None else 1, 0, -1):
         own = dvl @ rotation
-        columns = np.concatenate([skew(rates), skew(own), own[:, :, None]], axis=2)
+        columns = np.concatenate([skew(own), own[:, :, None], skew(rates)], axis=2)
         kept = np.arange(len(own))
         for _ in range(2):  # a second time without the worst
             h, z = columns[kept].reshape(-1, 7), (own - body)[kept].reshape(-1)
-            x = np.linalg.lstsq(h, z, rcond=1e-6)[0]
+            x = np.linalg.solve(h.T @ h + len(kept) * likely, h.T @ z)
             rest = own - body - columns @ x
             kept = np.flatnonzero(_better((rest**2).sum(axis=1)))
         if last > 1:
-            rotation = best_rotation(dvl[kept], (body + cross(rates, x[:3]))[kept], np.eye(3))
-    if np.linalg.norm(x[3:6]) > MISALIGNED or abs(x[6]) > SCALED:
+            rotation = best_rotation(dvl[kept], (body + cross(rates, x[4:]))[kept], np.eye(3))
+    if np.linalg.norm(x[:3]) > MISALIGNED or abs(x[3]) > SCALED:
         return NOT_EXPLAINED
     return Explained(_rms(rest) / _rms(dvl), rotation)
 

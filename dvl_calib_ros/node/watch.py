@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +23,9 @@ from rich.table import Table
 from ..calibration.correction import NOT_ESTIMATED
 from ..demo.player import BagPlayer
 from ..files.parameter_files import NODE_NAME
+from ..replay.replay import Topics
 from .answering import AnsweringNode
+from .calibration_node import QUEUE
 
 # place in ~/estimate's covariance diagonal, factor to what people read
 SHOWN = {
@@ -31,6 +34,12 @@ SHOWN = {
     "phi_z": ("φz °", 5, math.degrees(1.0)),
     "delta_k": ("δk %", 0, 100.0),
 }
+
+# Under which name the node says how many messages of a topic it has taken.
+RECEIVED = {Topics.dvl: "dvl received", Topics.gnss: "reference received", Topics.imu: "imu received"}
+# A busy machine falls behind a bag that is played ten times faster. So many messages of a topic may wait, half of what
+# a node's queue holds; and who is silent for so long, s, is not waited for.
+WAITING, PATIENCE_S = QUEUE // 2, 30.0
 
 
 class Watcher:
@@ -65,18 +74,28 @@ class Watcher:
         spinning.start()
         switches = [(switch_at_s, switch_to), (back_at_s, "auto")]
 
-        def on_time(at: float) -> None:
+        def on_time(at: float, sent: Mapping[str, int]) -> None:
             self._time = at
             if switches and at >= switches[0][0]:
                 self._switch(switches.pop(0)[1])
+            self._wait_until_at_most(WAITING, sent)
 
         try:
             self._player.wait_for_subscribers()
-            self._player.play(speed, on_time)
+            self._wait_until_at_most(0, self._player.play(speed, on_time))
         finally:
             executor.shutdown()
             spinning.join(5.0)
             self._node.destroy_node()
+
+    def _wait_until_at_most(self, waiting: int, sent: Mapping[str, int]) -> None:
+        """Until no more than so many messages of a topic wait in the node, by what it says of itself."""
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            received = (int(self._diagnostics.get(key, 0)) for key in RECEIVED.values())
+            if all(sent.get(topic, 0) - n <= waiting for topic, n in zip(RECEIVED, received, strict=True)):
+                return
+            time.sleep(0.02)
 
     def _switch(self, model: str) -> None:
         value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=model)

@@ -577,3 +577,9 @@ def dying_node(file: Path, place: str, count: int, *arguments: str):
         yield Live(world, process, file)
     world.close()
     assert process.returncode == -signal.SIGKILL
+
+
+def test_the_demo_waits_for_a_node_that_falls_behind_so_that_live_and_offline_agree():
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "demo", "--speed", "1000"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "Live and offline agree" in done.stdout, done.stdout + done.stderr
