@@ -476,6 +476,7 @@ class Calibrator:
             counts,
             suggestion,
             self._delay.reference_claims,
+            "" if (source is None and self._delay.claims) or not model.aided else self._delay.lever_arm_turns,
         )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:

@@ -33,8 +33,8 @@ CLEARLY = 40.0
 NOMINAL_SHARE = 1e-3
 # What a lever arm is allowed to explain leaves a misalignment (rad) and a scale below these.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
-# What is likely of a misalignment (rad), a scale and a lever arm (m). It decides what the motion does not: on a circle at
-# one speed a lever arm looks like a turned DVL. It counts by 0.005 of the speed in every sample, which moves what is
+# What is likely of a misalignment (rad), a scale and a lever arm (m). It decides what the motion does not: on a circle
+# at one speed a lever arm looks like a turned DVL. It counts by 0.005 of the speed in every sample, which moves what is
 # shown by a hundredth.
 LIKELY: Array = np.array([0.05] * 3 + [0.02] + [1.0] * 3) / 0.005
 # Fewer samples fit anything.

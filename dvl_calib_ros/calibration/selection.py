@@ -74,7 +74,9 @@ class GnssAvailability:
 
 
 class Evidence(NamedTuple):
-    """For the model that extends another: chi-square of what only it has, and what that is, in words."""
+    """For the model that extends another: chi-square of what only it has, or the share of a variance that only it knows
+    of; and what of the other model that says, in words.
+    """
 
     chi_square: float
     found: str
@@ -177,7 +179,7 @@ class Selection:
             return f"{reason}; {told} a current from the mounting"
         if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
             return reason
-        return f"{reason}; {parameters.gnss_model} does not explain the data, which show {self._evidence.found}"
+        return f"{reason}; {parameters.gnss_model} {self._evidence.found}"
 
 
 def published_models(parameters: Parameters) -> tuple[str, str]:

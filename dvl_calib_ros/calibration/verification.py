@@ -133,6 +133,7 @@ def verify(
     used_and_gated: tuple[int, int] | None = None,
     suggestion: str = "",
     reference_claims: bool = True,
+    lever_arm_turns: str = "",
 ) -> Verification:
     """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
 
@@ -146,10 +147,12 @@ def verify(
     used_and_gated: How many samples it used, and threw out; None where that is not known.
     suggestion: What configuration would fit, in words, if the one given does not.
     reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
+    lever_arm_turns: What a lever arm that the model takes as known does to an angle, in words, if it matters.
 
     """
     findings = [
         *use_findings(used_and_gated),
+        *_lever_arm_findings(lever_arm_turns, parameters),
         *([(Word.REJECT, f"{suggestion}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
@@ -176,6 +179,14 @@ def use_findings(used_and_gated: tuple[int, int] | None) -> list[Finding]:
             (Word.REJECT, f"{gated} of {used + gated} samples contradict it and were gated: it is that of the rest")
         ]
     return []
+
+
+def _lever_arm_findings(turns: str, parameters: Parameters) -> list[Finding]:
+    if not turns:
+        return []
+    known = f"the lever arm is known to ±{parameters.initial_std_lever_arm:.2g} m (initial_std_lever_arm)"
+    remedy = "give lever_arm and how well it is measured, or go straight and turn both ways"
+    return [(Word.REJECT, f"{known}, and {turns}: {remedy}")]
 
 
 def _angle_deg(model: Model, state: GaussianState) -> float:

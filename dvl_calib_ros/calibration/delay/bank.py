@@ -26,7 +26,7 @@ from ..kalman import GaussianState
 from ..parameters import Parameters
 from ..samples import Index, Mask, Stamps
 from ..time_blocks import TimeBlocks
-from .rows import BEYOND, DELAY, DELAYS_S, N_STATE, OF_DAY, DelayedRows
+from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, DelayedRows
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
 CELL_STD_S = 0.2
@@ -63,12 +63,16 @@ class Posterior:
     """What the bank says.
 
     state: x (n,), P (n, n) of G2's states. shown: (n,) which of them the data alone shows. inflation: (n,) by how much
-    its standard deviations were raised above the filter's own.
+    its standard deviations were raised above the filter's own. turned: (3,) by how much 1 m of lever arm along the
+    axis that matters most turns each misalignment, rad; by_lever_arm: (3,) variance of each that comes with what is not
+    known of the lever arm, in variances without.
     """
 
     state: GaussianState
     shown: Mask
     inflation: Array
+    turned: Array
+    by_lever_arm: Array
 
 
 class _Ended(NamedTuple):
@@ -323,8 +327,14 @@ class DelayBank:
         inflation = self._inflation(best, found)
         shown = self._shown(best, inflation)
         raised = state.raised(inflation)
+        p = state.p
+        turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
+        by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)
+        rest = np.maximum(np.diag(p)[:3] - by_lever_arm, 1e-12)
+        turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
-        return Posterior(with_states_of(raised, self.prior, _without(shown, _BEYOND)), shown, inflation)
+        claimed = with_states_of(raised, self.prior, _without(shown, _BEYOND))
+        return Posterior(claimed, shown, inflation, turned, by_lever_arm / rest)
 
     def days(self) -> list[DayState]:
         """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""

@@ -7,6 +7,7 @@ waits for it. (Long, because what is taken from the aligner and what is told of 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
@@ -21,7 +22,7 @@ from ..kalman import GaussianState
 from ..observations import Observations
 from ..parameters import Parameters
 from ..samples import FRAME_CODES, FRAMES, Index, Mask, Stamps, VelocityFrame, Verdict
-from ..selection import NO_EVIDENCE, Evidence
+from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..spikes import without_spikes
 from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
@@ -212,7 +213,24 @@ class DelayFilter:
         if DELAY in at and abs(x[DELAY]) > NAMED_FROM * std[DELAY]:
             late = "late" if x[DELAY] > 0.0 else "early"
             found.append(f"DVL stamps {abs(x[DELAY]):.2f} ± {std[DELAY]:.2f} s {late}")
-        return Evidence(chi_square, " and ".join(found))
+        turns = float(posterior.by_lever_arm.max())
+        if turns > chi_square:
+            return Evidence(turns, f"takes the lever arm as known, and {self.lever_arm_turns}")
+        return Evidence(chi_square, f"does not explain the data, which show {' and '.join(found)}")
+
+    @property
+    def lever_arm_turns(self) -> str:
+        """How much of an angle is the lever arm's, in words; '' if the motion tells them apart.
+
+        On a circle at one speed a DVL that sits elsewhere looks like a turned one, and σ of a model that takes the
+        lever arm as known is worth nothing.
+        """
+        posterior = self.posterior
+        if posterior is None or posterior.by_lever_arm.max() < EXTENDED_FROM:
+            return ""
+        index = int(np.argmax(posterior.by_lever_arm))
+        angle, turn = ("roll", "pitch", "yaw")[index], math.degrees(posterior.turned[index])
+        return f"in this motion 0.1 m of it is {0.1 * turn:.1f}° of {angle}"
 
     def remember(self, from_ns: int) -> None:
         """Keep the state as of now, for `remembered`."""

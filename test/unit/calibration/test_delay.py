@@ -20,6 +20,7 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.time_blocks import MOST, TimeBlocks
+from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.simulation.sensors import measure_dvl_matched
 from dvl_calib_ros.simulation.trajectories import body_rates
 
@@ -65,8 +66,10 @@ def found(seconds: float) -> Calibrator:
     return calibrate(late(seconds), NOISE)
 
 
-def straight(seconds: float = 120.0, yaw_rate: float = 0.0, speed: float = 1.5, with_rates: bool = True):
-    """A run of one speed and one yaw rate for ever, with a lever arm that such a run does not show."""
+def straight(
+    seconds: float = 120.0, yaw_rate: float = 0.0, speed: float = 1.5, with_rates: bool = True, changing: float = 0.0
+):
+    """A run of one speed (or one that changes by so much) and one yaw rate, with a lever arm that it does not show."""
     rng = np.random.default_rng(3)
     samples = []
     for i in range(round(seconds * 20)):
@@ -76,7 +79,7 @@ def straight(seconds: float = 120.0, yaw_rate: float = 0.0, speed: float = 1.5, 
         rate = (0.0, 0.0, yaw_rate) if with_rates else None
         samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), rate))
         if i % 4 == 0:
-            body = np.array([speed, 0.0, 0.0])
+            body = np.array([speed + changing * np.sin(t / 5.0), 0.0, 0.0])
             reference = rotation @ body + rng.normal(0.0, 0.02, 3)
             samples.append(ReferenceSample(stamp, tuple(reference.tolist()), None, VelocityFrame.ENU))
             measured = body + np.cross([0.0, 0.0, yaw_rate], [1.0, 0.3, 0.0]) + rng.normal(0.0, 0.005, 3)
@@ -113,6 +116,31 @@ def test_what_the_run_does_not_show_is_not_claimed_and_g2_is_g1(samples):
     shown = {entry.name: entry for entry in g2.observability}
     assert "turns" in shown["lever_arm_x"].missing
     assert "slowing down" in shown["time_offset"].missing
+
+
+ON_A_CIRCLE = "in this motion 0.1 m of it is 0.6° of yaw"
+
+
+def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_what_would_help():
+    samples = straight(yaw_rate=0.15)
+    unknown = calibrate(samples, NOISE, verified=True)
+    for name in ("M3", "M4", "G1", "G2"):
+        verification = unknown.verification(name)
+        assert verification.verdict is Word.REJECT
+        assert ON_A_CIRCLE in verification.reasons[0] and "go straight and turn both ways" in verification.reasons[0]
+    assert ON_A_CIRCLE not in str(unknown.verification("A1"))
+    known = calibrate(samples, NOISE.replace(lever_arm=(1.0, 0.3, 0.0), initial_std_lever_arm=0.01), verified=True)
+    assert known.verification("G1").verdict is not Word.REJECT
+    assert abs(known.estimate("G1").state[2]) < 4.0 * known.estimate("G1").std[2]
+
+
+def test_on_a_circle_at_changing_speed_auto_takes_the_model_whose_sigma_knows_of_the_lever_arm():
+    calibrator = calibrate(straight(yaw_rate=0.15, changing=0.03), NOISE)
+    assert calibrator.selected == "G2"
+    assert f"G1 takes the lever arm as known, and {ON_A_CIRCLE}" in calibrator.result().selected_because
+    g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
+    assert abs(g1.state[2]) > 20.0 * g1.std[2]
+    assert abs(g2.state[2]) < 3.0 * g2.std[2]
 
 
 def test_auto_takes_g2_when_the_data_call_for_it_and_says_why():
