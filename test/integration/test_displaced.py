@@ -28,11 +28,17 @@ def motion(time, waves_mps):
     return rate, heading, np.stack([speed, sway, waves_mps * np.cos(wave)], axis=-1)
 
 
+def circle(time, waves_mps):
+    """The same of a vehicle that turns at one rate for ever."""
+    rate, speed, wave = np.full_like(time, 0.12), 0.9 + 0.02 * np.sin(0.1 * time), 2.0 * np.pi * time / 5.0
+    return rate, 0.12 * time, np.stack([speed, waves_mps * np.sin(wave), waves_mps * np.cos(wave)], axis=-1)
+
+
 def spike(rng, share):
     return rng.normal(0, 1.5, 3) if rng.random() < share else 0.0
 
 
-def recorded(path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.02, claimed=CLAIMED, spikes=0.0):
+def recorded(path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.02, claimed=CLAIMED, spikes=0.0, motion=motion):
     """A bag of it, as a DVL measures that sits, is late and is turned so; nothing in it says where the DVL is.
 
     spikes: share of samples of DVL and reference that are off by metres per second.
@@ -68,6 +74,14 @@ def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp
     np.testing.assert_allclose(mounting.xyz_m[:2], lever_arm[:2], atol=0.05)
     assert mounting.time_offset_s == pytest.approx(late_s, abs=0.05)
     np.testing.assert_allclose(mounting.rpy_deg[1:], 0.0, atol=0.5)
+
+
+@pytest.mark.parametrize("ahead_m", [-1.9, -0.3, 0.3, 1.9])
+def test_on_a_circle_a_displaced_dvl_is_not_taken_for_a_turned_one_and_its_yaw_is_not_claimed(tmp_path, ahead_m):
+    calibration = dc.replay(recorded(tmp_path / "bag", (ahead_m, 0.0, 0.0), 0.0, motion=circle), history=False)
+    assert calibration.mounting.nominal_rpy_deg == (0.0, 0.0, 0.0)
+    yaw_deg, std_deg = calibration.mounting.rpy_deg[2], calibration.mounting.std_deg[2]
+    assert calibration.verdict == "reject" or abs(yaw_deg) < 3.0 * std_deg, (yaw_deg, std_deg, calibration.reasons)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 1.3])
