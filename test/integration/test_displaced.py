@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 from io_fixtures import write_bag
+from report_fixtures import drawn
 from runs import START_NS
 
 import dvl_calib_ros as dc
@@ -95,7 +96,8 @@ def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path, la
     assert calibration.replayed.result.estimate.gated >= 20
 
 
-def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path):
+def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path, monkeypatch):
+    drawn(monkeypatch)  # the page is read, its pictures are not
     calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.2, 0.0), -2.2))
     page = calibration.report(tmp_path / "report.html").read_text().replace("\N{MINUS SIGN}", "-")
     arm = re.search(r"<dt>Lever arm</dt>\s*<dd>x ([+-][\d.]+) m ± [\d.]+, y ([+-][\d.]+) m ± .*\(not shown\)", page)
