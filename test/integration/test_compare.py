@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 
 import pytest
 import yaml
 from command_line import fail
+from report_fixtures import drawn
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.cli.main import main
@@ -17,7 +19,7 @@ SHORT = ("--trajectory", "box", "--duration", "120", "--gnss-std", "0.05")
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    """Bags a, b of one mounting and c of one that is turned by 1°, with result files."""
+    """Bags a, b of one mounting and c of one that is turned by 1°, with result files (in JSON, which is YAML, too)."""
     folder = tmp_path_factory.mktemp("compare")
     for seed, (name, yaw) in enumerate((("a", "2"), ("b", "2"), ("c", "3"))):
         bag = str(folder / name)
@@ -27,7 +29,7 @@ def place(tmp_path_factory) -> Path:
         document = yaml.safe_load((folder / f"{name}.yaml").read_text())
         for key in document["time_span"]:
             document["time_span"][key] += day * 86_400_000_000_000
-        (folder / f"{name}.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+        (folder / f"{name}.yaml").write_text(json.dumps(document))
     return folder
 
 
@@ -47,10 +49,12 @@ def test_a_bag_is_calibrated_to_be_compared(place, capsys):
     assert main(["compare", str(place / "a"), str(place / "c")]) == 1
 
 
-def test_json_and_pictures_say_the_same(place, tmp_path, capsys):
+def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     out, page, png = tmp_path / "c.json", tmp_path / "c.html", tmp_path / "c.png"
     results = [str(place / f"{name}.yaml") for name in "abc"]
-    assert main(["compare", *results, "--json", str(out), "--report", str(page)]) == 1
+    with monkeypatch.context() as patch:
+        drawn(patch)  # the page's are counted
+        assert main(["compare", *results, "--json", str(out), "--report", str(page)]) == 1
     document = json.loads(out.read_text())
     assert document["same_mounting"] is False and len(document["pairs"]) == 3
     (moved,) = document["moved"]
@@ -84,19 +88,19 @@ def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp
         (("time_span",), "damaged"), (("mounting", "corrected_rpy"), "damaged"), (("model",), "damaged"),
         (("parameters",), "damaged"),
     ):  # fmt: skip
-        broken = yaml.safe_load(yaml.safe_dump(document))
+        broken = copy.deepcopy(document)
         part = broken
         for key in path[:-1]:
             part = part[key]
         del part[path[-1]]
         bad = tmp_path / "broken.yaml"
-        bad.write_text(yaml.safe_dump(broken, sort_keys=False))
+        bad.write_text(json.dumps(broken))
         assert says in fail(capsys, "compare", place / "a.yaml", bad)
     for estimate in document["models"].values():
         estimate["used"] = 0
     document["used"] = 0
     empty = tmp_path / "empty.yaml"
-    empty.write_text(yaml.safe_dump(document, sort_keys=False))
+    empty.write_text(json.dumps(document))
     assert "used no sample" in fail(capsys, "compare", place / "a.yaml", empty)
 
 

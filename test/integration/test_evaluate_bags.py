@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from command_line import succeed
+from report_fixtures import drawn
 
 from dvl_calib_ros.cli.main import main
 
@@ -22,7 +23,10 @@ def bags(tmp_path_factory) -> list[Path]:
     return [folder / "monday", folder / "tuesday"]
 
 
-def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_delay(bags, tmp_path, capsys):
+def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_delay(
+    bags, tmp_path, monkeypatch, capsys
+):
+    drawn(monkeypatch)  # they are counted, not looked at
     page, out = tmp_path / "x.html", tmp_path / "x.json"
     said, _ = succeed(capsys, "evaluate", *bags, "--models", "G1,G2", "--jobs", "1", "--report", page, "--json", out)
     document = json.loads(out.read_text())

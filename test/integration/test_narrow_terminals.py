@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
     """Two bags, and the result of the first."""
     folder = tmp_path_factory.mktemp("narrow")
     for name in ("one", "two"):
-        write_bag(folder / name, run(40.0))
+        write_bag(folder / name, run(15.0))
     document = result_document(replayed(folder / "one").result)
     (folder / "result.yaml").write_text(result_text(document))
     return folder

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import JAZZY, raw, rewrite, run, write_bag
 from mcap.writer import CompressionType, Writer
+from report_fixtures import drawn
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
 
@@ -190,6 +191,7 @@ HOSTILE_NAME = "../../escaped<script>alert(1)</script>$(touch escaped);touch esc
 def test_names_in_a_bag_write_no_file_and_reach_no_terminal_or_page_raw(tmp_path, capsys, monkeypatch):
     """Topic and frame names of a bag, through every command that writes."""
     monkeypatch.chdir(tmp_path)
+    drawn(monkeypatch)  # what is in the pictures: test_report.py
 
     def change(topic, message):
         message.header.frame_id = HOSTILE_NAME if topic != "gnss/twist" else "map"

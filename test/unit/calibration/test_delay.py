@@ -99,12 +99,12 @@ def test_lever_arm_and_delay_are_found_within_what_they_are_said_to_be_good_for(
 
 
 @pytest.mark.parametrize(
-    "samples",
-    [straight(), straight(yaw_rate=0.15), straight(yaw_rate=0.15, with_rates=False), straight(speed=0.1)],
+    "how",
+    [{}, {"yaw_rate": 0.15}, {"yaw_rate": 0.15, "with_rates": False}, {"speed": 0.1}],
     ids=["straight", "one yaw rate for ever", "no angular velocity", "too slow"],
 )
-def test_what_the_run_does_not_show_is_not_claimed_and_g2_is_g1(samples):
-    calibrator = calibrate(samples, NOISE)
+def test_what_the_run_does_not_show_is_not_claimed_and_g2_is_g1(how):
+    calibrator = calibrate(straight(**how), NOISE)
     g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
     prior = [2.0, 2.0, 2.0, 1.0]
     np.testing.assert_array_equal(g2.state[:8], g1.state)
@@ -182,7 +182,7 @@ def test_the_position_found_is_that_of_the_parameters_and_what_was_found_beside(
     assert lever_arm(MODELS["G1"], found(-1.4).state("G1"), (0.1, 0.0, 0.0)) == (0.1, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("block_size", [1, 7, 400])
+@pytest.mark.parametrize("block_size", [1, 400])
 def test_how_samples_are_gathered_changes_nothing(block_size):
     samples = late(-1.4)
     one, other = found(-1.4), calibrate(samples, NOISE, block_size=block_size)

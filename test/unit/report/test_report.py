@@ -35,7 +35,9 @@ SECOND = 1_000_000_000
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A report of a replay, and what was replayed."""
-    path, replayed = replay_page(tmp_path_factory.mktemp("report"), models=MODELS)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        drawn(monkeypatch)  # they take most of the time; `evaluated` has them
+        path, replayed = replay_page(tmp_path_factory.mktemp("report"), models=MODELS)
     return Page(path), replayed
 
 
@@ -148,6 +150,7 @@ def test_the_page_loads_nothing_and_runs_only_its_own_two_scripts(made, evaluate
 
 
 def test_nothing_in_a_bag_becomes_markup(tmp_path):
+    """Pictures and all."""
     folder = tmp_path / "<script>alert(1)<"
     folder.mkdir()
     path, replayed = replay_page(folder, dvl_frame='x"><img src=x onerror=alert(2)>')
@@ -305,7 +308,8 @@ def test_after_a_restart_the_history_starts_anew():
 # ------------------------------------------------------------------ command
 
 
-def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, capsys):
+def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, monkeypatch, capsys):
+    drawn(monkeypatch)
     bag = write_bag(tmp_path / "bag", run())
     report = tmp_path / "report.html"
     report.write_text("old")
