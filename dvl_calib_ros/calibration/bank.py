@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from .assembly import Assembler
 from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .frames import Array
 from .heave import HeaveRows, HeaveSums, with_heave
+from .height import HeightOfLate
 from .history import Counts, Standing
 from .kalman import GaussianState
 from .models import Model, Needs
@@ -66,7 +68,7 @@ def groups_of(
     for model in models:
         of_day = tuple(model.of_day.tolist())
         rows = (model.n_state, model.n_measurement, model.noise, model.heave)
-        kind = (model.needs, rows, model.motion_is_noise, of_day)
+        kind = (model.needs, rows, model.motion_is_noise, model.uses_height, of_day)
         alike.setdefault(kind, []).append(model)
     return tuple(Group(group, parameters, initial, verified) for group in alike.values())
 
@@ -97,6 +99,7 @@ class Group:
         still = self._assembler.process_rate is None
         self._scatter = BlockScatter(self._x, self._p, BLOCK_S) if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
+        self._height = HeightOfLate() if models[0].uses_height else None
         self._states: dict[str, GaussianState] = {}
         self._sound: dict[str, GaussianState] = {}  # the last that could be published
         self._last_stamp_ns: int | None = None
@@ -114,8 +117,9 @@ class Group:
 
         weight, prior_known: (N,) as in `Assembler.measurements`. The states after `ends` samples (E), if given.
         """
-        n_samples = len(stamps_ns)
-        self.n_given += n_samples
+        self.n_given += len(stamps_ns)
+        if self._height is not None:
+            seen = replace(seen, height=self._height.add(stamps_ns, seen.rising))
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp) if self._scatter is None else self._scatter.cuts(stamps_ns)
@@ -151,6 +155,8 @@ class Group:
         """Go on with what belongs to the vehicle; what is of the day is to be found anew."""
         if not len(self._of_day):
             return
+        if self._height is not None:
+            self._height.end_day()
         before = GaussianState(self._x, self._p)
         after = with_states_of(before, self._assembler.prior, self._of_day)
         self._x, self._p = after

@@ -76,6 +76,7 @@ class Observations:
     assumptions: Assumptions = ASSUMPTIONS
     unmeasured: Unmeasured | None = None
     earth_in_body: Array | None = None
+    height: Array | None = None
 
     @cached_property
     def reference(self) -> Reference:
@@ -110,6 +111,13 @@ class Observations:
     def velocity_in_body(self) -> Array:
         """Tᵀv: measured velocity at the reference point, turned by the nominal mounting (N, 3) m/s, body frame."""
         return self.velocity_at_reference @ self.rotation_dvl_from_body
+
+    @cached_property
+    def rising(self) -> Array:
+        """Measured vertical velocity (N,) m/s, positive up, of a block with attitude."""
+        assert self.rotation_enu_from_body is not None
+        up: Array = (self.rotation_enu_from_body[:, 2] * self.velocity_in_body).sum(axis=1)
+        return up
 
     @cached_property
     def speed(self) -> Array:

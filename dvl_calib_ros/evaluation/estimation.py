@@ -20,6 +20,7 @@ from ..calibration.alignment import align
 from ..calibration.assembly import Assembler
 from ..calibration.frames import Array
 from ..calibration.heave import HeaveRows, HeaveSums, with_heave
+from ..calibration.height import HeightOfLate
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.observations import Observations
@@ -138,6 +139,8 @@ def _estimate_one(
     model: Model, seen: Observations, variants: AlignedVariants, parameters: Parameters, ends: Sequence[int]
 ) -> GaussianState:
     assembler = Assembler([model], parameters)
+    if model.uses_height:
+        seen = replace(seen, height=_heights(seen, variants, variants.has[model.needs]))
     flat = assembler.measurements(seen, variants.rows.share(model.aided), variants.rows.prior_known)
     usable = variants.has[model.needs]
     x, p = (np.repeat(each, len(usable), axis=0) for each in assembler.start)
@@ -147,6 +150,15 @@ def _estimate_one(
         stamps_ns = variants.rows.stamps_ns.reshape(usable.shape)
         after = heave_joined(after, stamps_ns, rows, used, usable, parameters, ends)
     return assembler.state(0, after.x, after.p)
+
+
+def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Array:
+    """`Observations.height` of all rows (B N,), by those that models are given (B, N)."""
+    heights = np.zeros(given.shape)
+    columns = (each.reshape(given.shape) for each in (variants.rows.stamps_ns, seen.rising))
+    for own, at, stamps_ns, rising in zip(heights, given, *columns, strict=True):
+        own[at] = HeightOfLate().add(stamps_ns[at], rising[at])
+    return heights.ravel()
 
 
 def heave_joined(

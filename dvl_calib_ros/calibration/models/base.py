@@ -67,7 +67,8 @@ class Model:
     five states are those of the correction, see `correction_parameters`. extends: the model whose states its own begin
     with, and which it equals while the data show nothing more; such a model is filtered by `DelayFilter`.
     sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
-    for none. instead_of: the model that `auto` leaves for this one once headings show the current (headings.py).
+    for none. uses_height: it wants `Observations.height`. instead_of: the model that `auto` leaves for this one once
+    headings show the current (headings.py).
     """
 
     name: str
@@ -89,6 +90,7 @@ class Model:
     extends: str | None = None
     instead_of: str | None = None
     sideslip_std: float = 0.0
+    uses_height: bool = False
 
     @property
     def aided(self) -> bool:

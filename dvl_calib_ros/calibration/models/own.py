@@ -94,18 +94,20 @@ def _f1_noise(seen: Observations) -> Array:
 # On Snapir, vehicles skid by 1.8 s and leave a third of it unexplained.
 TURN_SWAY_STD_S, TURN_HEAVE_STD_S = 1.0, 0.5
 # No vehicle swims exactly along its bow: by a bent fin, trim or the turn of its propeller it goes askew by so much, rad
-# (0.5 degrees), which without a reference nothing tells from a misalignment. Ten recordings of Snapir scatter by 0.5.
-SIDESLIP_STD = 0.009
+# (0.35 degrees), which without a reference nothing tells from a misalignment. Ten recordings of Snapir scatter by 0.35.
+SIDESLIP_STD = 0.006
+# By how much a current changes with depth, m/s per m: by as much as it is strong (`current_std`) over 20 m.
+SHEAR_STD = 0.005
 # A vehicle more than this far from upright does not hold depth by its pitch.
 UPRIGHT = 0.5
 
 
 def _a1(seen: Observations) -> Linearised:
-    """Sway of a current and of turns, heave of a pitch: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h.
+    """Sway of a current and of turns, heave of a pitch: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h, s.
 
-    (Tᵀ(v + [v×]φ))_y = (Rᵀc)_y + b ω_z u: a constant current c turns with the heading, a misalignment does not, so
-    flying several headings tells them apart; b is the skid in turns. On one heading c and φ about z are the same to
-    the data and their priors decide, as in F1.
+    (Tᵀ(v + [v×]φ))_y = (Rᵀ(c + s z))_y + b ω_z u: a current turns with the heading, a misalignment does not, so flying
+    several headings tells them apart; z is the height, by which the current changes; b is the skid in turns. On one
+    heading c and φ about z are the same to the data and their priors decide, as in F1.
     (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of a vehicle that holds its depth with this pitch and roll, the
     vertical axis R's third row being n: n·v_b = 0. d = -1 is one that moves where it points; data with changing
     pitch tells. R = rotation_enu_from_body, u the measured speed ahead.
@@ -115,12 +117,14 @@ def _a1(seen: Observations) -> Linearised:
     up = rotation[:, 2]
     upright = np.abs(up[:, 2]) > UPRIGHT
     level_heave = np.where(upright, -(up[:, 0] * v[:, 0] + up[:, 1] * v[:, 1]) / np.where(upright, up[:, 2], 1.0), 0.0)
-    h = np.zeros((len(v), 2, 8))
+    h = np.zeros((len(v), 2, 10))
     h[:, :, :3] = -seen.body_from_measured[:, 1:]
     h[:, 0, 3:5] = rotation[:, :2, 1]
     h[:, 0, 5] = rates[:, 2] * v[:, 0]
     h[:, 1, 6] = level_heave
     h[:, 1, 7] = 1.0
+    if seen.height is not None:
+        h[:, 0, 8:] = rotation[:, :2, 1] * seen.height[:, None]
     z = v[:, 1:].copy()
     z[:, 1] -= level_heave
     return z, h
@@ -197,7 +201,8 @@ OWN = (
     ),
     Model(
         "A1", Needs.ATTITUDE, 2, _a1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
-        assumes="attitude, no GNSS; a constant current, skid in proportion to the turn rate, depth held or pitch flown",
+        assumes="attitude, no GNSS; a current that changes only with depth, skid in proportion to the turn rate, "
+        "depth held or pitch flown",
         wrong_when="on one heading (then it is F1: yaw and current are the same); a current that changes along the run",
         nuisance=(
             Nuisance("current_east", "m/s", "current_std", of_the_day=True),
@@ -205,9 +210,12 @@ OWN = (
             Nuisance("skid", "s", 3.0),
             Nuisance("dive", "", 0.5),
             Nuisance("heave", "m/s", "heave_offset_std"),
+            Nuisance("shear_east", "1/s", SHEAR_STD, of_the_day=True),
+            Nuisance("shear_north", "1/s", SHEAR_STD, of_the_day=True),
         ),
         instead_of="F1",
         sideslip_std=SIDESLIP_STD,
+        uses_height=True,
         noise=_a1_noise,
         motion_is_noise=True,
     ),

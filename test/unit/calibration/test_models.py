@@ -14,6 +14,7 @@ from dvl_calib_ros.calibration.bank import groups_of
 from dvl_calib_ros.calibration.error_model import correct, distort
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, skew
 from dvl_calib_ros.calibration.heave import HeaveRows, with_heave
+from dvl_calib_ros.calibration.height import HeightOfLate
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -53,6 +54,7 @@ def observations(velocity_dvl, velocity_body, t, sway_heave=PRIOR, frame="flu", 
         angular_velocity=rates @ FRAMES[frame],
         interval=np.full(n, 0.2),
         earth_in_body=(rotation_from_rpy(angles) @ FRAMES[frame]).swapaxes(1, 2)[:, :, :2],
+        height=5.0 * np.sin(0.3 * np.arange(n)),
     )
 
 
@@ -90,8 +92,9 @@ def predicted_z(model, state, seen):
     if model.name == "F1":  # only the motion ahead turns
         ahead = (velocity_dvl @ t) * [1, 0, 0] @ t.T
         return state[3:5] - (correct(ahead, phi, dk, t) - ahead @ t)[:, 1:]
-    _, _, _, east, north, skid, dive, heave = state
-    current = np.einsum("nij,i->nj", seen.rotation_enu_from_body, [east, north, 0.0])[:, 1]
+    _, _, _, east, north, skid, dive, heave, shear_east, shear_north = state
+    flow = np.array([east, north, 0.0]) + seen.height[:, None] * [shear_east, shear_north, 0.0]
+    current = np.einsum("nij,ni->nj", seen.rotation_enu_from_body, flow)[:, 1]
     turn = skid * seen.angular_velocity[:, 2] * (velocity_dvl @ t)[:, 0]
     return np.column_stack([current + turn, dive * level_heave(seen) + heave]) - corrected[:, 1:]
 
@@ -209,8 +212,9 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
         velocity_body + rng.normal(0, 0.1, (60, 3)), velocity_body, np.eye(3), noise=0.04 * np.eye(3)[None]
     )
     group = next(each for each in groups_of(LINEAR_MODELS, parameters) if name in each.index)
-    group.update(np.arange(60), seen, np.ones(60), np.ones(60, dtype=bool))
-    z, h = model.linearise(seen)
+    stamps_ns = 200_000_000 * np.arange(60)
+    group.update(stamps_ns, seen, np.ones(60), np.ones(60, dtype=bool))
+    z, h = model.linearise(replace(seen, height=HeightOfLate().add(stamps_ns, seen.rising)))
     m = model.n_measurement
     r = (seen.noise if model.noise is None else model.noise(seen))[:, :m, :m]
     weight = seen.motion_weight if model.motion_is_noise else np.ones(60)
@@ -223,7 +227,7 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
     expected = kalman.GaussianState(alone.x, alone.p)
     if model.heave is not None:
         rows = HeaveRows(1, model.n_state, parameters)
-        rows.add(np.arange(60), model.heave(seen)[:, None], alone.used[0])
+        rows.add(stamps_ns, model.heave(seen)[:, None], alone.used[0])
         expected, _ = with_heave(expected, rows.sums(), parameters.motion_std)
     np.testing.assert_allclose(after.x[0, k], expected.x[0], atol=1e-12)
     np.testing.assert_allclose(after.p[0, k], expected.p[0], atol=1e-12)
