@@ -39,7 +39,9 @@ def spike(rng, share):
     return rng.normal(0, 1.5, 3) if rng.random() < share else 0.0
 
 
-def recorded(path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.02, claimed=CLAIMED, spikes=0.0, motion=motion):
+def recorded(
+    path, lever_arm, late_s, mounting_rpy=(0.0, 0.0, 0.0), waves_mps=0.02, claimed=CLAIMED, spikes=0.0, motion=motion
+):
     """A bag of it, as a DVL measures that sits, is late and is turned so; nothing in it says where the DVL is.
 
     spikes: share of samples of DVL and reference that are off by metres per second.
