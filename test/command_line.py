@@ -37,9 +37,11 @@ def room_for(size: int) -> Iterator[None]:
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    compiled, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # Python 3.11 keeps what was cut off
     try:
         yield
     finally:
+        sys.dont_write_bytecode = compiled
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, before)
 
