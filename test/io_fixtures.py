@@ -17,7 +17,9 @@ from rosbags.typesys import Stores, get_typestore
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.encode import SampleWriter
 from dvl_calib_ros.replay.replay import Replayed, replay
@@ -119,6 +121,12 @@ def estimates(*paths: Path, **parameters: Any) -> dict[str, list[float]]:
     """Model -> state and covariance, to be compared."""
     result = replayed(*paths, **parameters).result
     return {name: [*each.state, *np.ravel(each.covariance)] for name, each in result.estimates.items()}
+
+
+def selected_alone(result: Result) -> str:
+    """A result file of the selected model: to parse the others is most of the time of a command that reads it."""
+    document = result_document(result)
+    return result_text({**document, "models": {document["model"]: document["models"][document["model"]]}})
 
 
 def steady_run(count: int, seed: int = 7) -> list[Sample]:

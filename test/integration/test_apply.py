@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from command_line import room_for
-from io_fixtures import replayed, run, write_bag
+from io_fixtures import replayed, run, selected_alone, write_bag
 from scipy.spatial.transform import Rotation
 
 import dvl_calib_ros as dc
@@ -58,9 +58,15 @@ def result(tmp_path_factory):
     return bag, replayed(bag, mounting_rpy=MOUNTING).result
 
 
+@pytest.fixture(scope="module")
+def saved_text(result) -> str:
+    return selected_alone(result[1])
+
+
 @pytest.fixture
-def saved(tmp_path, result) -> Path:
-    return change(tmp_path / "result.yaml", result[1])
+def saved(tmp_path, saved_text) -> Path:
+    (tmp_path / "result.yaml").write_text(saved_text)
+    return tmp_path / "result.yaml"
 
 
 def change(path: Path, result, turned: bool = False, **changes) -> Path:

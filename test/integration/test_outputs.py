@@ -14,11 +14,10 @@ import pytest
 from conftest import searched
 from hypothesis import example, given
 from hypothesis import strategies as st
-from io_fixtures import replayed, run, write_bag
+from io_fixtures import replayed, run, selected_alone, write_bag
 
 from dvl_calib_ros.cli.commands import COMMANDS
 from dvl_calib_ros.cli.main import build_parser, main
-from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.files.urdf import numbers
 
 
@@ -82,7 +81,7 @@ def original(tmp_path_factory) -> Path:
     (folder / "loose_bag" / "loose_bag.db3").rename(folder / LOOSE)
     shutil.rmtree(folder / "loose_bag")
     (folder / f"{LOOSE}-wal").touch()
-    text = result_text(result_document(replayed(bag).result))
+    text = selected_alone(replayed(bag).result)
     for name in ("result.yaml", "initial.yaml"):
         (folder / name).write_text(text)
     (folder / "params.yaml").write_text("/**: {ros__parameters: {min_speed: 0.5}}\n")

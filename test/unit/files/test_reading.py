@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 from pathlib import Path
 
@@ -25,12 +26,18 @@ USES = [
 ]  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("reading")
+    assert main(["replay", str(write_bag(folder / "bag", run(10.0))), "--save", str(folder / "good.yaml")]) == 0
+    (folder / "T.csv").write_text("0,1.5,0,0\n")
+    return folder
+
+
 @pytest.fixture
-def folder(tmp_path, monkeypatch) -> Path:
-    write_bag(tmp_path / "bag", run(10.0))
+def folder(original, tmp_path, monkeypatch) -> Path:
+    shutil.copytree(original, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    assert main(["replay", "bag", "--save", "good.yaml"]) == 0
-    (tmp_path / "T.csv").write_text("0,1.5,0,0\n")
     return tmp_path
 
 
