@@ -35,6 +35,12 @@ def skew(a: ArrayLike) -> Array:
     return (a @ _SKEW).reshape(*a.shape, 3)
 
 
+def turned_skew(rotation: Array, a: Array) -> Array:
+    """``rotation @ skew(a)``, (..., m, 3) of (m, 3) and (..., 3): one product, as it is linear in a."""
+    of_axes = rotation @ _SKEW.reshape(3, 3, 3)
+    return (a @ of_axes.reshape(3, -1)).reshape(*a.shape[:-1], *of_axes.shape[1:])
+
+
 def cross(a: Array, b: Array) -> Array:
     """a × b of vectors (..., 3): `numpy.cross` without the axes that it moves about, which take most of its time."""
     x, y, z = (a[..., axis] for axis in range(3))

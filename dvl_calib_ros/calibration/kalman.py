@@ -365,6 +365,18 @@ def _inverse(a: Array) -> Array:
     return _full([[_dot(columns[i], columns[j][i - j :]) for j in range(i + 1)] for i in range(m)])  # L⁻ᵀ L⁻¹
 
 
+def whitening(noise: Array) -> Array:
+    """L⁻¹ (..., m, m) of noise = L Lᵀ, which makes it 1; nan where noise is not positive definite."""
+    m = noise.shape[-1]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rows = _invert_lower(*_cholesky([[noise[..., i, j] for j in range(i + 1)] for i in range(m)]))
+    found = np.zeros_like(noise)
+    for i, row in enumerate(rows):
+        for j, value in enumerate(row):
+            found[..., i, j] = value
+    return found
+
+
 def _forward(low: Elements, inverse_diagonal: Sequence[Array], b: Sequence[Array]) -> list[Array]:
     """L⁻¹ b."""
     y: list[Array] = []
@@ -400,5 +412,10 @@ def _normalised_innovation_squared(
     for i, row in enumerate(s):
         row[i] += 1.0
     innovation = [each - _dot(u[row], y) for row, each in enumerate(z)]
+    return distance_squared(s, innovation)
+
+
+def distance_squared(s: Elements, innovation: Sequence[Array]) -> Array:
+    """νᵀS⁻¹ν. s: lower triangle of S, innovation: ν, element by element."""
     whitened = _forward(*_cholesky(s), innovation)
     return _dot(whitened, whitened)

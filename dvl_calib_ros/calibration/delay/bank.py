@@ -22,7 +22,7 @@ from ..correction_parameters import PriorOnErrors, to_correction
 from ..folds import FOLDS, folds_of, with_states_of
 from ..frames import Array
 from ..heave import HeaveRows, HeaveSums, with_heave
-from ..kalman import GaussianState
+from ..kalman import GaussianState, distance_squared
 from ..parameters import Parameters
 from ..samples import Index, Mask, Stamps
 from ..time_blocks import TimeBlocks
@@ -279,11 +279,15 @@ class DelayBank:
         known yet is in S.
         """
         found = self._solve()
-        innovation = rows.z - np.matmul(rows.h, found.x[None, :, :, None])[..., 0]
-        root = np.linalg.cholesky(found.p)
-        spread = rows.h @ root
-        s = spread @ spread.swapaxes(-1, -2) + np.linalg.inv(rows.information)[:, None]
-        nis = np.einsum("jki,jki->jk", innovation, np.linalg.solve(s, innovation[..., None])[..., 0]).min(axis=1)
+        h, z = rows.white[:, :N_STATE], rows.white[:, N_STATE]
+        flat = h.reshape(*h.shape[:2], -1)
+        innovation = z - (found.x[:, None] @ flat).reshape(z.shape)
+        spread = (np.linalg.cholesky(found.p).swapaxes(1, 2) @ flat).reshape(h.shape)
+        s = [
+            [np.einsum("kaj,kaj->kj", spread[:, :, i], spread[:, :, j]) + float(i == j) for j in range(i + 1)]
+            for i in range(3)
+        ]
+        nis = distance_squared(s, [*innovation.swapaxes(0, 1)]).min(axis=0)
         use = np.ones(len(rows), dtype=bool)
         if len(self._recent) >= ENOUGH:
             level = max(1.0, float(np.median(self._recent)) / MEDIAN_NIS)
@@ -440,15 +444,11 @@ def _without(shown: Mask, of: Index) -> Index:
 
 def _told(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:
     """What some rows tell each hypothesis: HᵀWH (K, n, n), HᵀWz (K, n), zᵀWz (K,)."""
-    z, h = rows.z[use], rows.h[use]
-    weighted = rows.information[use] * rows.weight[use, None, None]
-    k = len(DELAYS_S)
-    flat_h = h.transpose(1, 0, 2, 3).reshape(k, -1, N_STATE)
-    flat_wh = (weighted[:, None] @ h).transpose(1, 3, 0, 2).reshape(k, N_STATE, -1)
-    flat_z = z.transpose(1, 0, 2).reshape(k, -1)
-    flat_wz = (weighted[:, None] @ z[..., None])[..., 0].transpose(1, 0, 2).reshape(k, -1)
-    vector = (flat_wh @ flat_z[..., None])[..., 0]
-    return flat_wh @ flat_h, vector, np.einsum("ki,ki->k", flat_wz, flat_z)
+    white = rows.white if use.all() else rows.white[..., use]
+    weighted = white * rows.weight[use]
+    flat = (*white.shape[:2], -1)
+    told = weighted.reshape(flat) @ white.reshape(flat).swapaxes(1, 2)
+    return told[:, :N_STATE, :N_STATE], told[:, :N_STATE, N_STATE], told[:, N_STATE, N_STATE]
 
 
 def _likely(log_share: Array) -> tuple[Index, Array]:

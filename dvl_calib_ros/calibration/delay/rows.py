@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
+from ..kalman import whitening
 from ..models import MODELS
 from ..models.own import g1_heave, linearise_g1
 from ..observations import Observations
@@ -79,23 +80,21 @@ class ImuColumns(NamedTuple):
 class DelayedRows:
     """J reference samples, each compared at K delays.
 
-    index: (J,) of the reference. z: (J, K, 3) m/s and h: (J, K, 3, 12) on G1's states, lever arm (m, body) and what the
-    delay is more (s) than that of its hypothesis. information: (J, 3, 3) inverse of the noise. weight: (J,) share of
-    its own information that a sample adds. heave: (J, K, 13) (H, z) of what holds of heave in the mean, see heave.py.
+    index: (J,) of the reference. white: (K, 13, 3, J) (H, z) turned and scaled so that their noise is 1, on G1's
+    states, lever arm (m, body) and what the delay is more (s) than that of its hypothesis. weight: (J,) share of its
+    own information that a sample adds. heave: (J, K, 13) (H, z) of what holds of heave in the mean, see heave.py.
     regressor_noise: (J, 4) how much of the information on lever arm (3) and
     delay is that of noise: angular velocity and slope that only seem to change.
     """
 
     index: Index
-    z: Array
-    h: Array
-    information: Array
+    white: Array
     weight: Array
     heave: Array
     regressor_noise: Array
 
     def __len__(self) -> int:
-        return len(self.z)
+        return len(self.index)
 
     def part(self, at: Mask) -> DelayedRows:
         """Those of some references."""
@@ -129,16 +128,17 @@ def delayed_rows(
         moving &= (turning**2).sum(axis=1) <= max_turn_rate**2
     read = _read(dvl, times)
     use = seen.known & ~np.isnan(turning[:, 0]) & moving & read.known
+    white = whitening(noise + np.where(reference.claimed[:, None, None], noise_dvl, 0.0))
+    use &= np.isfinite(white).all(axis=(1, 2))
     index = np.flatnonzero(use)
-    body, noise, turning = body[index], noise[index], turning[index]
+    body, white, turning = body[index], white[index], turning[index]
     value, slope, spacing = read.velocity[index], read.slope[index], read.spacing[index]
-    added = np.where(reference.claimed[index, None, None], noise_dvl, 0.0)
     uncertain = _Uncertain(turning_noise, noise_dvl, read.slope_gain[index])
     interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)[index]
     # references closer together than the DVL's samples share these
     weight = np.clip(interval / spacing, 0.0, 1.0)
     earth = earth[index]
-    return _rows(index, value, slope, body, earth, turning, uncertain, noise + added, weight, template, lever_arm)
+    return _rows(index, value, slope, body, earth, turning, uncertain, white, weight, template, lever_arm)
 
 
 class _Uncertain(NamedTuple):
@@ -202,7 +202,7 @@ def _rows(
     earth: Array,
     turning: Array,
     uncertain: _Uncertain,
-    noise: Array,
+    white: Array,
     weight: Array,
     template: Observations,
     lever_arm: Vector,
@@ -220,15 +220,20 @@ def _rows(
         earth_in_body=np.repeat(earth, k, axis=0),
     )
     z, h_g1 = linearise_g1(each)
-    h = np.zeros((n, k, 3, N_STATE))
-    h[..., :N_G1] = h_g1.reshape(n, k, 3, N_G1)
-    h[..., LEVER_ARM] = -skew(turning)[:, None]
-    h[..., DELAY] = slope @ body_from_dvl.T
+    rows = np.empty((k, N_STATE + 1, 3, n))
+    rows[:, :N_G1] = h_g1.reshape(n, k, 3, N_G1).transpose(1, 3, 2, 0)
+    rows[:, LEVER_ARM] = -skew(turning).transpose(2, 1, 0)
+    rows[:, DELAY] = (slope @ body_from_dvl.T).transpose(1, 2, 0)
+    rows[:, N_STATE] = z.reshape(n, k, 3).transpose(1, 2, 0)
     heave = np.zeros((n, k, N_STATE + 1))
     heave[..., [*range(N_G1), N_STATE]] = g1_heave(each).reshape(n, k, N_G1 + 1)
-    heave[..., BEYOND] = h[:, :, 2, BEYOND]
-    information = np.linalg.inv(noise)
-    return DelayedRows(index, z.reshape(n, k, 3), h, information, weight, heave, uncertain.information(information))
+    heave[..., BEYOND] = rows[:, BEYOND, 2].transpose(2, 0, 1)
+    for i in (2, 1, 0):  # from the last on, as those before go into it
+        rows[:, :, i] *= white[:, i, i]
+        for j in range(i):
+            rows[:, :, i] += white[:, i, j] * rows[:, :, j]
+    told = uncertain.information(white.swapaxes(1, 2) @ white)
+    return DelayedRows(index, rows, weight, heave, told)
 
 
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..frames import Array, skew
+from ..frames import Array, skew, turned_skew
 from ..observations import Observations
 from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance
 
@@ -38,7 +38,7 @@ def linearise_g1(seen: Observations) -> Linearised:
     body_from_dvl = seen.rotation_dvl_from_body.T
     fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
     h = np.zeros((len(fast), 3, 8))
-    h[:, :, :3] = np.matmul(body_from_dvl, skew(seen.velocity_dvl))
+    h[:, :, :3] = turned_skew(body_from_dvl, seen.velocity_dvl)
     h[:, :, 3:5] = -(body_from_dvl * (fast * seen.velocity_dvl)[:, None, :])[:, :, :2]
     if seen.earth_in_body is not None:
         h[:, :, 6:] = seen.earth_in_body
@@ -54,7 +54,7 @@ def g1_heave(seen: Observations) -> Array:
     fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
     level = seen.velocity_dvl @ body_from_dvl.T * (1.0, 1.0, 0.0) @ body_from_dvl
     row = np.zeros((len(fast), 9))
-    row[:, :3] = body_from_dvl[2] @ skew(seen.velocity_dvl)
+    row[:, :3] = turned_skew(body_from_dvl[2:], seen.velocity_dvl)[:, 0]
     row[:, 3:5] = -(body_from_dvl[2] * fast * level)[:, :2]
     row[:, 5] = -1.0
     row[:, 8] = -seen.velocity_in_body[:, 2]
