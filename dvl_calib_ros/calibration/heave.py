@@ -66,10 +66,12 @@ class HeaveRows:
         size = k, n + 1, n + 1
         self._folds = HeaveSums(np.zeros((FOLDS, *size)), np.zeros((FOLDS, *size)), np.zeros((FOLDS, 1)))
         self._sum = np.zeros((k, n + 1))
+        self._sums: dict[int | None, HeaveSums] = {}  # as asked for since the last change
         self._start()
         self._last_ns: int | None = None
 
     def _start(self) -> None:
+        self._sums.clear()
         self._count, self._seconds = 0, 0.0
         self._sum = np.zeros_like(self._sum)
 
@@ -99,6 +101,7 @@ class HeaveRows:
             at = slice(start, end)
             self._count += int(np.count_nonzero(used[at]))
             self._seconds += float(seconds[at].sum())
+            self._sums.clear()
             self._sum = self._sum + rows[at][used[at]].sum(axis=0)
             self._last_ns = int(stamps_ns[end - 1])
             if end in ends:
@@ -126,23 +129,27 @@ class HeaveRows:
 
     def sums(self, without: int | None = None) -> HeaveSums:
         """The rows so far, the one of the block that is not ended among them; without a fold, if one is named."""
-        fold, row = self._open()
-        use = np.arange(FOLDS) != (FOLDS if without is None else without)
-        return HeaveSums(
-            *(kept[use].sum(axis=0) + more * (fold != without) for kept, more in zip(self._folds, row, strict=True))
-        )
+        if without not in self._sums:
+            fold, row = self._open()
+            use = np.arange(FOLDS) != (FOLDS if without is None else without)
+            self._sums[without] = HeaveSums(
+                *(kept[use].sum(axis=0) + more * (fold != without) for kept, more in zip(self._folds, row, strict=True))
+            )
+        return self._sums[without]
 
     def absorb(self) -> tuple[HeaveSums, Array]:
         """Give the caller the rows of ended blocks, who has them from now on; what they scatter by is kept.
 
         Returns the rows, and what they tell by folds (FOLDS, K, n+1, n+1).
         """
+        self._sums.clear()
         sums, told = HeaveSums(*(kept.sum(axis=0) for kept in self._folds)), self._folds.told
         self._folds = self._folds._replace(told=np.zeros_like(told))
         return sums, told
 
     def learn_from(self, source: Index) -> None:
         """Take what rows so far scatter by from others. source: (K,) from which of the K each takes it."""
+        self._sums.clear()
         self._folds = self._folds._replace(scatter=self._folds.scatter[:, source].copy())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .frames import Array
-from .robust import robust_std
+from .robust import median, robust_std
 from .samples import Mask
 
 # Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out.
@@ -50,9 +50,11 @@ def without_spikes(
         off = off_neighbours(x) / loud
         scale = np.maximum(robust_std(off), smallest)
         if also_at_ends:
-            off[:2], off[-2:] = (x[:2] - np.median(x[:5], axis=0)), (x[-2:] - np.median(x[-5:], axis=0))
+            off[:2], off[-2:] = (x[:2] - median(x[:5])), (x[-2:] - median(x[-5:]))
         far = (np.abs(off) / scale).max(axis=1)
         at = np.flatnonzero(far >= SPIKE)
+        if not len(at):
+            break
         # the good one between two spikes is far from where these tell it to be, and among the five about it
         about = np.clip(at, 2, len(far) - 3)[:, None] + np.arange(-2, 3)
         alone = np.abs(x[at] - np.median(x[about], axis=1)) / loud[at]

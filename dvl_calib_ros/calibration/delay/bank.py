@@ -119,7 +119,7 @@ class DelayBank:
         self._information, self._vector = _information(self._start)
         self._ended: list[_Ended] = []
         self._square = np.einsum("ki,ki->k", self._vector, self._start.x)
-        self._log_det = np.zeros(len(DELAYS_S))
+        self._log_det = np.linalg.slogdet(self._information)[1]
         self._parameters = parameters
         self._heave = HeaveRows(len(DELAYS_S), N_STATE, parameters)
         self._heave_variance = parameters.motion_std**2
@@ -171,7 +171,7 @@ class DelayBank:
                 self._folds[1][fold] = self._vector - vector
         x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
         self._square = found.misfit[best] + np.einsum("ki,ki->k", self._vector, x)
-        self._log_det = np.zeros(len(DELAYS_S))
+        self._log_det = np.linalg.slogdet(self._information)[1]
         self._regressor_noise[-1] = 0.0
         self._solved = None
 
@@ -194,7 +194,6 @@ class DelayBank:
             return np.zeros(0, dtype=bool)
         use = self._gated(rows)
         folds = folds_of(stamps_ns, self._parameters)
-        before = np.linalg.slogdet(self._information)[1]
         total, total_vector = np.zeros_like(self._information), np.zeros_like(self._vector)
         square, by_fold = np.zeros_like(self._square), []
         for fold in np.unique(folds[use]):  # also where nobody verifies: sums in one order are the same to the last bit
@@ -210,7 +209,6 @@ class DelayBank:
         self._information += total
         self._regressor_noise += rows.weight[use] @ rows.regressor_noise[use]
         self._vector += total_vector
-        self._log_det += np.linalg.slogdet(self._information)[1] - before
         self.blocks.add(total, total_vector, float(rows.weight[use].sum()))
         self._heave.add(stamps_ns, rows.heave, use)
         self._learn_heave()
@@ -249,7 +247,6 @@ class DelayBank:
 
     def _absorb_heave(self) -> None:
         """Under a random walk what a row tells ages with the rest."""
-        before = np.linalg.slogdet(self._information)[1]
         sums, by_fold = self._heave.absorb()
         told = sums.told / self._heave_variance
         if self._folds is not None:
@@ -259,7 +256,6 @@ class DelayBank:
         self._vector += told[:, :N_STATE, N_STATE]
         self._square += told[:, N_STATE, N_STATE]
         self._solved = None
-        self._log_det += np.linalg.slogdet(self._information)[1] - before
 
     def _drift(self, seconds: float) -> None:
         """Random walk over so many seconds: P grows, x stays, and so does the misfit."""
@@ -267,7 +263,9 @@ class DelayBank:
         p = np.linalg.inv(self._information)
         x = (p @ self._vector[..., None])[..., 0]
         misfit = self._square - np.einsum("ki,ki->k", x, self._vector)
+        before = np.linalg.slogdet(self._information)[1]
         self._information = np.linalg.inv(p + self._process_rate * seconds)
+        self._log_det += np.linalg.slogdet(self._information)[1] - before
         self._vector = (self._information @ x[..., None])[..., 0]
         self._square = misfit + np.einsum("ki,ki->k", self._vector, x)
         self._solved = None
@@ -307,9 +305,8 @@ class DelayBank:
             assert self._folds is not None
             information, vector = information - self._folds[0][without], vector - self._folds[1][without]
         heave = self._heave.sums(without).told / self._heave_variance
-        before = np.linalg.slogdet(information)[1]
         information, vector = information + heave[:, :N_STATE, :N_STATE], vector + heave[:, :N_STATE, N_STATE]
-        log_det = self._log_det + np.linalg.slogdet(information)[1] - before
+        log_det = np.linalg.slogdet(information)[1] - self._log_det
         p = np.linalg.inv(information)
         p = 0.5 * (p + p.swapaxes(1, 2))
         x = (p @ vector[..., None])[..., 0]

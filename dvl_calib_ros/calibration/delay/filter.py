@@ -21,6 +21,7 @@ from ..frames import ENU_FROM_NED, Array
 from ..kalman import GaussianState
 from ..observations import Observations
 from ..parameters import Parameters
+from ..robust import median
 from ..samples import FRAME_CODES, FRAMES, Index, Mask, Stamps, VelocityFrame, Verdict
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..spikes import without_spikes
@@ -506,7 +507,7 @@ class DelayFilter:
 
 def _is_slow(times: Array) -> bool:
     """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
-    return len(times) > 1 and float(np.median(np.diff(times))) > SLOW_S
+    return len(times) > 1 and float(median(np.diff(times))) > SLOW_S
 
 
 def _good(stamps_ns: Stamps, velocity: Array) -> Mask:

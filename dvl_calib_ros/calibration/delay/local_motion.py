@@ -24,9 +24,9 @@ REACH_INTERVALS = 2.6
 
 
 class LocalFit(NamedTuple):
-    """At every time (...): value (..., c), slope (..., c) per s, and whether there is one (...).
+    """At M times: value (M, c), slope (M, c) per s, and whether there is one (M,).
 
-    value_gain, slope_gain: (...) variance of value and slope for samples with white noise of variance 1.
+    value_gain, slope_gain: (M,) variance of value and slope for samples with white noise of variance 1.
     """
 
     value: Array
@@ -55,37 +55,39 @@ def reach_at(spacing: Array, least: float, most: float) -> Array:
 def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     """Fit a quadratic to the samples within `reach` of each time, weighted by (1 - |u|³)³ with u = distance / reach.
 
-    times: (N,) s, increasing. values: (N, c). at, reach: (...) s, nan for no fit.
+    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit.
     """
     found = ~np.isnan(reach)
     if not found.any():
-        nothing = np.full((*at.shape, values.shape[1]), np.nan)
-        return LocalFit(nothing, nothing, nothing[..., 0], nothing[..., 0], found)
+        nothing = np.full((len(at), values.shape[1]), np.nan)
+        return LocalFit(nothing, nothing, nothing[:, 0], nothing[:, 0], found)
     widest = float(np.nanmax(reach))
     around = int((np.searchsorted(times, times + widest) - np.arange(len(times))).max())
-    index = np.searchsorted(times, at)[..., None] + np.arange(-around, around)
+    # samples of a window first: sums over them are then those of whole rows
+    index = np.searchsorted(times, at) + np.arange(-around, around)[:, None]
     there = (index >= 0) & (index < len(times))
     index = np.clip(index, 0, len(times) - 1)
-    u = (times[index] - at[..., None]) / np.where(found, reach, 1.0)[..., None]
+    u = (times[index] - at) / np.where(found, reach, 1.0)
     near = np.abs(u)
-    weight = np.where(there & (near < 1.0), (1.0 - near**3) ** 3, 0.0)
+    falling = 1.0 - near * near * near
+    weight = np.where(there & (near < 1.0), falling * falling * falling, 0.0)
     used = weight > 0.0
-    found &= ((used & (u <= 0.0)).sum(axis=-1) >= ON_EACH_SIDE) & ((used & (u >= 0.0)).sum(axis=-1) >= ON_EACH_SIDE)
+    found &= ((used & (u <= 0.0)).sum(axis=0) >= ON_EACH_SIDE) & ((used & (u >= 0.0)).sum(axis=0) >= ON_EACH_SIDE)
     first = weight * u
     second = first * u
     # the normal equations of a + b u + c u² and, by cofactors, the first two rows of their inverse
-    s0, s1, s2 = weight.sum(axis=-1), first.sum(axis=-1), second.sum(axis=-1)
-    s3, s4 = (second * u).sum(axis=-1), (second * u * u).sum(axis=-1)
+    s0, s1, s2 = weight.sum(axis=0), first.sum(axis=0), second.sum(axis=0)
+    s3, s4 = (second * u).sum(axis=0), (second * u * u).sum(axis=0)
     c00, c01, c02 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
     c11, c12 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3
     determinant = s0 * c00 + s1 * c01 + s2 * c02
     found &= determinant > 1e-12 * s0**3
-    scale = 1.0 / np.where(found, determinant, 1.0)[..., None]
-    for_value = (c00[..., None] * weight + c01[..., None] * first + c02[..., None] * second) * scale
-    for_slope = (c01[..., None] * weight + c11[..., None] * first + c12[..., None] * second) * scale
-    around_values = values[index]
-    value = np.matmul(for_value[..., None, :], around_values)[..., 0, :]
-    slope = np.matmul(for_slope[..., None, :], around_values)[..., 0, :]
+    scale = 1.0 / np.where(found, determinant, 1.0)
+    for_value = (c00 * weight + c01 * first + c02 * second) * scale
+    for_slope = (c01 * weight + c11 * first + c12 * second) * scale
+    columns = [column[index] for column in values.T]
+    value = np.stack([(for_value * column).sum(axis=0) for column in columns], axis=1)
+    slope = np.stack([(for_slope * column).sum(axis=0) for column in columns], axis=1)
     unit = np.where(found, reach, 1.0)
-    gains = ((for_value**2).sum(axis=-1), (for_slope**2).sum(axis=-1) / unit**2)
-    return LocalFit(value, slope / unit[..., None], *gains, found)
+    gains = ((for_value**2).sum(axis=0), (for_slope**2).sum(axis=0) / unit**2)
+    return LocalFit(value, slope / unit[:, None], *gains, found)

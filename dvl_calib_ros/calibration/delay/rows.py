@@ -17,6 +17,7 @@ from ..kalman import whitening
 from ..models import MODELS
 from ..models.own import g1_heave, linearise_g1
 from ..observations import Observations
+from ..robust import median
 from ..samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
 
@@ -239,7 +240,7 @@ def _rows(
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     """Means of times (N,) s and columns (N, ...) over bins of BIN_S, of those bins that hold any;
     as they are if they come no faster than FASTER_THAN_S."""
-    if len(times) < 2 or np.median(np.diff(times)) >= FASTER_THAN_S:
+    if len(times) < 2 or median(np.diff(times)) >= FASTER_THAN_S:
         return times, *columns
     bins = np.floor(times / BIN_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(bins, prepend=bins[:1] - 1))
@@ -271,9 +272,9 @@ def _noise_of(times: Array, values: Array) -> Array:
 
     A vehicle that rolls in waves has second differences of its own if it is looked at once a second.
     """
-    if len(times) < 8 or np.median(np.diff(times)) > NOISE_FROM_S:
+    if len(times) < 8 or median(np.diff(times)) > NOISE_FROM_S:
         return np.zeros(values.shape[1])
-    bent: Array = np.median(np.diff(values, 2, axis=0) ** 2, axis=0) / (6.0 * 0.455)  # 0.455: median of chi-square
+    bent: Array = median(np.diff(values, 2, axis=0) ** 2) / (6.0 * 0.455)  # 0.455: median of chi-square
     return bent
 
 
