@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .channels import Channel, Decoder, DecodingError
 from .layout import Columns, Layout, NoLayoutError, layout_of
-from .reader import BagReader
+from .reader import BagReader, Wanted
 from .sorting import BagMessage
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
@@ -58,9 +58,11 @@ class Window:
     log_ns: int
 
 
-def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str] = ()) -> Iterator[Window]:
-    """All messages of these topics. one_by_one: topics of which no columns are wanted."""
-    messages = bag.raw_messages(topics)
+def windows(
+    bag: BagReader, topics: Collection[str], one_by_one: Collection[str] = (), wanted: Wanted | None = None
+) -> Iterator[Window]:
+    """Messages of these topics that are wanted, None for all. one_by_one: topics of which no columns are asked for."""
+    messages = bag.raw_messages(topics, wanted)
     layouts = _Layouts(bag.decoder)
     arrived = 0
     while taken := _taken(messages):

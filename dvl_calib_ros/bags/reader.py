@@ -28,6 +28,8 @@ else:
 # Plain tuples: there is one per message, and a named one would cost as much as a third of its decoding.
 DecodedMessage = tuple[str, int, Any, str]
 """Topic, log time (ns), decoded message (None if it cannot be decoded), and then why."""
+Wanted = Callable[[str, int], bool]
+"""Topic and log time (ns) of a message -> whether it is."""
 # Where a recording begins
 _MARKER = Channel("", "")
 
@@ -116,23 +118,21 @@ class BagReader:
             at += count
         return spans
 
-    def messages(
-        self, topics: Iterable[str], wanted: Callable[[str, int], bool] = lambda *_: True
-    ) -> Iterator[DecodedMessage]:
-        """Messages of these topics. wanted: by topic and log time, which are decoded; the others are left out."""
-        for log_ns, channel, data in self.raw_messages(topics):
-            if not wanted(channel.topic, log_ns):
-                continue
+    def messages(self, topics: Iterable[str], wanted: Wanted | None = None) -> Iterator[DecodedMessage]:
+        """Messages of these topics. wanted: which are decoded, None for all; the others are left out."""
+        for log_ns, channel, data in self.raw_messages(topics, wanted):
             try:
                 message, why = self.decoder(channel, data), ""
             except DecodingError as error:
                 message, why = None, str(error)
             yield channel.topic, log_ns, message, why
 
-    def raw_messages(self, topics: Iterable[str]) -> Iterator[BagMessage]:
-        """Log time, channel and CDR bytes of the messages of these topics."""
-        wanted = frozenset(topics)
-        streams = [self._of_source(source, wanted) for source in self._sources]
+    def raw_messages(self, topics: Iterable[str], wanted: Wanted | None = None) -> Iterator[BagMessage]:
+        """Log time, channel and CDR bytes of the messages of these topics that are wanted, None for all."""
+        if wanted is not None:
+            return (message for message in self.raw_messages(topics) if wanted(message[1].topic, message[0]))
+        chosen = frozenset(topics)
+        streams = [self._of_source(source, chosen) for source in self._sources]
         if len(streams) == 1:
             next(streams[0])  # the marker
             return streams[0]

@@ -7,19 +7,21 @@ yet the streams have samples at the same times, which can be compared.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
-from operator import attrgetter
+from operator import itemgetter
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..bags.columns import Part, windows
 from ..bags.reader import BagReader
 from ..calibration.frames import Array
-from ..calibration.samples import Mask
-from ..messages.decode import stamp_ns
+from ..calibration.samples import Mask, Stamps
+from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
 
@@ -31,6 +33,8 @@ TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 FASTEST = 1e5
 # Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
 MOST_STATIC = 200
+# Of an IMU: quaternion, angular velocity and acceleration.
+_IMU_NUMBERS = 10
 MOVING_TYPES = frozenset({*VELOCITY_TYPES, IMU_TYPE})
 
 
@@ -87,27 +91,33 @@ def survey(bag: BagReader) -> Survey:
     start_ns = bag.span_ns[0] if types else 0
     spans_ns = bag.recorded_spans_ns if types else [(0, 0)]
     seconds = 1e-9 * sum(end - start for start, end in spans_ns)
-    taken: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in moving}
+    one_by_one = {topic for topic, kind in types.items() if kind != IMU_TYPE and not _is_read_in_columns(kind)}
+    taken: dict[str, list[Part]] = {topic: [] for topic in moving}
     transforms: list[Any] = []
     descriptions: list[str] = []
-    wanted = _Bursts(spans_ns, static)
-    for topic, log_ns, message, _ in bag.messages(moving | static, wanted):
-        if message is None:
-            continue
-        if topic in moving:
-            taken[topic].append((log_ns, message))
-        elif types[topic] == TF_TYPE:
-            transforms += list(message.transforms)
-        else:
-            descriptions.append(message.data)
+    for window in windows(bag, moving | static, one_by_one, _Bursts(spans_ns, static)):
+        for part in window.parts:
+            topic = part.channel.topic
+            if topic in moving:
+                taken[topic].append(part)
+                continue
+            for message, _ in part.messages():
+                if message is None:
+                    continue
+                if types[topic] == TF_TYPE:
+                    transforms += list(message.transforms)
+                else:
+                    descriptions.append(message.data)
     looks = {}
-    for topic, messages in taken.items():
-        look = _look(
-            topic, types[topic], counts[topic], counts[topic] / seconds if seconds else 0.0, start_ns, messages
-        )
+    for topic, parts in taken.items():
+        look = _look(topic, types[topic], counts[topic], counts[topic] / seconds if seconds else 0.0, start_ns, parts)
         if look is not None:
             looks[topic] = look
     return Survey(types, counts, looks, tuple(transforms), tuple(dict.fromkeys(descriptions)))
+
+
+def _is_read_in_columns(kind: str) -> bool:
+    return kind in VELOCITY_TYPES and VELOCITY_TYPES[kind].is_read_in_columns
 
 
 def _is_static(topic: str, kind: str) -> bool:
@@ -139,35 +149,76 @@ class _Bursts:
         return True
 
 
-def _look(
-    topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, messages: list[tuple[int, Any]]
-) -> Look | None:
+def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, parts: list[Part]) -> Look | None:
     """None for a topic whose messages cannot be read."""
-    read = _imu_row if msgtype == IMU_TYPE else _velocity_row(msgtype)
-    if msgtype in VELOCITY_TYPES and VELOCITY_TYPES[msgtype].is_position:
-        messages = _differences(messages)
-    rows, stamps, frame_id = [], [], ""
-    for log_ns, message in messages:
+    rows = []
+    singly: list[_Message] = []
+    for part in parts:
         try:
-            rows.append(read(message))
-            stamps.append(1e-9 * ((stamp_ns(message.header.stamp) or log_ns) - start_ns))
-            frame_id = frame_id or _frame_id(msgtype, message)
-        except (AttributeError, TypeError, ValueError, IndexError):
-            continue
+            rows.append(_rows_of_columns(part, msgtype))
+        except UNREADABLE:
+            places = zip(part.arrival.tolist(), part.log_ns.tolist(), part.messages(), strict=True)
+            singly += [(arrival, log_ns, message) for arrival, log_ns, (message, _) in places if message is not None]
+    singly.sort(key=itemgetter(0))
+    if msgtype in VELOCITY_TYPES and VELOCITY_TYPES[msgtype].is_position:
+        singly = _differences(singly)
+    for each in singly:
+        with suppress(*UNREADABLE):
+            rows.append(_row_of_message(*each, msgtype))
     if not rows:
         return None
-    values = np.array(rows, dtype=float)
+    arrival, stamps_ns, values = (np.concatenate(column) for column in list(zip(*rows, strict=True))[:3])
+    names = sorted((int(each.arrival[0]), each.frame_id) for each in rows if each.frame_id)
+    if msgtype == IMU_TYPE:
+        for number, at in enumerate((slice(0, 4), slice(4, 7), slice(7, 10))):
+            values[values[:, _IMU_NUMBERS + number] == NO_DATA, at] = np.nan
+        values = values[:, :_IMU_NUMBERS]
+    else:
+        values[(values == 0.0).all(axis=1)] = np.nan  # what drivers send for want of a measurement
     values[~(np.abs(values) < FASTEST)] = np.nan  # so that their squares are numbers
     whole = (np.abs(values) < FASTEST).all(axis=1) if msgtype != IMU_TYPE else np.ones(len(values), dtype=bool)
-    order = np.argsort(np.array(stamps)[whole], kind="stable")
-    return Look(topic, msgtype, count, rate_hz, frame_id, np.array(stamps)[whole][order], values[whole][order])
+    order = np.lexsort((arrival, stamps_ns))
+    order = order[whole[order]]
+    frame_id = names[0][1] if names else ""
+    return Look(topic, msgtype, count, rate_hz, frame_id, 1e-9 * (stamps_ns[order] - start_ns), values[order])
 
 
-def _differences(messages: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
+_Message = tuple[int, int, Any]
+"""Place among all that are read, log time (ns), message."""
+
+
+class _Rows(NamedTuple):
+    """N messages. arrival: (N,) their places. stamps_ns: (N,). numbers: (N, k). frame_id: of the first."""
+
+    arrival: Stamps
+    stamps_ns: Stamps
+    numbers: Array
+    frame_id: str
+
+
+def _rows_of_columns(part: Part, msgtype: str) -> _Rows:
+    """Raises what is `UNREADABLE`."""
+    columns = part.columns
+    if columns is None:
+        raise ValueError("not laid out alike")
+    stamps_ns = columns.header.stamp.sec.astype(np.int64) * 1_000_000_000 + columns.header.stamp.nanosec
+    name = _frame_id(msgtype, columns)[0].tobytes().decode("ascii")
+    numbers = np.column_stack(_numbers(msgtype, columns)).astype(float)
+    return _Rows(part.arrival, np.where(stamps_ns == 0, part.log_ns, stamps_ns), numbers, name)
+
+
+def _row_of_message(arrival: int, log_ns: int, message: Any, msgtype: str) -> _Rows:
+    """Raises what is `UNREADABLE`."""
+    numbers = np.array([_numbers(msgtype, message)], dtype=float)
+    stamp = stamp_ns(message.header.stamp) or log_ns
+    return _Rows(np.array([arrival]), np.array([stamp]), numbers, str(_frame_id(msgtype, message)))
+
+
+def _differences(messages: list[_Message]) -> list[_Message]:
     """Satellite positions as the velocities between them, at the middle of each window."""
     difference = FixDifference()
     found = []
-    for log_ns, message in messages:
+    for arrival, log_ns, message in messages:
         stamp = stamp_ns(message.header.stamp) or log_ns
         fixed = difference(stamp, message.latitude, message.longitude, message.altitude, None)
         if fixed is not None and message.status.status >= 0:
@@ -176,36 +227,28 @@ def _differences(messages: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
             header = SimpleNamespace(
                 stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=message.header.frame_id
             )
-            found.append((log_ns, SimpleNamespace(velocity=velocity, header=header)))
+            found.append((arrival, log_ns, SimpleNamespace(velocity=velocity, header=header)))
     return found
 
 
-def _frame_id(msgtype: str, message: Any) -> str:
+def _frame_id(msgtype: str, message: Any) -> Any:
     kind = VELOCITY_TYPES.get(msgtype)
-    return str(message.header.frame_id if kind is None else kind.frame_id(message))
+    return message.header.frame_id if kind is None else kind.frame_id(message)
 
 
-def _velocity_row(msgtype: str) -> Callable[[Any], list[float]]:
+def _numbers(msgtype: str, message: Any) -> list[Any]:
+    """Of a message, or of columns: a velocity; of an IMU all that `Look` says, then what says whether it is given."""
+    if msgtype == IMU_TYPE:
+        q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
+        given = (
+            message.orientation_covariance,
+            message.angular_velocity_covariance,
+            message.linear_acceleration_covariance,
+        )
+        return [q.x, q.y, q.z, q.w, w.x, w.y, w.z, a.x, a.y, a.z, *(each[..., 0] for each in given)]
     kind = VELOCITY_TYPES[msgtype]
-    velocity = attrgetter("velocity") if kind.is_position else kind.velocity
-
-    def row(message: Any) -> list[float]:
-        v = velocity(message)
-        if v.x == v.y == v.z == 0.0:  # what drivers send for want of a measurement
-            return [np.nan] * 3
-        return [v.x, v.y, v.z]
-
-    return row
-
-
-def _imu_row(message: Any) -> list[float]:
-    nothing = [np.nan] * 4
-    q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
-    return [
-        *(nothing if message.orientation_covariance[0] == -1.0 else (q.x, q.y, q.z, q.w)),
-        *(nothing[:3] if message.angular_velocity_covariance[0] == -1.0 else (w.x, w.y, w.z)),
-        *(nothing[:3] if message.linear_acceleration_covariance[0] == -1.0 else (a.x, a.y, a.z)),
-    ]
+    v = message.velocity if kind.is_position else kind.velocity(message)
+    return [v.x, v.y, v.z]
 
 
 def comparable(a: Look, at_s: Array, longest_gap_s: float = 1.5) -> tuple[Array, Mask]:
