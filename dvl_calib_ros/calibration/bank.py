@@ -123,7 +123,7 @@ class Group:
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp) if self._scatter is None else self._scatter.cuts(stamps_ns)
-        every = ends if not len(cuts) else np.union1d(cuts, [] if ends is None else ends).astype(np.intp)
+        every = ends if not len(cuts) else np.array(sorted({*cuts.tolist(), *([] if ends is None else ends.tolist())}))
         if self._heave is None:
             after = self._after(data, process, every)
             self._x, self._p, states = after.x, after.p, after.at

@@ -41,7 +41,7 @@ class FoldInformation:
         """Add N samples, as far as models used them (K, N)."""
         h = data.h.swapaxes(2, 3)  # (K, N, n, m)
         wh = h @ np.linalg.inv(data.r) * (data.weight * used)[:, :, None, None]
-        for fold in np.unique(folds):
+        for fold in set(folds.tolist()):
             at = folds == fold
             wh_fold = _rows(wh[:, at])
             self._information[fold] += wh_fold.swapaxes(1, 2) @ _rows(h[:, at])
@@ -111,7 +111,7 @@ class Moments:
         measured = np.broadcast_to(seen.measured_in_body, v.shape)
         rotation = seen.rotation_dvl_from_body
         variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, seen.noise, rotation), v.shape)
-        for fold in np.unique(folds):
+        for fold in set(folds.tolist()):
             at = folds == fold
             self.count[fold] += at.sum()
             for axis in range(3):

@@ -57,7 +57,7 @@ def without_spikes(
             break
         # the good one between two spikes is far from where these tell it to be, and among the five about it
         about = np.clip(at, 2, len(far) - 3)[:, None] + np.arange(-2, 3)
-        alone = np.abs(x[at] - np.median(x[about], axis=1)) / loud[at]
+        alone = np.abs(x[at] - median(x[about].swapaxes(0, 1))) / loud[at]
         far[at] = (np.minimum(np.abs(off[at]), alone) / scale).max(axis=1)
         good = (far < SPIKE) | (far < beside(far))  # what a spike does to its neighbours is not theirs
         if good.all():

@@ -247,7 +247,7 @@ def _with_lever_arm(data: Together, hypothesis: Hypothesis, known: Array | None)
 
 def _better(errors: Array) -> Array:
     """(N,) whether a sample is not among the worst."""
-    return np.asarray(errors <= np.quantile(errors, KEPT_SHARE))
+    return np.asarray(errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))])
 
 
 def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:

@@ -141,12 +141,14 @@ class _Bursts:
         if topic in self._static:
             self._static[topic] += 1
             return self._static[topic] <= MOST_STATIC
+        if log_ns < self._next_ns.get(topic, 0):
+            return False
         span = max(bisect_right(self._starts_ns, log_ns) - 1, 0)
         recorded_ns = log_ns - self._starts_ns[span] + self._recorded_before_ns[span]
-        if recorded_ns % self._period_ns >= BURST_NS or log_ns < self._next_ns.get(topic, 0):
-            return False
-        self._next_ns[topic] = log_ns + BURST_EVERY_NS
-        return True
+        since_ns = recorded_ns % self._period_ns
+        is_wanted = since_ns < BURST_NS
+        self._next_ns[topic] = log_ns + (BURST_EVERY_NS if is_wanted else self._period_ns - since_ns)
+        return is_wanted
 
 
 def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, parts: list[Part]) -> Look | None:

@@ -19,6 +19,7 @@ from ..calibration.delay.hold_out import NO_TERMS, Compared, Recording, Terms
 from ..calibration.folds import folds_of
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
+from ..calibration.robust import median
 from ..calibration.samples import Index
 from ..calibration.verification import Word
 
@@ -134,7 +135,7 @@ def dead_reckoned(
     errors = [_level(each.error[use], each, use, on_a_map) for each in (before, after)]
     astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     ends = _stretches(along)
-    kept = np.unique(np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp))
+    kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
         distance_m=float(along[-1]),
@@ -164,7 +165,7 @@ def _steps(times: Array) -> Array:
     interval = np.diff(times, prepend=times[:1])
     if len(interval) < 2:
         return np.zeros(len(times))
-    usual = float(np.median(interval[1:]))
+    usual = float(median(interval[1:]))
     return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
 
 
@@ -197,7 +198,7 @@ def _noise(errors: Array, step_s: Array, along: Array, ends: Index) -> float:
     """
     if len(errors) < 3:
         return 0.0
-    variance = np.median(np.diff(errors, axis=0) ** 2, axis=0).sum() / (2.0 * MEDIAN_SQUARE)
+    variance = median(np.diff(errors, axis=0) ** 2).sum() / (2.0 * MEDIAN_SQUARE)
     squares = np.concatenate([[0.0], np.cumsum(step_s[1:] ** 2)])
     share = variance * np.diff(squares[ends]) / np.maximum(np.diff(along[ends]), 1e-9) ** 2
     return 1000.0 * math.sqrt(float(np.mean(share)))

@@ -24,6 +24,7 @@ from ..frames import Array
 from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState, distance_squared
 from ..parameters import Parameters
+from ..robust import median
 from ..samples import Index, Mask, Stamps
 from ..time_blocks import TimeBlocks
 from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, DelayedRows
@@ -196,7 +197,9 @@ class DelayBank:
         folds = folds_of(stamps_ns, self._parameters)
         total, total_vector = np.zeros_like(self._information), np.zeros_like(self._vector)
         square, by_fold = np.zeros_like(self._square), []
-        for fold in np.unique(folds[use]):  # also where nobody verifies: sums in one order are the same to the last bit
+        for fold in sorted(
+            set(folds[use].tolist())
+        ):  # also where nobody verifies: sums in one order are the same to the last bit
             told = _told(rows, use & (folds == fold))
             by_fold.append((fold, told))
             total += told[0]
@@ -241,7 +244,7 @@ class DelayBank:
         own = HeaveSums(sums.told[best], sums.scatter[best], sums.weight)
         with suppress(np.linalg.LinAlgError):  # numbers that run away: what was learnt before is kept
             _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
-            if np.isfinite(variance[0]):
+            if np.isfinite(variance[0]) and variance[0] != self._heave_variance:
                 self._heave_variance = float(variance[0])
                 self._solved = None
 
@@ -288,7 +291,7 @@ class DelayBank:
         nis = distance_squared(s, [*innovation.swapaxes(0, 1)]).min(axis=0)
         use = np.ones(len(rows), dtype=bool)
         if len(self._recent) >= ENOUGH:
-            level = max(1.0, float(np.median(self._recent)) / MEDIAN_NIS)
+            level = max(1.0, float(median(np.array(self._recent))) / MEDIAN_NIS)
             use = nis <= self._gate * level
         self._recent = (self._recent + nis.tolist())[-RECENT:]
         self.used += int(use.sum())
@@ -376,7 +379,7 @@ class DelayBank:
 
         last: of this day, in the errors; held: the same as the filter has it. fold: place in `_Ended.known`.
         """
-        on = np.setdiff1d(np.arange(N_STATE), OF_DAY)
+        on = np.delete(np.arange(N_STATE), OF_DAY)
         states = []
         for ended in self._ended:
             x, p = ended.known[fold]

@@ -406,7 +406,7 @@ class DelayFilter:
         inside = (late[:, 0] >= dvl.times[0]) & (late[:, -1] <= dvl.times[-1])
         moving = inside & ((raw**2).sum(axis=1) >= self._parameters.min_speed**2)
         unmeasured = track.unmeasured[at] != 0
-        for code in np.unique(track.frames[at]).tolist():
+        for code in set(track.frames[at].tolist()):
             for has_attitude in (True, False):
                 use = moving & (track.frames[at] == code) & (oriented == has_attitude) & ~unmeasured
                 if use.any():

@@ -67,7 +67,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     index = np.searchsorted(times, at) + np.arange(-around, around)[:, None]
     there = (index >= 0) & (index < len(times))
     index = np.clip(index, 0, len(times) - 1)
-    u = (times[index] - at) / np.where(found, reach, 1.0)
+    u = (times.take(index) - at) / np.where(found, reach, 1.0)
     near = np.abs(u)
     falling = 1.0 - near * near * near
     weight = np.where(there & (near < 1.0), falling * falling * falling, 0.0)
@@ -85,7 +85,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     scale = 1.0 / np.where(found, determinant, 1.0)
     for_value = (c00 * weight + c01 * first + c02 * second) * scale
     for_slope = (c01 * weight + c11 * first + c12 * second) * scale
-    columns = [column[index] for column in values.T]
+    columns = [column.take(index) for column in values.T]
     value = np.stack([(for_value * column).sum(axis=0) for column in columns], axis=1)
     slope = np.stack([(for_slope * column).sum(axis=0) for column in columns], axis=1)
     unit = np.where(found, reach, 1.0)

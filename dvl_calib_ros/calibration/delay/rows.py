@@ -23,9 +23,10 @@ from .local_motion import local_fit, reach_at, spacing_at
 
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
 # (0.1 m/s² changing by 0.3 m/s³ bends by 1.5 mm/s).
-DELAYS_S: Array = np.arange(-16, 17) * 0.2
-LONGEST_DELAY_S = 3.2
 STEP_S = 0.2
+STEPS: Index = np.arange(-16, 17)
+DELAYS_S: Array = STEPS * STEP_S
+LONGEST_DELAY_S = 3.2
 # Samples at least as dense as this tell their noise apart from the vehicle's motion, s.
 NOISE_FROM_S = 0.15
 # Samples faster than this are averaged over bins of so long: none the worse for it, and the work stays the same.
@@ -133,7 +134,7 @@ def delayed_rows(
     use &= np.isfinite(white).all(axis=(1, 2))
     index = np.flatnonzero(use)
     body, white, turning = body[index], white[index], turning[index]
-    value, slope, spacing = read.velocity[index], read.slope[index], read.spacing[index]
+    value, slope, spacing = read.velocity[..., index], read.slope[..., index], read.spacing[index]
     uncertain = _Uncertain(turning_noise, noise_dvl, read.slope_gain[index])
     interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)[index]
     # references closer together than the DVL's samples share these
@@ -159,7 +160,7 @@ class _Uncertain(NamedTuple):
 
 
 class _Reading(NamedTuple):
-    """The DVL at J times and every delay: velocity, slope (J, K, 3), and at J times whether all of it is known, how far
+    """The DVL at J times and every delay: velocity, slope (3, K, J), and at J times whether all of it is known, how far
     the DVL's samples are apart, s, and the slope's noise for samples with noise of variance 1."""
 
     velocity: Array
@@ -171,27 +172,31 @@ class _Reading(NamedTuple):
 
 def _read(dvl: DvlColumns, times: Array) -> _Reading:
     """Fits are made every STEP_S, and cubics read between them: on so short a step no worse, a tenth of the work."""
-    first = int(np.floor((times[0] + DELAYS_S[0]) / STEP_S))
-    n = int(np.ceil((times[-1] + DELAYS_S[-1]) / STEP_S)) + 2 - first
-    grid = STEP_S * np.arange(first, first + n)
+    first, last = (int(np.floor(time / STEP_S)) + step for time, step in ((times[0], STEPS[0]), (times[-1], STEPS[-1])))
+    grid = STEP_S * np.arange(first, last + 2)
     spacing = spacing_at(dvl.times, grid)
     reach = reach_at(spacing, LEAST_REACH_S, MOST_REACH_S)
     fit = local_fit(dvl.times, dvl.velocity, grid, reach)
     wide = local_fit(dvl.times, dvl.velocity, grid, np.maximum(reach, LEAST_SLOPE_REACH_S))
-    place = (times / STEP_S - first)[:, None] + DELAYS_S / STEP_S
-    before = np.floor(place).astype(np.intp)
-    part = (place - before)[..., None]
+    steps = times / STEP_S
+    middle = np.floor(steps).astype(np.intp)
+    part = steps - middle  # at every delay, as they are whole steps
+    middle -= first
+    before = middle + STEPS[:, None]
     after = before + 1
     rest = 1.0 - part
-    velocity = (
-        fit.value[before] * (rest * rest * (1.0 + 2.0 * part))
-        + fit.value[after] * (part * part * (1.0 + 2.0 * rest))
-        + (fit.slope[before] * rest - fit.slope[after] * part) * (STEP_S * part * rest)
+    (v0, b0, s0), (v1, b1, s1) = (
+        [column.T.take(at, axis=1) for column in (fit.value, fit.slope, wide.slope)]
+        for at in (before, after)
     )
-    slope = wide.slope[before] * rest + wide.slope[after] * part
+    velocity = (
+        v0 * (rest * rest * (1.0 + 2.0 * part))
+        + v1 * (part * part * (1.0 + 2.0 * rest))
+        + (b0 * rest - b1 * part) * (STEP_S * part * rest)
+    )
+    slope = s0 * rest + s1 * part
     found = fit.found & wide.found
-    known: Mask = np.all(found[before] & found[after], axis=1)
-    middle = before[:, len(DELAYS_S) // 2]
+    known: Mask = (found.take(before) & found.take(after)).all(axis=0)
     return _Reading(velocity, slope, known, spacing[middle], wide.slope_gain[middle])
 
 
@@ -208,26 +213,26 @@ def _rows(
     template: Observations,
     lever_arm: Vector,
 ) -> DelayedRows:
-    n, k = velocity_dvl.shape[:2]
+    k, n = velocity_dvl.shape[1:]
     body_from_dvl = template.rotation_dvl_from_body.T
     lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
     # the same reference beside the DVL at every delay
     each = Observations(
-        velocity_dvl=velocity_dvl.reshape(n * k, 3),
-        reference_body=np.repeat(body, k, axis=0),
-        lever_velocity=None if lever is None else np.repeat(lever, k, axis=0),
+        velocity_dvl=velocity_dvl.transpose(1, 2, 0).reshape(k * n, 3),
+        reference_body=np.tile(body, (k, 1)),
+        lever_velocity=None if lever is None else np.tile(lever, (k, 1)),
         rotation_dvl_from_body=template.rotation_dvl_from_body,
         sway_heave=template.sway_heave,
-        earth_in_body=np.repeat(earth, k, axis=0),
+        earth_in_body=np.tile(earth, (k, 1, 1)),
     )
     z, h_g1 = linearise_g1(each)
     rows = np.empty((k, N_STATE + 1, 3, n))
-    rows[:, :N_G1] = h_g1.reshape(n, k, 3, N_G1).transpose(1, 3, 2, 0)
+    rows[:, :N_G1] = h_g1.reshape(k, n, 3, N_G1).transpose(0, 3, 2, 1)
     rows[:, LEVER_ARM] = -skew(turning).transpose(2, 1, 0)
-    rows[:, DELAY] = (slope @ body_from_dvl.T).transpose(1, 2, 0)
-    rows[:, N_STATE] = z.reshape(n, k, 3).transpose(1, 2, 0)
+    rows[:, DELAY] = np.tensordot(body_from_dvl, slope, 1).swapaxes(0, 1)
+    rows[:, N_STATE] = z.reshape(k, n, 3).swapaxes(1, 2)
     heave = np.zeros((n, k, N_STATE + 1))
-    heave[..., [*range(N_G1), N_STATE]] = g1_heave(each).reshape(n, k, N_G1 + 1)
+    heave[..., [*range(N_G1), N_STATE]] = g1_heave(each).reshape(k, n, N_G1 + 1).swapaxes(0, 1)
     heave[..., BEYOND] = rows[:, BEYOND, 2].transpose(2, 0, 1)
     for i in (2, 1, 0):  # from the last on, as those before go into it
         rows[:, :, i] *= white[:, i, i]
