@@ -175,8 +175,11 @@ def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tupl
         missed = np.concatenate([-found, np.ones((*found.shape[:-1], 1))], axis=-1)
         misfit = np.maximum((missed * product(scatter, missed)).sum(axis=-1), 0.0)
         unsure = (spread * variance[..., None] / (variance[..., None] + share)).sum(axis=-1)
+        before = variance
         variance = (PSEUDO_BLOCKS * motion_std**2 + misfit + unsure) / (PSEUDO_BLOCKS + sums.weight)
         variance = np.maximum(variance, motion_std**2)
+        if (variance == before).all():  # as where nothing heaves
+            break
     left = variance[..., None] / (variance[..., None] + share)
     found = x + product(axes, pull / (variance[..., None] + share))
     return GaussianState(found, (axes * left[..., None, :]) @ np.swapaxes(axes, -1, -2)), variance

@@ -69,7 +69,7 @@ def _share_left(
 
     A delay by which no reference is beside the sample cannot say that it is right.
     """
-    both = np.intersect1d(rows.index, fewer.index)
+    both = rows.index[np.isin(rows.index, fewer.index)]
     if not len(both):
         return 1.0
     before, _ = misfits(rows.part(np.isin(rows.index, both)))

@@ -43,6 +43,7 @@ from .rows import (
     DvlColumns,
     ImuColumns,
     ReferenceColumns,
+    TurnRates,
     attitude_at,
     binned,
     delayed_rows,
@@ -340,10 +341,10 @@ class DelayFilter:
         imu = self._imu(block_ns - MARGIN_NS, end_ns + MARGIN_NS)
         self._compare_coarsely(block_ns, end_ns, dvl, imu)
         from_s, to_s = self._seconds(np.array([block_ns, end_ns])).tolist()
-        binned_dvl = DvlColumns(*binned(*dvl))
+        binned_dvl, turns = DvlColumns(*binned(*dvl)), TurnRates.of(imu)
         rows = None
         if len(dvl.times) >= 6 and len(imu.times) >= 2:
-            rows_of = partial(self._rows, reference=reference, imu=imu, noise_dvl=noise_dvl)
+            rows_of = partial(self._rows, reference=reference, imu=imu, turns=turns, noise_dvl=noise_dvl)
             if _is_slow(dvl.times):
                 good, rows = without_contradicted(dvl, reference.times, rows_of, self._bank.misfits)
                 self._leave_out(slots[~good])
@@ -356,16 +357,19 @@ class DelayFilter:
             return False
         used = self._bank.add(rows, stamps_ns[rows.index], BLOCK_NS * 1e-9)
         self._reference_clock.add(
-            binned_dvl, reference.part(rows.index[used]), imu, noise_dvl, self._bank.likeliest_delay
+            binned_dvl, reference.part(rows.index[used]), imu, turns, noise_dvl, self._bank.likeliest_delay
         )
         return len(rows) > 0
 
-    def _rows(self, dvl: DvlColumns, *, reference: ReferenceColumns, imu: ImuColumns, noise_dvl: Array) -> DelayedRows:
+    def _rows(
+        self, dvl: DvlColumns, *, reference: ReferenceColumns, imu: ImuColumns, turns: TurnRates, noise_dvl: Array
+    ) -> DelayedRows:
         p = self._parameters
         return delayed_rows(
             dvl,
             reference,
             imu,
+            turns,
             noise_dvl=noise_dvl,
             template=self._template,
             lever_arm=self._lever_arm,

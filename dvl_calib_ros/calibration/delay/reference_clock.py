@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..frames import Array, skew
+from ..frames import Array, cross, skew
 from ..parameters import Parameters
 from ..time_blocks import FEWEST, TimeBlocks
 from .local_motion import local_fit, reach_at, spacing_at
@@ -23,6 +23,7 @@ from .rows import (
     DvlColumns,
     ImuColumns,
     ReferenceColumns,
+    TurnRates,
     angular_velocity_at,
     attitude_at,
 )
@@ -112,7 +113,13 @@ class ReferenceClock:
         self._blocks = TimeBlocks()
 
     def add(
-        self, dvl: DvlColumns, reference: ReferenceColumns, imu: ImuColumns, noise_dvl: Array, delay: float
+        self,
+        dvl: DvlColumns,
+        reference: ReferenceColumns,
+        imu: ImuColumns,
+        turns: TurnRates,
+        noise_dvl: Array,
+        delay: float,
     ) -> None:
         """Take a block's references that are no outliers.
 
@@ -137,10 +144,10 @@ class ReferenceClock:
         own = (times - LATE_S[:, None]).ravel()
         shape = len(LATE_S), len(times)
         rotation, oriented = attitude_at(imu, own, self._p.imu_timeout)
-        rates = angular_velocity_at(imu, own, self._p.imu_timeout)[0].reshape(*shape, 3)
+        rates = angular_velocity_at(turns, own, self._p.imu_timeout)[0].reshape(*shape, 3)
         to_body = rotation.swapaxes(1, 2).reshape(*shape, 3, 3)
         to_body = np.where(reference.in_body[:, None, None], np.eye(3), to_body)
-        body = np.matmul(to_body, reference.velocity[..., None])[..., 0] + np.cross(rates, self._p.lever_arm)
+        body = np.matmul(to_body, reference.velocity[..., None])[..., 0] + cross(rates, np.array(self._p.lever_arm))
         known = fit.found.reshape(at.shape).all(axis=0)
         known &= (oriented.reshape(shape) | reference.in_body).all(axis=0) & ~np.isnan(rates).any(axis=(0, 2))
         known &= (measured[1] ** 2).sum(axis=1) >= self._p.min_speed**2

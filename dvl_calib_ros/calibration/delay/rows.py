@@ -7,7 +7,7 @@ at s + τ, where it is 20 times less noisy than GNSS. So hypotheses of τ are to
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -78,6 +78,22 @@ class ImuColumns(NamedTuple):
     angular_velocity: Array
 
 
+class TurnRates(NamedTuple):
+    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body; variance (3,) of
+    its noise."""
+
+    times: Array
+    rates: Array
+    variance: Array
+
+    @staticmethod
+    def of(imu: ImuColumns) -> TurnRates:
+        """Those of an IMU."""
+        known = ~np.isnan(imu.angular_velocity).any(axis=1)
+        times, rates = binned(imu.times[known], imu.angular_velocity[known])
+        return TurnRates(times, rates, _noise_of(times, rates))
+
+
 @dataclass(frozen=True)
 class DelayedRows:
     """J reference samples, each compared at K delays.
@@ -100,13 +116,16 @@ class DelayedRows:
 
     def part(self, at: Mask) -> DelayedRows:
         """Those of some references."""
-        return DelayedRows(*(getattr(self, each.name)[at] for each in fields(self)))
+        return DelayedRows(
+            self.index[at], self.white[..., at], self.weight[at], self.heave[at], self.regressor_noise[at]
+        )
 
 
 def delayed_rows(
     dvl: DvlColumns,
     reference: ReferenceColumns,
     imu: ImuColumns,
+    turns: TurnRates,
     *,
     noise_dvl: Array,
     template: Observations,
@@ -122,7 +141,7 @@ def delayed_rows(
     parameters. imu_gap_s: longest gap that is interpolated across.
     """
     times = reference.times
-    turning, turning_noise = angular_velocity_at(imu, times, imu_gap_s)
+    turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s)
     seen = _in_body(reference, imu, imu_gap_s)
     body, noise, earth = seen.velocity, seen.noise, seen.earth_in_body
     moving = (body**2).sum(axis=1) >= min_speed**2
@@ -186,8 +205,7 @@ def _read(dvl: DvlColumns, times: Array) -> _Reading:
     after = before + 1
     rest = 1.0 - part
     (v0, b0, s0), (v1, b1, s1) = (
-        [column.T.take(at, axis=1) for column in (fit.value, fit.slope, wide.slope)]
-        for at in (before, after)
+        [column.T.take(at, axis=1) for column in (fit.value, fit.slope, wide.slope)] for at in (before, after)
     )
     velocity = (
         v0 * (rest * rest * (1.0 + 2.0 * part))
@@ -256,12 +274,11 @@ def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     )
 
 
-def angular_velocity_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Array]:
+def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> tuple[Array, Array]:
     """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (3,)."""
-    known = ~np.isnan(imu.angular_velocity).any(axis=1)
-    if np.count_nonzero(known) < 2:
+    stamps, rates, variance = turns
+    if len(stamps) < 2:
         return np.full((len(times), 3), np.nan), np.zeros(3)
-    stamps, rates = binned(imu.times[known], imu.angular_velocity[known])
     interpolated = np.column_stack([np.interp(times, stamps, column) for column in rates.T])
     reach = reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S)
     smooth = local_fit(stamps, rates, times, reach)
@@ -269,7 +286,7 @@ def angular_velocity_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Ar
     outside = (times < stamps[0]) | (times > stamps[-1]) | (stamps[after] - stamps[after - 1] > gap_s)
     value = np.where(smooth.found[:, None], smooth.value, interpolated)
     value[outside] = np.nan
-    return value, _noise_of(stamps, rates) * float(np.nanmean(smooth.value_gain)) if smooth.found.any() else np.zeros(3)
+    return value, variance * float(np.nanmean(smooth.value_gain)) if smooth.found.any() else np.zeros(3)
 
 
 def _noise_of(times: Array, values: Array) -> Array:
