@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
             discovery.topics,
             on_progress,
             merge=arguments.merge,
-            with_history=write_report is not None,
+            with_history=arguments.report is not None,
         )
     result = replayed.result
 
