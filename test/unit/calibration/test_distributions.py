@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from dvl_calib_ros.calibration import chi_square, distributions
-from dvl_calib_ros.calibration.robust import robust_std
+from dvl_calib_ros.calibration.robust import median, robust_std
 
 TAILS = (1e-12, 1e-4, 0.01, 0.3, 0.5, 0.9, 0.9999)
 
@@ -37,6 +37,12 @@ def test_distributions_of_arrays_are_those_of_scipy(rng):
     scatter = stats.median_abs_deviation(values, axis=0, scale="normal")
     assert robust_std(values) == pytest.approx(scatter)
     assert np.isnan(robust_std(values[:0])).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 8])
+def test_the_median_is_numpys_to_the_last_bit(rng, n):
+    values = rng.normal(size=(n, 3))
+    assert median(values).tolist() == np.median(values, axis=0).tolist()
 
 
 @pytest.mark.parametrize(("count", "n", "p"), [(0, 9, 0.1), (3, 10, 0.2), (40, 3000, 1e-3), (7, 7, 0.5)])
