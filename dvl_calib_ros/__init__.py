@@ -6,8 +6,8 @@ give. It is imported when it is asked for, since the command line must not wait 
 
 import sys as _sys
 from pathlib import Path as _Path
-from typing import TYPE_CHECKING
 
+TYPE_CHECKING = False  # as in typing, which takes longer than all else here
 if TYPE_CHECKING:
     from .api import (
         Calibration,

@@ -1,141 +1,26 @@
-"""Entry point of ``dvl-calib``."""
+"""Entry point of ``dvl-calib``. What takes long to import is imported below, where an interrupt is looked after."""
 
 from __future__ import annotations
 
-import argparse
-import io
-import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import NoReturn
 
-from .. import __version__
-from ..streams import give_up, open_streams, say
-from .commands import COMMANDS
-
-
-class _Formatter(argparse.RawDescriptionHelpFormatter):
-    """Folds the paragraphs of a description to the terminal's width; a command to copy stays in one line."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        import textwrap
-
-        paragraphs = text.split("\n\n")
-        return "\n\n".join(
-            each if each.startswith("example:") else textwrap.fill(" ".join(each.split()), width) for each in paragraphs
-        )
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say in one line what is wrong with the usage."""
-        from ..errors import printable
-
-        self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
-
-
-def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser with all commands; only the one that is called is imported and gets its arguments."""
-    parser = _Parser(
-        prog="dvl-calib",
-        description="Calibrate a Doppler velocity log (DVL): live on ROS 2, or over recorded bags.",
-        epilog="example: dvl-calib replay my_bag --models all",
-    )
-    parser.add_argument("--version", action="version", version=f"dvl-calib {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
-    for command in COMMANDS:
-        of_it = commands.add_parser(
-            command.name, help=command.help, epilog=f"example: {command.example}", formatter_class=_Formatter
-        )
-        if command.name in argv:
-            module = command.load()
-            of_it.description = (module.__doc__ or "").strip()
-            of_it.set_defaults(run=module.run)
-            module.add_arguments(of_it)
-    return parser
+TYPE_CHECKING = False  # as in typing, which takes longer than all else here
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; 0 on success, 2 on bad usage or bad input, said in one line on standard error."""
-    if "_ARGCOMPLETE" in os.environ:
-        _complete()
-    open_streams()
-    # our matrices are small: more threads of BLAS only wait for each other (2.5 times the CPU in a diagnosis). Before
-    # numpy is imported, which commands do when they are called
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     argv = sys.argv[1:] if argv is None else argv
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show φ must not end the run
-            stream.reconfigure(errors="replace")
     try:
-        with _terminated_as_interrupted():
-            return _run(argv)
+        from .command_line import run
+
+        return run(argv)
     except KeyboardInterrupt:
+        from ..streams import say
+
         say(f"dvl-calib {next((word for word in argv if not word.startswith('-')), '')}: interrupted")
         return 130
-    except ModuleNotFoundError as error:  # where the package was built by colcon, which installs no other
-        name = (error.name or "").partition(".")[0]
-        if name in ("", __name__.partition(".")[0]):
-            raise
-        called = next(command.name for command in COMMANDS if command.name in argv)
-        return _fail(called, f"needs the Python package {name}, which is not installed; pip install {name}")
-
-
-@contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a command as Ctrl-C does: what is half written goes."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            if signal.getsignal(number) is signal.default_int_handler:  # not if the node, which ends, ignores it now
-                signal.signal(number, handler)
-
-
-def _run(argv: Sequence[str]) -> int:
-    arguments = build_parser(argv).parse_args(argv)
-    from ..calibration.parameters import ParameterError
-    from ..errors import InputError
-
-    try:
-        code = int(arguments.run(arguments) or 0)
-        sys.stdout.flush()
-        return code
-    except (InputError, ParameterError) as error:
-        return _fail(arguments.command, str(error))
-    except BrokenPipeError:  # | head
-        give_up(sys.stdout)
-        return 0
-    except OSError as error:
-        give_up(sys.stdout)  # if that is what cannot be written
-        name = "" if error.filename is None else f"{error.filename}: "
-        return _fail(arguments.command, f"{name}{error.strerror or error}; check names, permissions and space")
-
-
-def _complete() -> NoReturn:
-    """Answer the shell, which asks what the line that is being typed may go on with, and end."""
-    import argcomplete
-
-    argcomplete.autocomplete(build_parser(os.environ.get("COMP_LINE", "").split()))
-    sys.exit(1)  # not reached: it ends the process itself
-
-
-def _fail(command: str, message: str) -> int:
-    from ..errors import printable
-
-    try:
-        sys.stdout.flush()  # what was printed before, which the interpreter could only complain of
-    except OSError:
-        give_up(sys.stdout)
-    say(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}")
-    return 2
 
 
 if __name__ == "__main__":

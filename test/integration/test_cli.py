@@ -64,6 +64,30 @@ def test_every_command_has_help_with_an_example(capsys, command):
     assert f"example: dvl-calib {command or ''}".strip() in capsys.readouterr().out
 
 
+PARTS = ("", ".streams", ".cli", ".cli.main", ".cli.command_line", ".cli.commands")
+
+
+@pytest.mark.parametrize("at", ["argparse", *(f"dvl_calib_ros{part}" for part in PARTS[1:] if part not in PARTS[2:4])])
+def test_an_interrupt_while_the_first_modules_are_imported_is_one_line(at):
+    interrupting = f"""import sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name == {at!r}:
+            sys.meta_path.remove(self)
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Finder())
+from dvl_calib_ros.cli.main import main
+sys.exit(main(["replay", "bag"]))"""
+    done = subprocess.run([sys.executable, "-c", interrupting], capture_output=True, text=True, cwd=ROOT)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "dvl-calib replay: interrupted\n")
+
+
+@pytest.mark.parametrize("words", [("replay", ""), ("doctor", "bag", "--json", ""), ("", "bag")])
+def test_an_empty_argument_is_not_taken_for_the_folder_that_this_runs_in(capsys, monkeypatch, words):
+    monkeypatch.chdir(ROOT / "bags" / "straight_leg")  # a bag
+    assert "an argument is empty" in fail(capsys, *words)
+
+
 def test_the_help_comes_at_once_since_it_imports_next_to_nothing():
     """Of ours the entry and the table of commands, and of others the standard library: what else there is, a bare
     interpreter has as well (an editable install brings some).
@@ -76,7 +100,7 @@ def test_the_help_comes_at_once_since_it_imports_next_to_nothing():
         if (done := subprocess.run([sys.executable, "-c", f"import sys\n{script}"], capture_output=True, text=True))
     )
     imported = {name for name in helped - bare if name.partition(".")[0] not in sys.stdlib_module_names}
-    assert imported == {f"dvl_calib_ros{part}" for part in ("", ".streams", ".cli", ".cli.main", ".cli.commands")}
+    assert imported == {f"dvl_calib_ros{part}" for part in PARTS}
     slow = {"subprocess", "tempfile", "json", "asyncio", "inspect", "dataclasses", "importlib.metadata"}
     assert not slow & (helped - bare)
 

@@ -18,6 +18,7 @@ from conftest import ROOT
 from io_fixtures import run, write_bag
 
 from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.cli import common
 from dvl_calib_ros.cli.main import main
 
 PATIENCE_S = 60.0
@@ -161,6 +162,50 @@ def test_a_full_disk_is_said_in_one_line_also_when_nobody_reads_the_answer(bag, 
     done = shell("> >(true)", "replay", bag, "--json", tmp_path / "o.json", before="ulimit -f 1; trap '' XFSZ;")
     assert done.returncode == 2 and done.stderr.splitlines()[-1].endswith("name a file on another disk")
     assert "Exception ignored" not in done.stderr and os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "words", [("doctor", "b"), ("replay", "BAG", "--json", "o.json"), ("simulate", "new"), ("apply", "r.yaml")]
+)
+def test_that_the_folder_it_was_started_in_is_gone_is_said(bag, tmp_path, monkeypatch, capsys, words):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    error = fail(capsys, *(bag if word == "BAG" else word for word in words))
+    assert error.endswith("the folder that this was started in is gone, change to another\n")
+
+
+@pytest.mark.parametrize(
+    ("what", "storage"), [("grows", "mcap"), ("grows", "sqlite3"), ("replaced", "mcap"), ("journal", "sqlite3")]
+)
+def test_a_recording_that_changes_while_it_is_read_is_said(tmp_path, monkeypatch, capsys, storage, what):
+    """Discovery read one bag, the calibration another: the answer looked as usable as any."""
+    for name, turned in (("a", 0.0), ("b", 4.0)):
+        options = ["--duration", "30", "--misalignment", "0", "0", str(turned), "--storage", storage]
+        assert main(["simulate", str(tmp_path / name), *options]) == 0
+    file, other = (next(path for path in (tmp_path / name).iterdir() if path.suffix != ".yaml") for name in "ab")
+    assert main(["replay", str(tmp_path / "a")]) == 0
+    assert "changed while" not in capsys.readouterr().err
+    found = common.discovered
+
+    def meanwhile(*given):
+        discovery = found(*given)
+        if what == "grows":
+            with file.open("ab") as written:
+                written.write(bytes(100))
+        elif what == "replaced":
+            other.replace(file)
+        else:
+            os.utime(journal)
+        return discovery
+
+    journal = file.with_name(f"{file.name}-wal")
+    if what == "journal":
+        journal.touch()
+        os.utime(journal, (0, 0))
+    monkeypatch.setattr(common, "discovered", meanwhile)
+    assert main(["replay", str(file if what == "journal" else tmp_path / "a")]) == 0
+    assert capsys.readouterr().err.count("changed while it was read") == 1
 
 
 @pytest.mark.parametrize("place", ["/proc/new", "T.csv/new", "T.csv/new/deeper"])

@@ -16,8 +16,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from io_fixtures import replayed, run, selected_alone, write_bag
 
+from dvl_calib_ros.cli.command_line import build_parser
 from dvl_calib_ros.cli.commands import COMMANDS
-from dvl_calib_ros.cli.main import build_parser, main
+from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.urdf import numbers
 
 
