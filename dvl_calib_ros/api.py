@@ -286,8 +286,9 @@ def compare(*results: StrPath | Calibration) -> Comparison:
     Raises
     ------
     InputError
-        For what is no result file, holds no sample, or has nothing in common with the others.
+        For what is no result file, holds no sample, is one of the others, or has nothing in common with them.
     """
+    from .calibration.comparison import check_distinct
     from .calibration.comparison import compare as run
     from .files.extrinsics import load_extrinsics
     from .replay.replay import extrinsics_of_replay
@@ -302,6 +303,7 @@ def compare(*results: StrPath | Calibration) -> Comparison:
         if extrinsics is None:
             raise InputError(f"{name}: no sample of it could be used to calibrate; leave it out")
         found.append(extrinsics)
+    check_distinct(found)
     return run(found)
 
 

@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,6 +126,16 @@ class Comparison:
     def same_mounting(self) -> bool:
         """Whether the mounting did not move, as far as σ can tell."""
         return not self.moved
+
+
+def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
+    """Raise InputError if two are one calibration by two names, which would confirm itself."""
+    for one, other in combinations(calibrations, 2):
+        of_one, of_other = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
+        if of_one == of_other and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
+            raise InputError(
+                f"{one.name}, {other.name}: are one calibration by two names, which cannot be compared with itself"
+            )
 
 
 def compare(calibrations: Sequence[Extrinsics]) -> Comparison:

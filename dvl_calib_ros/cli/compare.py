@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print."""
-    from ..calibration.comparison import compare, comparison_document
+    from ..calibration.comparison import check_distinct, compare, comparison_document
     from ..errors import InputError
 
     paths: list[Path] = arguments.results
@@ -54,7 +54,9 @@ def run(arguments: argparse.Namespace) -> int:
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments, "write_comparison_report")
     names = _names(paths)
-    comparison = compare([_loaded(arguments, path, name) for path, name in zip(paths, names, strict=True)])
+    calibrations = [_loaded(arguments, path, name) for path, name in zip(paths, names, strict=True)]
+    check_distinct(calibrations)
+    comparison = compare(calibrations)
     try:
         common.deliver(
             lambda: _print(comparison),

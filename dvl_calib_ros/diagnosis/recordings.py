@@ -223,9 +223,21 @@ def load_recordings(
             on_progress((index + share) / len(paths))
 
         recording, own = _load(name, path, parameters, topics, progress)
+        for other, its_path in zip(recordings, paths, strict=False):
+            if _holds_much_of(recording, other):
+                raise InputError(f"{its_path}, {path}: hold the same samples, so neither is held out; name one of them")
         recordings.append(recording)
         notes += own if len(paths) == 1 else [f"{path}: {note}" for note in own]
     return Loaded(tuple(recordings), tuple(notes))
+
+
+def _holds_much_of(one: Recording, other: Recording) -> bool:
+    """Whether half of the DVL's samples of one of them are in the other, too."""
+    if one.first_ns != other.first_ns:
+        return False
+    _, own, its = np.intersect1d(one.dvl.time, other.dvl.time, assume_unique=True, return_indices=True)
+    shared = np.count_nonzero((one.dvl.values[own] == other.dvl.values[its]).all(axis=1))
+    return bool(2 * shared > min(len(one.dvl.time), len(other.dvl.time)))
 
 
 def recording_names(paths: Sequence[Path]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,9 @@ def cross_check(
                 for name in set(other.delayed) & set(models):
                     terms = other.delayed[name]
                     corrected[calibrated, models.index(name), verified] = _delayed_rmse(each, terms, parameters)
+    for first, second in combinations(range(len(bags)), 2):
+        if found[first].n_paired == found[second].n_paired and 0.0 < uncorrected[first] == uncorrected[second]:
+            raise InputError(f"{bags[first]}, {bags[second]}: are one bag by two names; name others to check it on")
     return CrossCheck(
         bags=tuple(map(str, bags)),
         models=tuple(models),

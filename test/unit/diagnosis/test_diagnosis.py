@@ -493,6 +493,13 @@ def test_the_answer_comes_first_in_one_sentence(bag_with_lever_arm, capsys):
     assert "lever_arm" in output.splitlines()[0] and output.splitlines()[0].endswith(".")
 
 
+def test_a_recording_is_not_held_out_from_its_own_copy_also_where_that_is_cut_off(bag_with_lever_arm, tmp_path):
+    content = next(bag_with_lever_arm.glob("*.mcap")).read_bytes()
+    (tmp_path / "copy.mcap").write_bytes(content[: 3 * len(content) // 4])
+    with pytest.raises(InputError, match=r"copy\.mcap: hold the same samples"):
+        load_recordings([bag_with_lever_arm, tmp_path / "copy.mcap"], Parameters(), Topics())
+
+
 def test_a_bag_without_reference_is_refused(tmp_path, capsys):
     bag = tmp_path / "bag"
     succeed(capsys, "simulate", bag, "--duration", "60", "--gnss-rate", "0")

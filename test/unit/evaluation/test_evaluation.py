@@ -439,6 +439,12 @@ def test_bags_are_checked_against_each_other(two_bags, tmp_path, capsys):
         assert corrected[verified] < 0.05 < 0.08 < document["uncorrected"][verified]
 
 
+def test_a_bag_by_two_names_is_not_checked_against_itself(two_bags, tmp_path, capsys):
+    (tmp_path / "link").symlink_to(Path(two_bags[0]).resolve())
+    assert main(["evaluate", two_bags[0], str(tmp_path / "link"), "--models", "M3"]) == 2
+    assert "are one bag by two names" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("take", "said"), [(lambda b: b[:1], "one bag cannot be checked"), (lambda b: b[:1] * 2, "a bag is named twice")]
 )
