@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 State = tuple[int, int, int]
 """Of a file: which it is, its size, and when it was last written."""
@@ -22,7 +21,7 @@ _SUFFIXES = (".mcap", ".db3", ".db3-wal", ".db3-journal", ".zstd")
 def recordings_now(arguments: argparse.Namespace) -> dict[Path, State]:
     """Files of recordings that a command's arguments lead to, as they are now."""
     files: dict[Path, State] = {}
-    for path in _paths(vars(arguments).values()):
+    for path in paths_in(arguments):
         with suppress(OSError, ValueError):  # what cannot be read is for the command to say
             for file in _files(path):
                 status = file.stat()
@@ -40,8 +39,9 @@ def changed(before: Mapping[Path, State], after: Mapping[Path, State]) -> list[s
     ]
 
 
-def _paths(values: Iterable[Any]) -> Iterator[Path]:
-    for value in values:
+def paths_in(arguments: argparse.Namespace) -> Iterator[Path]:
+    """Every path that a command's arguments name."""
+    for value in vars(arguments).values():
         for each in value if isinstance(value, list) else [value]:
             if isinstance(each, Path):
                 yield each

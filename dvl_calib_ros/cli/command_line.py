@@ -96,16 +96,15 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 def _run(argv: Sequence[str]) -> int:
-    parser = build_parser(argv)
-    if "" in argv:  # a path would be taken for the folder that this runs in
-        parser.error("an argument is empty; is a variable of the shell not set?")
-    arguments = parser.parse_args(argv)
+    arguments = build_parser(argv).parse_args(argv)
     from ..calibration.parameters import ParameterError
     from ..errors import InputError, printable
-    from .changed import changed, recordings_now
+    from .changed import changed, paths_in, recordings_now
 
     recordings = recordings_now(arguments)
     try:
+        if "" in argv and any(str(path) == "." for path in paths_in(arguments)):  # pathlib takes one for the other
+            raise InputError("the name of a file or folder is empty; is a variable of the shell not set?")
         code = int(arguments.run(arguments) or 0)
         sys.stdout.flush()
         for sentence in changed(recordings, recordings_now(arguments)):

@@ -82,10 +82,10 @@ sys.exit(main(["replay", "bag"]))"""
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "dvl-calib replay: interrupted\n")
 
 
-@pytest.mark.parametrize("words", [("replay", ""), ("doctor", "bag", "--json", ""), ("", "bag")])
+@pytest.mark.parametrize("words", [("replay", ""), ("doctor", "bag", "--json", ""), ("apply", "")])
 def test_an_empty_argument_is_not_taken_for_the_folder_that_this_runs_in(capsys, monkeypatch, words):
     monkeypatch.chdir(ROOT / "bags" / "straight_leg")  # a bag
-    assert "an argument is empty" in fail(capsys, *words)
+    assert "the name of a file or folder is empty" in fail(capsys, *words)
 
 
 def test_the_help_comes_at_once_since_it_imports_next_to_nothing():
