@@ -259,7 +259,7 @@ def test_names_that_are_one_on_other_file_systems_are_not_written_both(scratch, 
     for name in ("a", "A"):
         (folder / name).mkdir()
     before = snapshot(folder)
-    words = ["compare", "result.yaml", "bag", "--json", one, "--report", other]
+    words = ["replay", "bag", "--json", one, "--save", other]
     if one == "a/x":  # other folders, other names
         assert main(words) == 0
         return
