@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..bags.reader import BagReader
+from ..calibration.coarse_mounting import DELAYS_S
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.samples import VelocityFrame
@@ -101,6 +102,17 @@ def discover(paths: Sequence[Path], parameters: Parameters, given: Given | None 
     return _Search(seen, parameters, given or Given(), where).run()
 
 
+def _in_time_of(dvl: Look, other: Look | None) -> Look | None:
+    """By stamps as the DVL's clock would have them, where clocks differ by more than any delay that is looked for.
+
+    Velocities of different times agree in any frame but the right one; what it says of the clocks the replay says.
+    """
+    ahead_s = 0.0 if other is None else other.ahead_s - dvl.ahead_s
+    if other is None or abs(ahead_s) <= DELAYS_S[-1]:
+        return other
+    return replace(other, stamps_s=other.stamps_s - ahead_s)
+
+
 class _Search:
     """One search; what it finds is collected on the way."""
 
@@ -119,7 +131,7 @@ class _Search:
         looks = self._seen.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
         if dvl is not None:
-            self._frames(dvl, reference, imu)
+            self._frames(dvl, _in_time_of(dvl, reference), _in_time_of(dvl, imu))
         self._found.insert(0, self._topics_said(topics))
         return Discovery(
             topics,

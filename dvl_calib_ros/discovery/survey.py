@@ -44,8 +44,9 @@ class Look:
 
     count: messages in the recording. rate_hz: over the whole of it, 0 if that is an instant. frame_id: of the velocity
     or of the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the
-    log where it is zero. values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular
-    velocity rad/s and acceleration m/s², nan where not given.
+    log where it is zero. ahead_s: by how much they are ahead of the log, in the median. values: velocity (N, 3) m/s, as
+    in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
+    given.
     """
 
     topic: str
@@ -54,6 +55,7 @@ class Look:
     rate_hz: float
     frame_id: str
     stamps_s: Array
+    ahead_s: float
     values: Array
 
     @property
@@ -169,7 +171,7 @@ def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, p
             rows.append(_row_of_message(*each, msgtype))
     if not rows:
         return None
-    arrival, stamps_ns, values = (np.concatenate(column) for column in list(zip(*rows, strict=True))[:3])
+    arrival, log_ns, stamps_ns, values = (np.concatenate(column) for column in list(zip(*rows, strict=True))[:4])
     names = sorted((int(each.arrival[0]), each.frame_id) for each in rows if each.frame_id)
     if msgtype == IMU_TYPE:
         for number, at in enumerate((slice(0, 4), slice(4, 7), slice(7, 10))):
@@ -182,7 +184,8 @@ def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, p
     order = np.lexsort((arrival, stamps_ns))
     order = order[whole[order]]
     frame_id = names[0][1] if names else ""
-    return Look(topic, msgtype, count, rate_hz, frame_id, 1e-9 * (stamps_ns[order] - start_ns), values[order])
+    stamps_s, ahead_s = 1e-9 * (stamps_ns[order] - start_ns), 1e-9 * float(np.median(stamps_ns - log_ns))
+    return Look(topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[order])
 
 
 _Message = tuple[int, int, Any]
@@ -190,9 +193,10 @@ _Message = tuple[int, int, Any]
 
 
 class _Rows(NamedTuple):
-    """N messages. arrival: (N,) their places. stamps_ns: (N,). numbers: (N, k). frame_id: of the first."""
+    """N messages. arrival: (N,) their places. log_ns, stamps_ns: (N,). numbers: (N, k). frame_id: of the first."""
 
     arrival: Stamps
+    log_ns: Stamps
     stamps_ns: Stamps
     numbers: Array
     frame_id: str
@@ -206,14 +210,14 @@ def _rows_of_columns(part: Part, msgtype: str) -> _Rows:
     stamps_ns = columns.header.stamp.sec.astype(np.int64) * 1_000_000_000 + columns.header.stamp.nanosec
     name = _frame_id(msgtype, columns)[0].tobytes().decode("ascii")
     numbers = np.column_stack(_numbers(msgtype, columns)).astype(float)
-    return _Rows(part.arrival, np.where(stamps_ns == 0, part.log_ns, stamps_ns), numbers, name)
+    return _Rows(part.arrival, part.log_ns, np.where(stamps_ns == 0, part.log_ns, stamps_ns), numbers, name)
 
 
 def _row_of_message(arrival: int, log_ns: int, message: Any, msgtype: str) -> _Rows:
     """Raises what is `UNREADABLE`."""
     numbers = np.array([_numbers(msgtype, message)], dtype=float)
     stamp = stamp_ns(message.header.stamp) or log_ns
-    return _Rows(np.array([arrival]), np.array([stamp]), numbers, str(_frame_id(msgtype, message)))
+    return _Rows(*np.array([[arrival], [log_ns], [stamp]]), numbers, str(_frame_id(msgtype, message)))
 
 
 def _differences(messages: list[_Message]) -> list[_Message]:

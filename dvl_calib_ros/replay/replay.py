@@ -34,6 +34,7 @@ from ..files.result_file import days_document, estimate_document, load_initial_c
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
+from .clocks import StreamClocks
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 
@@ -133,7 +134,7 @@ def replay(
             recordings_ns=_between(bag),
         )
         decoder = MessageDecoder(calibrator.parameters)
-        _feed_all(bag, chosen, decoder, calibrator, on_progress)
+        clocks = _feed_all(bag, chosen, decoder, calibrator, on_progress)
         calibrator.finish()
         on_finished(calibrator)
         found += decoder.problems.values()
@@ -142,12 +143,12 @@ def replay(
     found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
-    said = objections(navigation)
+    of_drift, of_clocks = objections(navigation), clocks.objections(parameters)
     return Replayed(
         replace(
             result,
             verifications={
-                name: verification.with_objections(said) if name == result.selected else verification
+                name: verification.with_objections([*of_clocks, *(of_drift if name == result.selected else [])])
                 for name, verification in result.verifications.items()
             },
         ),
@@ -259,13 +260,16 @@ def _feed_all(
     decoder: MessageDecoder,
     calibrator: Calibrator,
     on_progress: Callable[[float], None],
-) -> None:
+) -> StreamClocks:
     start_ns, end_ns = bag.span_ns
+    clocks = StreamClocks()
     streams = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     for stretch in sample_streams(bag, streams, decoder):
         calibrator.feed(stretch.streams)
+        clocks.add(stretch.streams)
         on_progress((stretch.log_ns - start_ns) / max(end_ns - start_ns, 1))
     on_progress(1.0)
+    return clocks
 
 
 def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
