@@ -217,7 +217,8 @@ def _row_of_message(arrival: int, log_ns: int, message: Any, msgtype: str) -> _R
     """Raises what is `UNREADABLE`."""
     numbers = np.array([_numbers(msgtype, message)], dtype=float)
     stamp = stamp_ns(message.header.stamp) or log_ns
-    return _Rows(*np.array([[arrival], [log_ns], [stamp]]), numbers, str(_frame_id(msgtype, message)))
+    place, logged, stamped = np.array([[arrival], [log_ns], [stamp]])
+    return _Rows(place, logged, stamped, numbers, str(_frame_id(msgtype, message)))
 
 
 def _differences(messages: list[_Message]) -> list[_Message]:
