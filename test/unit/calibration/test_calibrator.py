@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
+from dvl_calib_ros.calibration import bank
 from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS, Needs
@@ -727,6 +729,33 @@ def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_
     np.testing.assert_array_equal(calibrator.state("M1").x, before.x)
     feed(calibrator, samples[1000:])
     assert calibrator.estimate("M1").used > used
+    check_finite(calibrator)
+
+
+@pytest.mark.parametrize(
+    "poison",
+    [lambda x, p: (np.nan * x, p), lambda x, p: (x, np.inf * p), lambda x, p: (x, -p)],
+    ids=["no number", "no bound", "variances below zero"],
+)
+def test_a_state_that_no_solver_objects_to_and_is_none_is_not_gone_on_from(poison, monkeypatch):
+    samples = make_samples(NOISY)
+    calibrator = calibrate(samples[:900])
+    before = {name: calibrator.state(name).x for name in ("M1", "G1")}
+    filtered = bank._filtered
+
+    def poisoned(*given):
+        after = filtered(*given)
+        x, p = poison(after.x, after.p)
+        return replace(after, x=x, p=p)
+
+    monkeypatch.setattr(bank, "_filtered", poisoned)
+    feed(calibrator, samples[900:1000])
+    for name, x in before.items():
+        np.testing.assert_array_equal(calibrator.state(name).x, x)
+        assert calibrator.counts["calibration"][f"{name} restarted"] > 0
+    monkeypatch.undo()
+    feed(calibrator, samples[1000:])
+    assert np.abs(calibrator.state("M1").x - before["M1"]).max() > 0.0
     check_finite(calibrator)
 
 
