@@ -27,8 +27,9 @@ class StreamClocks:
         dvl = _read(streams.dvl)
         for stream, block in ((Stream.REFERENCE, streams.reference), (Stream.IMU, streams.imu)):
             other = _read(block)
+            other = other.part(other.arrival > dvl.arrival[0]) if len(dvl) else other.part(slice(0))
             before = np.searchsorted(dvl.arrival, other.arrival) - 1
-            self._ahead_ns[stream].append((other.stamps_ns - dvl.stamps_ns[before])[before >= 0])
+            self._ahead_ns[stream].append(other.stamps_ns - dvl.stamps_ns[before])
 
     def objections(self, parameters: Parameters) -> list[tuple[Word, str]]:
         """What clocks that differ by more than any model looks for say against every calibration."""

@@ -35,8 +35,8 @@ def words(text: str) -> Counter[str]:
 def folder(tmp_path_factory):
     """Two bags, and the result of the first."""
     folder = tmp_path_factory.mktemp("narrow")
-    for name in ("one", "two"):
-        write_bag(folder / name, run(15.0))
+    for name, seconds in (("one", 15.0), ("two", 16.0)):
+        write_bag(folder / name, run(seconds))
     document = result_document(replayed(folder / "one").result)
     (folder / "result.yaml").write_text(result_text(document))
     return folder
