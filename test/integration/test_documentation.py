@@ -28,8 +28,10 @@ def workplace(tmp_path_factory) -> Path:
     """A folder with all that the pages speak of, under the names that they use."""
     place = tmp_path_factory.mktemp("documentation")
     short = ("--trajectory", "box", "--duration", "120", "--gnss-std", "0.05", "--seed", "1")
-    for name in ("my_bag", "recorded_bag"):
-        shutil.copytree(ROOT / "bags" / "harbour_box", place / name)
+    shutil.copytree(ROOT / "bags" / "harbour_box", place / "recorded_bag")
+    # the same vehicle on another day, as bags/README.md has it
+    vehicle = ("--misalignment", "1", "-1.5", "3", "--scale", "0.5", "--gnss-std", "0.03", "--seed", "5")
+    assert main(["simulate", str(place / "my_bag"), "--trajectory", "box", "--duration", "300", *vehicle]) == 0
     assert main(["simulate", str(place / "monday"), *short]) == 0
     assert main(["simulate", str(place / "simulator_bag"), *short, "--trajectory", "lawnmower"]) == 0
     shutil.copy(next((ROOT / "bags" / "harbour_box").glob("*.mcap")), place / "tuesday.mcap")
