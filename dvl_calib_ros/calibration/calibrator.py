@@ -476,7 +476,8 @@ class Calibrator:
             counts,
             suggestion,
             self._delay.reference_claims,
-            "" if (source is None and self._delay.claims) or not model.aided else self._delay.lever_arm_turns,
+            self._delay.lever_arm_turns if model.aided else "",
+            source is None,
         )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:

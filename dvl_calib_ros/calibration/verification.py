@@ -134,6 +134,7 @@ def verify(
     suggestion: str = "",
     reference_claims: bool = True,
     lever_arm_turns: str = "",
+    finds_lever_arm: bool = False,
 ) -> Verification:
     """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
 
@@ -147,12 +148,13 @@ def verify(
     used_and_gated: How many samples it used, and threw out; None where that is not known.
     suggestion: What configuration would fit, in words, if the one given does not.
     reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
-    lever_arm_turns: What a lever arm that the model takes as known does to an angle, in words, if it matters.
+    lever_arm_turns: How much of an angle is the lever arm's, in words, if the motion does not tell them apart.
+    finds_lever_arm: Whether it is in σ of the angles, and not taken as known.
 
     """
     findings = [
         *use_findings(used_and_gated),
-        *_lever_arm_findings(lever_arm_turns, parameters),
+        *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
         *([(Word.REJECT, f"{suggestion}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
@@ -181,11 +183,13 @@ def use_findings(used_and_gated: tuple[int, int] | None) -> list[Finding]:
     return []
 
 
-def _lever_arm_findings(turns: str, parameters: Parameters) -> list[Finding]:
+def _lever_arm_findings(turns: str, is_found: bool, parameters: Parameters) -> list[Finding]:
     if not turns:
         return []
-    known = f"the lever arm is known to ±{parameters.initial_std_lever_arm:.2g} m (initial_std_lever_arm)"
-    remedy = "give lever_arm and how well it is measured, or go straight and turn both ways"
+    remedy = "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways"
+    if is_found:
+        return [(Word.MARGINAL, f"the lever arm is not shown well, and {turns}: {remedy}")]
+    known = f"the lever arm is known to ±{parameters.initial_std_lever_arm:.2g} m"
     return [(Word.REJECT, f"{known}, and {turns}: {remedy}")]
 
 

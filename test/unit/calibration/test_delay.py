@@ -135,8 +135,10 @@ def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_w
 
 
 def test_on_a_circle_at_changing_speed_auto_takes_the_model_whose_sigma_knows_of_the_lever_arm():
-    calibrator = calibrate(straight(yaw_rate=0.15, changing=0.03), NOISE)
+    calibrator = calibrate(straight(yaw_rate=0.15, changing=0.03), NOISE, verified=True)
     assert calibrator.selected == "G2"
+    verification = calibrator.verification("G2")
+    assert verification.verdict is not Word.ACCEPT and any(ON_A_CIRCLE in reason for reason in verification.reasons)
     assert f"G1 takes the lever arm as known, and {ON_A_CIRCLE}" in calibrator.result().selected_because
     g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
     assert abs(g1.state[2]) > 20.0 * g1.std[2]
