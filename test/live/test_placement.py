@@ -44,6 +44,7 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
         effects=(injection("lever_arm:x_m=-0.6,y_m=0.1,z_m=-0.2"),),
     )  # fmt: skip
     write_bag(scenario, bag, Storage.MCAP, Compression.NONE)
+    arm = (0.0, 0.0, 0.0) if given and "use_transforms" in given[0] else (-0.6, 0.1, -0.2)
     publisher = world.node.create_publisher(String, "robot_description", LATCHED)
     publisher.publish(String(data=URDF))
     with world.calibration_node("max_latency:=600.0", f"result_file:={saved}", *given):
@@ -54,12 +55,15 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
         player = BagPlayer(world.node, [bag])
         player.wait_for_subscribers()
         player.play(speed=100.0)
-        assert world.call(Trigger, f"{NODE}/save").success
+
+        def is_placed() -> bool:  # what was latched before may reach a node after what is published now
+            assert world.call(Trigger, f"{NODE}/save").success
+            return bool(np.allclose(load_yaml(saved, "result file")["parameters"]["lever_arm"], arm, rtol=0, atol=1e-9))
+
+        until(is_placed, "the lever arm of the transform")
     result = load_yaml(saved, "result file")
     nominal = {(): YAW, ("use_transforms:=false",): 0.0}.get(given, 0.7)
     np.testing.assert_allclose(result["parameters"]["mounting_rpy"], (0.0, 0.0, nominal), atol=1e-9)
-    arm = (0.0, 0.0, 0.0) if given and "use_transforms" in given[0] else (-0.6, 0.1, -0.2)
-    np.testing.assert_allclose(result["parameters"]["lever_arm"], arm, atol=1e-9)
     if not given:
         assert result["mounting"]["corrected_rpy"][2] == pytest.approx(YAW + 0.02, abs=0.02)
         assert result["counts"]["dvl"]["accepted"] > 250
