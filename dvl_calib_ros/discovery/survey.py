@@ -20,6 +20,7 @@ import numpy as np
 from ..bags.columns import Part, windows
 from ..bags.reader import BagReader
 from ..calibration.frames import Array
+from ..calibration.robust import median
 from ..calibration.samples import Mask, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
@@ -184,7 +185,7 @@ def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, p
     order = np.lexsort((arrival, stamps_ns))
     order = order[whole[order]]
     frame_id = names[0][1] if names else ""
-    stamps_s, ahead_s = 1e-9 * (stamps_ns[order] - start_ns), 1e-9 * float(np.median(stamps_ns - log_ns))
+    stamps_s, ahead_s = 1e-9 * (stamps_ns[order] - start_ns), 1e-9 * float(median(stamps_ns - log_ns))
     return Look(topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[order])
 
 

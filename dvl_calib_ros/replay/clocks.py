@@ -8,6 +8,7 @@ import numpy as np
 
 from ..calibration.delay.rows import LONGEST_DELAY_S
 from ..calibration.parameters import Parameters
+from ..calibration.robust import median
 from ..calibration.samples import SampleBlock, Stamps, Stream, Streams
 from ..calibration.verification import Word
 
@@ -39,7 +40,7 @@ class StreamClocks:
             ahead_ns = np.concatenate(self._ahead_ns[stream] or [np.zeros(0, dtype=np.int64)])
             if not len(ahead_ns):
                 continue
-            ahead_s = 1e-9 * float(np.median(ahead_ns)) - offsets[stream] + parameters.dvl_time_offset
+            ahead_s = float(median(1e-9 * ahead_ns)) - offsets[stream] + parameters.dvl_time_offset
             if abs(ahead_s) <= LONGEST_DELAY_S + parameters.position_window:
                 continue
             known = WELL_KNOWN.get(round(abs(ahead_s)))

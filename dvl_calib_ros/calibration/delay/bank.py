@@ -197,9 +197,8 @@ class DelayBank:
         folds = folds_of(stamps_ns, self._parameters)
         total, total_vector = np.zeros_like(self._information), np.zeros_like(self._vector)
         square, by_fold = np.zeros_like(self._square), []
-        for fold in sorted(
-            set(folds[use].tolist())
-        ):  # also where nobody verifies: sums in one order are the same to the last bit
+        # by folds also where nobody verifies: sums in one order are the same to the last bit
+        for fold in sorted(set(folds[use].tolist())):
             told = _told(rows, use & (folds == fold))
             by_fold.append((fold, told))
             total += told[0]

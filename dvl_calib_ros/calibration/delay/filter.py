@@ -217,8 +217,9 @@ class DelayFilter:
             found.append(f"DVL stamps {abs(x[DELAY]):.2f} ± {std[DELAY]:.2f} s {late}")
         turns = float(posterior.by_lever_arm.max())
         if turns > chi_square:
-            return Evidence(turns, f"takes the lever arm as known, and {self.lever_arm_turns}")
-        return Evidence(chi_square, f"does not explain the data, which show {' and '.join(found)}")
+            return Evidence(turns, f"takes the lever arm as known, and {_turns_in_words(posterior)}")
+        shown = " and ".join(found) or "a lever arm or a delay"
+        return Evidence(chi_square, f"does not explain the data, which show {shown}")
 
     @property
     def lever_arm_turns(self) -> str:
@@ -230,9 +231,7 @@ class DelayFilter:
         posterior = self.posterior
         if posterior is None or posterior.by_lever_arm.max() < EXTENDED_FROM:
             return ""
-        index = int(np.argmax(posterior.by_lever_arm))
-        angle, turn = ("roll", "pitch", "yaw")[index], math.degrees(posterior.turned[index])
-        return f"in this motion 0.1 m of it is {0.1 * turn:.1f}° of {angle}"
+        return _turns_in_words(posterior)
 
     def remember(self, from_ns: int) -> None:
         """Keep the state as of now, for `remembered`."""
@@ -507,6 +506,12 @@ class DelayFilter:
         recording, epoch_ns = self.recording
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), self._bank, self._parameters)
+
+
+def _turns_in_words(posterior: Posterior) -> str:
+    index = int(np.argmax(posterior.by_lever_arm))
+    angle, turn = ("roll", "pitch", "yaw")[index], math.degrees(posterior.turned[index])
+    return f"in this motion 0.1 m of it is {0.1 * turn:.1f}° of {angle}"
 
 
 def _is_slow(times: Array) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -16,6 +17,7 @@ from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, sp
 from dvl_calib_ros.calibration.delay.rows import BEYOND
 from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -143,6 +145,18 @@ def test_on_a_circle_at_changing_speed_auto_takes_the_model_whose_sigma_knows_of
     g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
     assert abs(g1.state[2]) > 20.0 * g1.std[2]
     assert abs(g2.state[2]) < 3.0 * g2.std[2]
+
+
+@pytest.mark.parametrize("times_more", [20.0, 40.0])
+def test_why_g2_is_stayed_with_is_said_in_whole_sentences(times_more):
+    calibrator = calibrate(straight(yaw_rate=0.15, changing=0.03), NOISE)
+    filtered = calibrator._delay
+    x, p = filtered.posterior.state
+    nothing = replace(filtered.posterior, state=GaussianState(0.1 * x, p), by_lever_arm=np.zeros(3))
+    filtered._posterior = replace(nothing, by_lever_arm=np.array([0.0, 0.0, times_more]))
+    assert filtered.evidence.found == f"takes the lever arm as known, and {ON_A_CIRCLE}"
+    filtered._posterior = nothing
+    assert not filtered.evidence.found.endswith(" ")
 
 
 def test_auto_takes_g2_when_the_data_call_for_it_and_says_why():
