@@ -7,7 +7,8 @@ import ast
 from conftest import ROOT
 
 LONGEST = 350
-MODULES = sorted(path for folder in ("dvl_calib_ros", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
+FOLDERS = ("dvl_calib_ros", "benchmarks", "validation")
+MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
 def lacks_reason(text: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import re
+import runpy
 import sys
 import types
 import warnings
@@ -91,11 +92,21 @@ def test_types_are_handed_on():
     assert (ROOT / "dvl_calib_ros" / "py.typed").is_file() and '"py.typed"' in SETUP
 
 
+def test_only_the_package_is_installed(monkeypatch):
+    """Benchmarks, validation and tests are for who has the sources."""
+    given = {}
+    monkeypatch.setattr("setuptools.setup", lambda **what: given.update(what))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path(str(ROOT / "setup.py"))
+    folders = {path.parent for path in MODULES}
+    assert {name.replace(".", "/") for name in given["packages"]} == {str(path.relative_to(ROOT)) for path in folders}
+
+
 def test_no_file_gives_a_syntax_warning():
     """Python 3.12 and later tell users of every one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for folder in ("dvl_calib_ros", "benchmarks", "test", "launch", "examples"):
+        for folder in ("dvl_calib_ros", "benchmarks", "validation", "test", "launch", "examples"):
             for path in (ROOT / folder).rglob("*.py"):
                 compile(path.read_text(encoding="utf-8"), str(path), "exec")
 

@@ -1,0 +1,46 @@
+"""`python -m validation`: what it has, and what it says to a wrong call."""
+
+from __future__ import annotations
+
+import importlib
+
+import pytest
+
+from validation import repeat
+from validation.__main__ import COMMANDS, main
+
+
+def test_every_command_is_listed_and_there(capsys):
+    assert main(["--help"]) == 0
+    listed = capsys.readouterr().out
+    for name, what in COMMANDS.items():
+        assert f"  {name:<8}  {what}\n" in listed
+        assert callable(importlib.import_module(f"validation.{name}").main)
+
+
+@pytest.mark.parametrize("wrong", [["nonsense"], ["repeat", "--times", "0"]])
+def test_a_wrong_call_is_refused_in_one_line(capsys, wrong):
+    assert main(wrong) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("python -m validation: ") and said.err.count("\n") == 1
+
+
+def test_a_run_that_fails_is_counted_and_its_log_kept(tmp_path, monkeypatch, capsys):
+    suite = tmp_path / "test_two.py"
+    suite.write_text("def test_good(): pass\ndef test_bad(): assert 'here' == 'there'\n")
+    monkeypatch.setattr(repeat, "SUITE", ("-q", "-c", str(tmp_path / "none.ini"), str(suite)))
+    (tmp_path / "none.ini").write_text("[pytest]\n")
+    assert repeat.main(["--times", "1", "--logs", str(tmp_path / "logs")]) == 1
+    said = capsys.readouterr().out
+    assert "   1  passed 1  failed 1  " in said and said.endswith("1 of 1 runs failed\n")
+    (log,) = (tmp_path / "logs").iterdir()
+    assert "assert 'here' == 'there'" in log.read_text()
+    suite.write_text("def test_good(): pass\n")
+    assert repeat.main(["--times", "1"]) == 0
+    assert "0 of 1 runs failed" in capsys.readouterr().out
+
+
+def test_a_run_that_cannot_begin_is_a_failure(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(repeat, "SUITE", ("-q", str(tmp_path / "test_missing.py")))
+    assert repeat.main(["--times", "1", "--logs", str(tmp_path / "logs")]) == 1
+    assert "1 of 1 runs failed" in capsys.readouterr().out

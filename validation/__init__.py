@@ -1,0 +1,1 @@
+"""What is claimed of this package, measured again: `python -m validation`. Not installed."""
