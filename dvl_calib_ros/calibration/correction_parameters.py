@@ -28,9 +28,12 @@ _NEWTON_STEPS = 20
 # After a step as small as this what is left is smaller by orders of magnitude, below what anybody reads.
 _LAST_STEP = 1e-10
 # Where the prior hardly binds and the data do not either, the map is so curved that full steps run away to a DVL that
-# measures nothing, with a σ of nothing, or go to and fro: no step is longer than this in an angle (rad) or a scale, and
-# from the eighth on (good data need three) they are half as long.
-_LONGEST_STEP, _FULL_STEPS, _STEPS = 0.2, 8, 60
+# measures nothing, with a σ of nothing: no step is longer than this in an angle (rad) or a scale. Gauss-Newton's steps
+# go to and fro there, or shrink by so little each that they do not end (by a quarter, where 100 s at 0.02 m/s tell the
+# scale to 0.1 per cent and roll not at all). Good data need three of them; from the ninth on the map's curvature is in
+# the step.
+_LONGEST_STEP, _GAUSS_NEWTON_STEPS, _STEPS = 0.2, 8, 60
+_HALVINGS = 10
 
 
 class Mapped(NamedTuple):
@@ -57,6 +60,24 @@ def errors_from_correction(correction: Array) -> Mapped:
     dc = (db - dscale[..., None] * c[..., None, :, :]) / scale[..., None, :, None]
     derivative = np.concatenate([_skew_part(dc), dscale], axis=-1)[..., :_N]
     return Mapped(np.concatenate([_skew_part(c), scale - 1.0], axis=-1)[..., :_N], np.swapaxes(derivative, -1, -2))
+
+
+def _curvature(correction: Array) -> Array:
+    """ψ, κ (..., 5) -> second derivatives of φ and δk (..., 5, 5, 5), the last axis theirs.
+
+    d²B = B G_i B G_j B + B G_j B G_i B, and those of the quotients c_ij = b_ij / b_ii.
+    """
+    b = np.linalg.inv(_IDENTITY - (correction @ _GENERATORS.reshape(_N, 9)).reshape(*correction.shape[:-1], 3, 3))
+    db = b[..., None, :, :] @ _GENERATORS @ b[..., None, :, :]
+    one_way = (b[..., None, :, :] @ _GENERATORS)[..., :, None, :, :] @ db[..., None, :, :, :]
+    d2b = one_way + np.swapaxes(one_way, -4, -3)
+    scale, dscale, d2scale = (np.diagonal(each, axis1=-2, axis2=-1) for each in (b, db, d2b))
+    c = b / scale[..., None]
+    dc = (db - dscale[..., None] * c[..., None, :, :]) / scale[..., None, :, None]
+    crossed = dscale[..., :, None, :, None] * dc[..., None, :, :, :]
+    d2c = d2b - d2scale[..., None] * c[..., None, None, :, :] - crossed - np.swapaxes(crossed, -4, -3)
+    d2c /= scale[..., None, None, :, None]
+    return np.concatenate([_skew_part(d2c), d2scale], axis=-1)[..., :_N]
 
 
 def _errors_from_one_correction(correction: Array) -> Mapped:
@@ -134,7 +155,7 @@ class PriorOnErrors:
     The filter ran on ψ and κ from `start`, the first-order image of `prior`. A prior of zero scale that was put on κ
     would pull the found scale towards that of a rotation by no angle, 0.4 per cent off at 5 degrees where the data is
     weak. What the filter has gained, Λ - Λ_start, is the data's alone; with it the maximum of the posterior is found
-    by Gauss-Newton, exact as the data is linear in ψ and κ.
+    by Gauss-Newton, and by Newton where that does not end, exact as the data is linear in ψ and κ.
     """
 
     def __init__(self, start: GaussianState, prior: GaussianState) -> None:
@@ -164,9 +185,13 @@ class PriorOnErrors:
             jacobian = _extended(mapped.jacobian, x.shape[-1])
             weighted = np.swapaxes(jacobian, -1, -2) @ self._information
             information = gained + weighted @ jacobian
-            step = _solve(information, gained_state + product(weighted, product(jacobian, x) + self._mean - errors)) - x
-            longest = np.abs(step[..., :_N]).max(axis=-1, keepdims=True)
-            step *= _LONGEST_STEP / np.maximum(longest, _LONGEST_STEP) * (1.0 if n < _FULL_STEPS else 0.5)
+            if n < _GAUSS_NEWTON_STEPS:
+                told = gained_state + product(weighted, product(jacobian, x) + self._mean - errors)
+                step = _no_longer(_solve(information, told) - x)
+            else:
+                slope = gained_state - product(gained, x) + product(weighted, self._mean - errors)
+                step = _no_longer(self._newton_step(information, x, errors, slope))
+                step = self._ascending(gained, gained_state, x, step)
             x = x + step
             if np.abs(step).max() < _LAST_STEP:
                 break
@@ -174,6 +199,43 @@ class PriorOnErrors:
             raise np.linalg.LinAlgError("no maximum of the posterior is found")
         # the last step is so small that the errors after it need no new linearisation
         return GaussianState(errors + product(jacobian, step), _propagated(jacobian, np.linalg.inv(information)))
+
+    def _newton_step(self, information: Array, x: Array, errors: Array, slope: Array) -> Array:
+        """Steps (..., n) by the posterior's own curvature. slope: (..., n), its derivative.
+
+        Where it is curved upwards, as between two maxima of a roll of either sign, a step goes the way of the slope all
+        the same: curvatures are taken without their signs.
+        """
+        curved = information.copy()
+        pull = product(self._information, errors - self._mean)[..., :_N]
+        curved[..., :_N, :_N] += (_curvature(x[..., :_N]) @ pull[..., None, :, None])[..., 0]
+        curvature, along = np.linalg.eigh(curved)
+        curvature = np.abs(curvature)
+        curvature = np.maximum(curvature, np.finfo(float).eps * curvature.max(axis=-1, keepdims=True))
+        return product(along, product(np.swapaxes(along, -1, -2), slope) / curvature)
+
+    def _ascending(self, gained: Array, gained_state: Array, x: Array, step: Array) -> Array:
+        """Steps (..., n), halved until the posterior is not less after them than before."""
+
+        def cost(at: Array) -> Array:
+            off = np.concatenate([errors_from_correction(at[..., :_N]).errors, at[..., _N:]], axis=-1) - self._mean
+            found: Array = 0.5 * (at * product(gained, at) + off * product(self._information, off)) - gained_state * at
+            return found.sum(axis=-1, keepdims=True)
+
+        limit = cost(x)
+        limit = limit + 1e-12 * np.abs(limit)  # what rounding makes of it
+        for _ in range(_HALVINGS):
+            worse = cost(x + step) > limit
+            if not worse.any():
+                break
+            step = np.where(worse, 0.5 * step, step)
+        return step
+
+
+def _no_longer(step: Array) -> Array:
+    """Steps (..., n), shortened to `_LONGEST_STEP`."""
+    longest = np.abs(step[..., :_N]).max(axis=-1, keepdims=True)
+    return step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
 
 
 def _information(state: GaussianState) -> tuple[Array, Array]:

@@ -215,7 +215,7 @@ def _held_out_table(e: Evaluation) -> Table:
 
 def _time_table(e: Evaluation) -> Table:
     table = titled("Avg.VRMSE m/s against calibration time", ["set", "first"], e.columns)
-    for each, rows in zip(e.sets, e.avg_vrmse_by_time.mean(axis=-1), strict=True):
+    for each, rows in zip(e.sets, e.seed_mean_by_time, strict=True):
         for window, row in zip(e.windows_s, rows, strict=True):
             name = each.name if window == e.windows_s[0] else ""
             table.add_row(name, "all" if window is None else f"{window:g} s", *map(cell, row))
@@ -230,7 +230,7 @@ def _each_table(e: Evaluation, study: EachStudy, title: str) -> Table:
 
     caption = "?: the model says that it has not seen yaw, in most of the combinations"
     table = titled(title, ["run", "heading spread"], e.columns, caption=caption)
-    scores = study.avg_vrmse.mean(axis=-1)
+    scores = study.seed_mean
     for run, row, observed in zip(study.runs, scores, study.yaw_observed, strict=True):
         marks = ["", *(" ?" if share < 0.5 else "" for share in observed)]
         cells = [cell(value) + mark for value, mark in zip(row, marks, strict=True)]

@@ -14,7 +14,7 @@ from ..calibration.parameters import Parameters
 from . import protocol
 from .baselines import BASELINES
 from .estimation import SensorData, estimate
-from .results import Curve
+from .results import Curve, Failure, mean_of_known
 from .trajectories import Trajectory
 
 TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
@@ -33,11 +33,16 @@ def curve_keys(models: Sequence[str]) -> list[tuple[str, float | None]]:
 
 
 def squared_errors(
-    run: Trajectory, measured: Array, references: Mapping[float, Array], models: Sequence[str], parameters: Parameters
+    run: Trajectory,
+    measured: Array,
+    references: Mapping[float, Array],
+    models: Sequence[str],
+    parameters: Parameters,
+    failures: list[Failure],
 ) -> Array:
     """Squared error of φ on one run (curves, T, 3) rad², mean over combinations; nan for what cannot run on it.
 
-    measured: (B, N, 3) m/s. references: by their noise (B, N, 3) m/s.
+    measured: (B, N, 3) m/s. references: by their noise (B, N, 3) m/s. failures: what raises is added.
     """
     ends = [run.first(seconds) for seconds in TIMES_S]
     cut = slice(0, ends[-1])
@@ -47,21 +52,25 @@ def squared_errors(
         data = SensorData(run.part(0, ends[-1]), measured[:, cut], reference[:, cut])
         aided = [name for name in _AIDED if name in models]
         free = [name for name in _FREE if name in models] if std == REFERENCE_STD[0] else []
-        states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends)
+        states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends, failures)
         for name, state in states.items():
             by_key[name, None if name in free else std] = _of_states(state, truth)
         for name, align in BASELINES.items():
-            rotations = [
-                align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for end in ends
-            ]
-            off = np.stack([_turns_off(each, truth) for each in rotations])
+            try:
+                rotations = [
+                    align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for end in ends
+                ]
+                off = np.stack([_turns_off(each, truth) for each in rotations])
+            except Exception as error:  # costs this curve's share of the run alone
+                failures.append(Failure.of(error, name, run.name))
+                continue
             by_key[name, std] = (off**2).mean(axis=1)
     missing = np.full((len(TIMES_S), 3), np.nan)
     return np.stack([by_key.get(key, missing) for key in curve_keys(models)])
 
 
 def _of_states(state: GaussianState, truth: Array) -> Array:
-    return np.asarray(((state.x[..., :3] - truth) ** 2).mean(axis=1))
+    return mean_of_known((state.x[..., :3] - truth) ** 2, 1)
 
 
 def _turns_off(body_from_dvl: Array, misalignment: Array) -> Array:
@@ -74,11 +83,7 @@ def _turns_off(body_from_dvl: Array, misalignment: Array) -> Array:
 
 def curves(models: Sequence[str], squares: Array) -> tuple[Curve, ...]:
     """squares: (..., curves, T, 3) rad², over seeds and runs; nan where a curve cannot run."""
-    known = np.isfinite(squares)
-    axes = tuple(range(squares.ndim - 3))
-    count = known.sum(axis=axes)
-    total = np.where(known, squares, 0.0).sum(axis=axes)
-    mean = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    mean = mean_of_known(squares, tuple(range(squares.ndim - 3)))
     return tuple(
         Curve(name, std, np.sqrt(each))
         for (name, std), each in zip(curve_keys(models), mean, strict=True)

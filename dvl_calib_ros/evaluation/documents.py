@@ -32,7 +32,7 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
         },
         "avg_vrmse_by_time": {
             name: {_window(w): _row(e.columns, row) for w, row in zip(e.windows_s, rows, strict=True)}
-            for name, rows in zip(names, e.avg_vrmse_by_time.mean(axis=-1), strict=True)
+            for name, rows in zip(names, e.seed_mean_by_time, strict=True)
         },
         "coverage": _coverage(e.coverage),
         "coverage_of_all": _coverage(e.coverage_of_all),
@@ -49,6 +49,7 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
         "trajectories": list(e.trajectories),
         "source": e.source,
         "notes": list(e.notes),
+        "failures": [vars(each) for each in e.failures],
         "seeds": list(e.seeds),
         "combinations": e.n_combinations,
         "parameters": dict(e.parameters),
@@ -144,7 +145,7 @@ def _each(study: EachStudy | None, columns: Sequence[str]) -> dict[str, Any] | N
             "avg_vrmse": _row(columns, scores),
             "yaw_observed": _row(columns[1:], observed),
         }
-        for run, scores, observed in zip(study.runs, study.avg_vrmse.mean(axis=-1), study.yaw_observed, strict=True)
+        for run, scores, observed in zip(study.runs, study.seed_mean, study.yaw_observed, strict=True)
     ]
     return {
         "runs": runs,

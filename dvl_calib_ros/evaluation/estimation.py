@@ -27,6 +27,7 @@ from ..calibration.observations import Observations
 from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
 from ..calibration.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
+from .results import Failure
 from .trajectories import Trajectory
 
 T = TypeVar("T", bound=np.generic)
@@ -116,23 +117,56 @@ def _finite(reference: Array) -> Array:
 
 
 def estimate(
-    models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
+    models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int], failures: list[Failure]
 ) -> Mapping[str, GaussianState]:
     """States of every model that can run on the data, after the first `ends` samples (E ascending numbers).
 
     Returns x (E, B, n) and P (E, B, n, n) by the model's name. parameters: without process noise, lever arm or
-    mounting.
+    mounting. A variant whose estimate raises is nan in that model alone, and is added to `failures`.
     """
+    able = [name for name in models if MODELS[name].needs is not Needs.ATTITUDE or _has_attitude(data)]
+    try:
+        return _estimate(able, data, parameters, ends)
+    except Exception:  # one by one, so that what raises costs nobody else
+        return {name: _estimate_by_variant(name, data, parameters, ends, failures) for name in able}
+
+
+def _has_attitude(data: SensorData) -> bool:
+    return data.run.rotation_enu_from_body is not None
+
+
+def _estimate_by_variant(
+    name: str, data: SensorData, parameters: Parameters, ends: Sequence[int], failures: list[Failure]
+) -> GaussianState:
+    """`estimate` of one model, each variant by itself."""
+    n_state, n_variants = MODELS[name].n_state, len(data.velocity_dvl)
+    x = np.full((len(ends), n_variants, n_state), np.nan)
+    p = np.full((len(ends), n_variants, n_state, n_state), np.nan)
+    for index in range(n_variants):
+        own = slice(index, index + 1)
+        one = replace(data, velocity_dvl=data.velocity_dvl[own], reference=data.reference[own])
+        try:
+            state = _estimate([name], one, parameters, ends)[name]
+        except Exception as error:
+            failures.append(Failure.of(error, name, data.run.name, index))
+            continue
+        x[:, index], p[:, index] = state.x[:, 0], state.p[:, 0]
+    return GaussianState(x, p)
+
+
+def _estimate(
+    models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
+) -> Mapping[str, GaussianState]:
     variants = aligned(data, parameters)
     found: dict[str, GaussianState] = {}
     for needs in Needs:
         group = [MODELS[name] for name in models if MODELS[name].needs is needs]
-        if not group or (needs is Needs.ATTITUDE and data.run.rotation_enu_from_body is None):
+        if not group:
             continue
         seen = variants.observations(needs, parameters)
         for model in group:  # each on its own, in its own size: here it is the variants that fill the arrays
             found[model.name] = _estimate_one(model, seen, variants, parameters, ends)
-    return {name: found[name] for name in models if name in found}
+    return {name: found[name] for name in models}
 
 
 def _estimate_one(

@@ -14,6 +14,7 @@ from ..calibration.frames import Array
 from ..calibration.models import LINEAR_MODELS, MODELS
 from ..calibration.observations import Observations
 from ..calibration.parameters import SCHEMA, Parameters
+from ..errors import InputError
 from ..parallel import Workers, run_all
 from . import protocol
 from .baselines import BASELINES
@@ -28,11 +29,11 @@ from .procedure import (
     each_runs,
     models_in_noise_study,
     noise_study_run,
-    run_seed,
+    seed_or_failure,
     sensor_data,
     single_headings,
 )
-from .results import CalibrationRun, Coverage, EachStudy, ErrorsInVariables, Evaluation, Trace
+from .results import CalibrationRun, Coverage, EachStudy, ErrorsInVariables, Evaluation, Failure, Trace, mean_of_known
 from .trajectories import Trajectory, load_folder, own_trajectories
 
 # The procedure has no lever arm and no delay, so the model that finds them would only be another name of G1
@@ -46,6 +47,8 @@ FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", 
 # Trajectories and the combination of the pictures
 TRACED, TRACED_COMBINATION = ("T01", "T07"), 0
 TRACE_SAMPLES = 400
+# Failures that a note names
+NAMED_FAILURES = 5
 
 OWN_NOTES: tuple[str, ...] = ("simulated trajectories: the published figures are of others, so there is no ratio",)
 FORMULA = "-a σ²/(E‖h‖² + a σ²), h the noiseless regressor of the scale, a the number of its noisy axes"
@@ -64,7 +67,8 @@ def evaluate(
 ) -> Evaluation:
     """Run the procedure over a folder of trajectories, or without one over the project's own.
 
-    parameters: as for the node, see `DEFAULTS` and `FIXED`. Raises InputError.
+    parameters: as for the node, see `DEFAULTS` and `FIXED`. What raises among the estimates is left out, and is in
+    `Evaluation.failures` and its notes. Raises InputError, also where nothing is left.
     """
     runs, notes = (own_trajectories(), OWN_NOTES) if folder is None else load_folder(folder, partial_folder)
     parameters, ignored = _for_procedure(parameters)
@@ -76,24 +80,34 @@ def evaluate(
     )
     seeds = tuple(range(n_seeds))
     total = n_seeds + len(procedure.sets)
-    outcomes = run_all(partial(run_seed, procedure), seeds, workers, lambda x: on_progress(x * n_seeds / total))
-    held_out = run_all(
+    by_seed = run_all(partial(seed_or_failure, procedure), seeds, workers, lambda x: on_progress(x * n_seeds / total))
+    outcomes = [each for each in by_seed if isinstance(each, SeedOutcome)]
+    failures = [each for each in by_seed if isinstance(each, Failure)]
+    failures += [failure for each in outcomes for failure in each.failures]
+    seeds = tuple(seed for seed, each in zip(seeds, by_seed, strict=True) if isinstance(each, SeedOutcome))
+    avg_vrmse = np.array([[run.avg_vrmse for run in each.by_set] for each in outcomes])  # (Q, S, C)
+    if not np.isfinite(avg_vrmse[..., 1:]).any():
+        why = f"; the first: {failures[0]}" if failures else ""
+        raise InputError(f"no model has an estimate on any of the sets, so there is nothing to evaluate{why}")
+    verified = run_all(
         partial(verify_set, procedure, seeds[0]),
         procedure.sets,
         workers,
         lambda x: on_progress((n_seeds + x * len(procedure.sets)) / total),
     )
+    held_out, failed = zip(*verified, strict=True)
+    failures += [failure for of_set in failed for failure in of_set]
     own_generator = folder is None
     return Evaluation(
         source="own generator (simulated trajectories)" if own_generator else f"folder {folder}",
         own_generator=own_generator,
-        notes=(*notes, *ignored),
+        notes=(*notes, *ignored, *_left_out(failures)),
         trajectories=tuple(runs),
         models=procedure.models,
         sets=procedure.sets,
         seeds=seeds,
         n_combinations=len(protocol.COMBINATIONS),
-        avg_vrmse=np.stack([[run.avg_vrmse for run in each.by_set] for each in outcomes], axis=-1),
+        avg_vrmse=np.moveaxis(avg_vrmse, 0, -1),
         windows_s=protocol.WINDOWS_S,
         avg_vrmse_by_time=np.stack([[run.by_time for run in each.by_set] for each in outcomes], axis=-1),
         published=protocol.PUBLISHED,
@@ -106,9 +120,21 @@ def evaluate(
         parameters=parameters.as_dict(),
         version=__version__,
         held_out=tuple(each for of_set in held_out for each in of_set),
-        baselines=dict(zip(BASELINES, np.mean([each.baselines for each in outcomes], axis=0).T, strict=True)),
+        baselines=dict(
+            zip(BASELINES, mean_of_known(np.array([each.baselines for each in outcomes]), 0).T, strict=True)
+        ),
         convergence=curves(procedure.models, np.stack([each.convergence for each in outcomes])),
+        failures=tuple(failures),
     )
+
+
+def _left_out(failures: Sequence[Failure]) -> list[str]:
+    """A note that counts what raised, and names the first of it."""
+    if not failures:
+        return []
+    named = "; ".join(map(str, failures[:NAMED_FAILURES]))
+    more = f"; and {len(failures) - NAMED_FAILURES} more, see failures in --json" * (len(failures) > NAMED_FAILURES)
+    return [f"{len(failures)} failed and {'is' if len(failures) == 1 else 'are'} in none of the figures: {named}{more}"]
 
 
 def _for_procedure(parameters: Parameters) -> tuple[Parameters, tuple[str, ...]]:
@@ -125,8 +151,10 @@ def _coverage(models: Sequence[str], outcomes: Sequence[RunOutcome]) -> tuple[Co
         ran = [each for each in outcomes if name in each.errors]
         if ran:
             errors, std = (np.concatenate([getattr(each, what)[name] for each in ran]) for what in ("errors", "std"))
+            known = np.isfinite(errors).all(axis=1)
             model = MODELS[name]
-            found.append(coverage(name, model.state_names[: model.n_errors], errors, std))
+            if known.any():
+                found.append(coverage(name, model.state_names[: model.n_errors], errors[known], std[known]))
     return tuple(found)
 
 
@@ -139,7 +167,7 @@ def _each_study(
     return EachStudy(
         runs=runs,
         avg_vrmse=np.stack([[run.avg_vrmse for run in seed] for seed in outcomes], axis=-1),
-        yaw_observed=np.mean([[run.yaw_observed for run in seed] for seed in outcomes], axis=0),
+        yaw_observed=mean_of_known(np.array([[run.yaw_observed for run in seed] for seed in outcomes]), 0),
         coverage=_coverage(procedure.models, [run for seed in outcomes for run in seed]),
     )
 
@@ -149,14 +177,15 @@ def _errors_in_variables(procedure: Procedure, outcomes: Sequence[SeedOutcome]) 
     if not models:
         return None
     pull = np.concatenate([each.pull for each in outcomes], axis=-1)
+    spread = mean_of_known((pull - mean_of_known(pull, -1)[..., None]) ** 2, -1)
     std = np.array(NOISE_STUDY_STD)
     predicted, axes = zip(*(_predicted_pull(name, noise_study_run(procedure), std) for name in models), strict=True)
     return ErrorsInVariables(
         models=models,
         gnss_std=std,
         predicted=np.stack(predicted),
-        measured=pull.mean(axis=-1),
-        standard_error=pull.std(axis=-1) / np.sqrt(pull.shape[-1]),
+        measured=mean_of_known(pull, -1),
+        standard_error=np.sqrt(spread / np.maximum(np.isfinite(pull).sum(axis=-1), 1)),
         noisy_axes=np.array(axes),
         formula=FORMULA,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,33 +14,40 @@ from ..calibration.verification import Verification
 from .estimation import SensorData, streams_of, true_prior
 from .procedure import Procedure, sensor_data
 from .protocol import SCALES_PERCENT
-from .results import CalibrationSet, HeldOut
+from .results import CalibrationSet, Failure, HeldOut
 
 # One combination of every misalignment: one by one takes ten times longer than many at once
 VERIFIED = slice(None, None, len(SCALES_PERCENT))
 
 
-def verify_set(procedure: Procedure, seed: int, calibration_set: CalibrationSet) -> tuple[HeldOut, ...]:
-    """One entry per model that runs on the set, over `VERIFIED` combinations of errors."""
+def verify_set(
+    procedure: Procedure, seed: int, calibration_set: CalibrationSet
+) -> tuple[tuple[HeldOut, ...], tuple[Failure, ...]]:
+    """One entry per model that runs on the set, over `VERIFIED` combinations of errors; and those that raised."""
+    failures: list[Failure] = []
     data = sensor_data(procedure.runs[calibration_set.calibration_run], seed)
-    results = _calibrate(data, data.run.first(calibration_set.window_s), procedure)
-    return tuple(
+    results = _calibrate(data, data.run.first(calibration_set.window_s), procedure, failures)
+    held_out = tuple(
         _summary(calibration_set.name, name, [result.verifications[name] for result in results])
         for name in procedure.models
-        if results[0].estimates[name].used
+        if results and results[0].estimates[name].used
     )
+    return held_out, tuple(replace(each, seed=seed) for each in failures)
 
 
-def _calibrate(data: SensorData, end: int, procedure: Procedure) -> list[Result]:
-    """Result of every `VERIFIED` combination over the first `end` samples."""
+def _calibrate(data: SensorData, end: int, procedure: Procedure, failures: list[Failure]) -> list[Result]:
+    """Result of every `VERIFIED` combination over the first `end` samples, without those that raise."""
     parameters = procedure.parameters
     prior = true_prior(data, parameters)
     stretch = SensorData(data.run.part(0, end), data.velocity_dvl[:, :end], data.reference[:, :end])
     results = []
     for variant in range(len(data.velocity_dvl))[VERIFIED]:
-        calibrator = Calibrator(parameters, prior_sway_heave=prior, block_size=end, verified=True)
-        calibrator.feed(streams_of(stretch, variant))
-        results.append(calibrator.result())
+        try:
+            calibrator = Calibrator(parameters, prior_sway_heave=prior, block_size=end, verified=True)
+            calibrator.feed(streams_of(stretch, variant))
+            results.append(calibrator.result())
+        except Exception as error:
+            failures.append(Failure.of(error, "hold-out verification", data.run.name, variant))
     return results
 
 

@@ -18,7 +18,7 @@ from .baselines import BASELINES
 from .convergence import REFERENCE_STD, TIMES_S, curve_keys, squared_errors
 from .estimation import SensorData, estimate
 from .metrics import Moments, heading_spread, vrmse
-from .results import CalibrationRun, CalibrationSet
+from .results import CalibrationRun, CalibrationSet, Failure, mean_of_known
 from .trajectories import Trajectory
 
 # A leg is a single heading while it turns by no more than this, and is worth calibrating on from this length
@@ -72,7 +72,8 @@ class SeedOutcome:
 
     each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) by how much noise in the
     reference moves the first scale state. baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`. convergence: (L,
-    curves, T, 3) squared errors of the misalignment over time on each of the runs, see `convergence`.
+    curves, T, 3) squared errors of the misalignment over time on each of the runs, see `convergence`. failures: what
+    raised, and is nan.
     """
 
     by_set: tuple[RunOutcome, ...]
@@ -81,12 +82,14 @@ class SeedOutcome:
     pull: Array
     baselines: Array
     convergence: Array
+    failures: tuple[Failure, ...] = ()
 
 
 def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     """The whole procedure with the noise of one seed."""
     measured = {name: dvl_velocities(run, seed) for name, run in procedure.runs.items()}
     moments = {name: Moments.of(measured[name], run.velocity) for name, run in procedure.runs.items()}
+    failures: list[Failure] = []
 
     def data(name: str) -> SensorData:
         return SensorData(procedure.runs[name], measured[name], references(procedure.runs[name], seed))
@@ -94,28 +97,29 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     def outcome(stretch: SensorData, windows: Sequence[float | None], own_window: float | None) -> RunOutcome:
         others = _others(moments, stretch.run.name)
         ends = [stretch.run.first(window) for window in windows]
-        return _calibrate(stretch, ends, windows.index(own_window), others, procedure)
+        return _calibrate(stretch, ends, windows.index(own_window), others, procedure, failures)
 
     by_set = tuple(outcome(data(each.calibration_run), protocol.WINDOWS_S, each.window_s) for each in procedure.sets)
     baselines = np.array(
         [
             [
                 float(vrmse(_others(moments, each.calibration_run), matrices).mean())
-                for matrices in _baselines(data(each.calibration_run), each.window_s)
+                for matrices in _baselines(data(each.calibration_run), each.window_s, failures)
             ]
             for each in procedure.sets
         ]
     )
     if not procedure.studies:
         none = np.empty((0, len(curve_keys(procedure.models)), len(TIMES_S), 3))
-        return SeedOutcome(by_set, (), (), np.empty((0, len(NOISE_STUDY_STD), 0)), baselines, none)
+        no_pull = np.empty((0, len(NOISE_STUDY_STD), 0))
+        return SeedOutcome(by_set, (), (), no_pull, baselines, none, _of_seed(failures, seed))
     with_attitude = runs_with_attitude(procedure.runs)
     legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
-    return SeedOutcome(
+    outcome_of_seed = SeedOutcome(
         by_set=by_set,
         each=tuple(outcome(data(name), [None], None) for name in with_attitude),
         single_heading=tuple(outcome(_part(data(name), start, end), [None], None) for name, start, end in legs),
-        pull=_noise_study(procedure, data(noise_study_run(procedure).name), seed),
+        pull=_noise_study(procedure, data(noise_study_run(procedure).name), seed, failures),
         baselines=baselines,
         convergence=np.stack(
             [
@@ -125,24 +129,43 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
                     {std: references(procedure.runs[name], seed, std) for std in REFERENCE_STD},
                     procedure.models,
                     procedure.parameters,
+                    failures,
                 )
                 for name in with_attitude
             ]
             or [np.full((len(curve_keys(procedure.models)), len(TIMES_S), 3), np.nan)]
         ),
     )
+    return replace(outcome_of_seed, failures=_of_seed(failures, seed))
+
+
+def seed_or_failure(procedure: Procedure, seed: int) -> SeedOutcome | Failure:
+    """`run_seed`, or why there is nothing of that seed."""
+    try:
+        return run_seed(procedure, seed)
+    except Exception as error:
+        return replace(Failure.of(error, "everything"), seed=seed)
+
+
+def _of_seed(failures: Sequence[Failure], seed: int) -> tuple[Failure, ...]:
+    return tuple(replace(each, seed=seed) for each in failures)
 
 
 def _others(moments: Mapping[str, Moments], name: str) -> Moments:
     return Moments.stack([each for other, each in moments.items() if other != name])
 
 
-def _baselines(data: SensorData, window_s: float | None) -> list[Array]:
-    """Corrections (B, 3, 3) by each of the baselines."""
+def _baselines(data: SensorData, window_s: float | None, failures: list[Failure]) -> list[Array]:
+    """Corrections (B, 3, 3) by each of the baselines; nan where one raises."""
     end = data.run.first(window_s)
-    return [
-        align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for align in BASELINES.values()
-    ]
+    found = []
+    for name, align in BASELINES.items():
+        try:
+            found.append(align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]))
+        except Exception as error:
+            failures.append(Failure.of(error, name, data.run.name))
+            found.append(np.full((len(data.velocity_dvl), 3, 3), np.nan))
+    return found
 
 
 def sensor_data(run: Trajectory, seed: int) -> SensorData:
@@ -186,9 +209,16 @@ def true_state(model: Model) -> Array:
     return protocol.truth() @ np.linalg.pinv(from_state).T
 
 
-def _calibrate(data: SensorData, ends: Sequence[int], own: int, others: Moments, procedure: Procedure) -> RunOutcome:
+def _calibrate(
+    data: SensorData,
+    ends: Sequence[int],
+    own: int,
+    others: Moments,
+    procedure: Procedure,
+    failures: list[Failure],
+) -> RunOutcome:
     """own: index of the run's own window."""
-    states = estimate(procedure.models, data, procedure.parameters, ends)
+    states = estimate(procedure.models, data, procedure.parameters, ends, failures)
     n_variants = len(data.velocity_dvl)
     matrices = np.full((len(ends), procedure.n_columns, n_variants, 3, 3), np.nan)
     matrices[:, 0] = np.eye(3)
@@ -202,8 +232,9 @@ def _calibrate(data: SensorData, ends: Sequence[int], own: int, others: Moments,
         matrices[:, 1 + index] = corrections(model, state)
         errors[name] = state.x[own, :, : model.n_errors] - true_state(model)
         std[name] = np.sqrt(np.diagonal(state.p[own], axis1=1, axis2=2)[:, : model.n_errors])
-        yaw_observed[index] = np.mean(std[name][:, 2] <= observed_std)
-    by_time = vrmse(others, matrices[:, :, None]).mean(axis=(-1, -2))  # (E, C, others, B) -> (E, C)
+        yaw_std = std[name][:, 2]
+        yaw_observed[index] = mean_of_known(np.where(np.isnan(yaw_std), np.nan, yaw_std <= observed_std), 0)
+    by_time = mean_of_known(vrmse(others, matrices[:, :, None]), (-1, -2))  # (E, C, others, B) -> (E, C)
     return RunOutcome(by_time, by_time[own], errors, std, yaw_observed, matrices[own])
 
 
@@ -257,7 +288,7 @@ def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in models if MODELS[name].aided and MODELS[name].scale_axes)
 
 
-def _noise_study(procedure: Procedure, data: SensorData, seed: int) -> Array:
+def _noise_study(procedure: Procedure, data: SensorData, seed: int, failures: list[Failure]) -> Array:
     """By how much noise of each size in the reference moves the first scale state (G, V, B)."""
     models = models_in_noise_study(procedure.models)
     if not models:
@@ -268,7 +299,7 @@ def _noise_study(procedure: Procedure, data: SensorData, seed: int) -> Array:
             gnss_aided_std=max(std, NOISE_STUDY_SMALLEST_STD), initial_std_scale=NOISE_STUDY_PRIOR_STD_SCALE
         )
         noisy = replace(data, reference=references(data.run, seed, std))
-        states = estimate(models, noisy, parameters, [len(data.run.time)])
+        states = estimate(models, noisy, parameters, [len(data.run.time)], failures)
         return np.stack([states[name].x[0, :, 3] for name in models])
 
     without_noise = scales(0.0)

@@ -18,6 +18,41 @@ from ..calibration.frames import Array
 UNCALIBRATED = "uncalibrated"
 
 
+def mean_of_known(values: Array, axis: int | tuple[int, ...]) -> Array:
+    """Mean along axes of what is not nan; nan where all of it is."""
+    known = np.isfinite(values)
+    count = np.asarray(known.sum(axis=axis))
+    total = np.asarray(np.where(known, values, 0.0).sum(axis=axis))
+    return np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What raised and was left out: one estimate of many, or a whole seed.
+
+    what: a model, a baseline, or what else was tried. run: trajectory or set. combination, seed: which; None for all
+    of them. why: the exception in one line.
+    """
+
+    what: str
+    run: str
+    combination: int | None
+    why: str
+    seed: int | None = None
+
+    @staticmethod
+    def of(error: Exception, what: str, run: str = "", combination: int | None = None) -> Failure:
+        """Of an exception."""
+        said = " ".join(str(error).split())
+        return Failure(what, run, combination, f"{type(error).__name__}: {said}" if said else type(error).__name__)
+
+    def __str__(self) -> str:
+        parts = [self.what, self.run]
+        parts += [f"seed {self.seed}"] if self.seed is not None else []
+        parts += [f"combination {self.combination}"] if self.combination is not None else []
+        return f"{', '.join(part for part in parts if part)}: {self.why}"
+
+
 @dataclass(frozen=True)
 class CalibrationSet:
     """A set of the procedure: calibrate on the first window_s (None: all) of a run, evaluate on all other runs."""
@@ -95,7 +130,12 @@ class EachStudy:
         rows = [i for i, run in enumerate(self.runs) if trajectories is None or run.trajectory in trajectories]
         if not rows:
             return np.full(self.avg_vrmse.shape[1], np.nan)
-        return np.asarray(np.median(self.avg_vrmse[rows].mean(axis=-1), axis=0))
+        return np.asarray(np.median(self.seed_mean[rows], axis=0))
+
+    @property
+    def seed_mean(self) -> Array:
+        """(L, C) Avg.VRMSE, mean over the seeds."""
+        return mean_of_known(self.avg_vrmse, -1)
 
 
 @dataclass(frozen=True)
@@ -169,7 +209,7 @@ class Evaluation:
     avg_vrmse: (S, C, Q). windows_s: (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column ->
     m/s. coverage: over the sets; coverage_of_all: over these and the runs of `each`. parameters: as used, plain
     values. baselines: (S,) Avg.VRMSE of what was done before, by name. convergence: the misalignment's error against
-    time. version: of the software.
+    time. failures: what raised, and is in none of these. version: of the software.
     """
 
     source: str
@@ -195,6 +235,7 @@ class Evaluation:
     baselines: Mapping[str, Array] = field(default_factory=dict)
     convergence: tuple[Curve, ...] = ()
     coverage_of_all: tuple[Coverage, ...] = ()
+    failures: tuple[Failure, ...] = ()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -204,7 +245,12 @@ class Evaluation:
     @property
     def seed_mean(self) -> Array:
         """(S, C) Avg.VRMSE, mean over the seeds."""
-        return np.asarray(self.avg_vrmse.mean(axis=-1))
+        return mean_of_known(self.avg_vrmse, -1)
+
+    @property
+    def seed_mean_by_time(self) -> Array:
+        """(S, W, C) Avg.VRMSE, mean over the seeds."""
+        return mean_of_known(self.avg_vrmse_by_time, -1)
 
     @property
     def set_mean(self) -> Array:

@@ -189,7 +189,7 @@ def _improvement(e: Evaluation) -> Picture:
 def _calibration_times(e: Evaluation) -> Iterable[Picture]:
     base = e.columns.index(UNCALIBRATED)
     models = [e.columns.index(name) for name in e.models]
-    by_time = e.avg_vrmse_by_time.mean(axis=-1)
+    by_time = e.seed_mean_by_time
     for i, each in enumerate(e.sets):
         yield picture(
             f"{each.name}: calibrated on {each.calibration_run}",
@@ -328,7 +328,7 @@ _SINGLE = "Calibrated on stretches of a single heading"
 def _study(e: Evaluation, study: EachStudy | None, title: str) -> dict[str, Any] | None:
     if study is None or not study.runs:
         return None
-    errors = study.avg_vrmse.mean(axis=-1)  # (L, C)
+    errors = study.seed_mean  # (L, C)
     runs = [f"{run.trajectory} {run.from_s:.0f}–{run.to_s:.0f} s" for run in study.runs]
     rows = []
     for run, label, values, observed in zip(

@@ -31,7 +31,7 @@ def rolls_over_sigma(waves: Waves | None) -> np.ndarray:
             rng = np.random.default_rng([seed, len(trajectory)])
             dvl = protocol.unit_under_test(run.velocity, protocol.COMBINATIONS[seed], rng)[None]
             data = SensorData(run, dvl, protocol.reference(run.velocity, rng)[None])
-            state = estimate(["G1"], data, PARAMETERS.replace(prior_source="fixed"), [len(run.time)])["G1"]
+            state = estimate(["G1"], data, PARAMETERS.replace(prior_source="fixed"), [len(run.time)], [])["G1"]
             error = state.x[0, 0, 0] - protocol.truth()[seed, 0]
             found.append(error / np.sqrt(state.p[0, 0, 0, 0]))
     return np.array(found)

@@ -38,7 +38,7 @@ def test_what_is_found_is_a_rotation_also_of_motion_in_a_plane_or_of_none():
 def found():
     run = own_trajectories()["T02"]
     with_noise = {std: references(run, 0, std) for std in (protocol.GNSS_STD, 0.02)}
-    squares = squared_errors(run, dvl_velocities(run, 0), with_noise, MODELS, Parameters.from_mapping(DEFAULTS))
+    squares = squared_errors(run, dvl_velocities(run, 0), with_noise, MODELS, Parameters.from_mapping(DEFAULTS), [])
     return {(each.name, each.gnss_std): each for each in curves(MODELS, squares[None, None])}
 
 

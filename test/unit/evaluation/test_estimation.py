@@ -45,7 +45,7 @@ def calibrated(data: SensorData, variant: int, parameters: Parameters):
 
 def check(data: SensorData, parameters: Parameters):
     variants = aligned(data, parameters)
-    states = estimate(tuple(MODELS), data, parameters, [N_SAMPLES])
+    states = estimate(tuple(MODELS), data, parameters, [N_SAMPLES], [])
     for variant in range(N_VARIANTS):
         calibrator, (row, verdict, pairing) = calibrated(data, variant, parameters)
         own = slice(variant * N_SAMPLES, (variant + 1) * N_SAMPLES)

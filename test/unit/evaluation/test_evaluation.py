@@ -102,7 +102,7 @@ def test_every_state_is_that_of_replaying_a_bag_of_the_same_data(options, runs, 
         replayed = replay([tmp_path / "bag"], parameters.replace(prior_source="fixed", prior_sway_heave=(sway, heave)))
     else:
         replayed = replay([tmp_path / "bag"], parameters)
-    states = estimate(EVALUATED, data, parameters, [50, 150])
+    states = estimate(EVALUATED, data, parameters, [50, 150], [])
     assert set(states) == set(EVALUATED)
     for name in EVALUATED:
         expected = replayed.result.estimates[name]
@@ -113,7 +113,7 @@ def test_every_state_is_that_of_replaying_a_bag_of_the_same_data(options, runs, 
 
 def test_a_model_that_needs_attitude_does_not_run_without(runs):
     data = sensor_data(runs["T14"].part(0, 60), seed=0)
-    states = estimate(EVALUATED, data, Parameters(**DEFAULTS), [60])
+    states = estimate(EVALUATED, data, Parameters(**DEFAULTS), [60], [])
     assert set(EVALUATED) - set(states) == {"A1"}
 
 
@@ -122,7 +122,7 @@ def test_the_truth_to_find_is_in_the_frame_of_the_estimates(runs):
     run = runs["T02"]
     data = SensorData(run, dvl_velocities(run, seed=0), references(run, seed=0, gnss_std=0.0))
     parameters = Parameters(**DEFAULTS, gnss_aided_std=0.005, initial_std_misalignment=0.5, initial_std_scale=0.1)
-    found = estimate(("G1",), data, parameters, [len(data.run.time)])["G1"].x[0]
+    found = estimate(("G1",), data, parameters, [len(data.run.time)], [])["G1"].x[0]
     truth = true_state(MODELS["G1"])
     error = found[:, : truth.shape[1]] - truth
     assert np.degrees(np.abs(error[:, 1:3]).max()) < 0.4
@@ -155,7 +155,7 @@ def test_averages_are_those_of_every_combination_and_trajectory(evaluation, runs
     """One cell, from the samples."""
     column = evaluation.columns.index("M4")
     data = {name: sensor_data(run, seed=1) for name, run in runs.items()}
-    state = estimate(("M4",), data["T13"], Parameters(**DEFAULTS), [len(runs["T13"].time)])["M4"].x[-1]
+    state = estimate(("M4",), data["T13"], Parameters(**DEFAULTS), [len(runs["T13"].time)], [])["M4"].x[-1]
     scores = []
     for index in range(len(protocol.COMBINATIONS)):
         phi, k = state[index, :3], np.array([state[index, 3], 0.0, 0.0])
