@@ -20,7 +20,7 @@ from .alignment import Aligner
 from .assembly import gate_of, nis_bounds, prior
 from .bank import Group, ModelCounts, groups_of
 from .days import day_covariance
-from .delay.filter import DelayFilter
+from .delay.filter import DelayFilter, Worker
 from .delay.hold_out import Recording, Terms
 from .frames import Array, Vector
 from .headings import EVERY_NS, Headings
@@ -67,7 +67,8 @@ class Calibrator:
     earlier. on_event: told of restarts in words. on_rows: given the aligned rows, in order, once all models have had
     them. on_restart: called when all of them are to be forgotten. verified: keep what hold-out verification needs.
     trace: filled with the models' states over time. recordings_ns: stamps between one recording and the next, each of
-    which is a day of its own.
+    which is a day of its own. worker: does what would hold up live messages; None: all is done at once, and comes to
+    the same.
     """
 
     def __init__(
@@ -83,6 +84,7 @@ class Calibrator:
         verified: bool = False,
         trace: StateTrace | None = None,
         recordings_ns: Sequence[int] = (),
+        worker: Worker | None = None,
     ) -> None:
         if parameters.prior_source == "reference" and prior_sway_heave is None:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
@@ -94,6 +96,7 @@ class Calibrator:
         self._on_restart = on_restart
         self._verified = verified
         self._trace = trace
+        self._worker = worker
         self._observer = Observer(parameters)
         self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
         self.reset()
@@ -121,6 +124,7 @@ class Calibrator:
             gate_of(extended.n_measurement, self.parameters),
             self._on_block,
             self._verified,
+            self._worker,
         )
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
@@ -277,7 +281,11 @@ class Calibrator:
             rows.forget_before(done - rows.base)
 
     def finish(self) -> None:
-        """Update all models with what is decided, and tell on_rows of the rest, which may still wait for partners."""
+        """No samples come any more: update all models with what is decided, and tell on_rows of the rest.
+
+        That may still wait for partners.
+        """
+        self._delay.finish()
         for group in self._groups:
             self._update(group)
         rows = self._aligner.rows
@@ -502,7 +510,11 @@ class Calibrator:
         return self._delay.recording
 
     def result(self) -> Result:
-        """Everything, as of now."""
+        """Everything that the samples so far tell, also where it takes effect only when later ones have come."""
+        with self._delay.settled():
+            return self._result()
+
+    def _result(self) -> Result:
         return Result(
             selected=self.selected,
             selected_because=self.selection.reason(self.parameters),

@@ -174,11 +174,19 @@ def _recursion_of_one(
 
 @cache
 def _dposv() -> Callable[[Array, Array], tuple[Array, Array, int]]:
-    """LAPACK's, imported when the first sample comes by itself: it takes 0.2 s, which recordings need not wait for."""
+    """LAPACK's, imported when the first sample comes by itself: it takes 0.2 s, which recordings need not wait for.
+
+    Live, nor need the first message: see `prepare`.
+    """
     from scipy.linalg.lapack import dposv
 
     solver: Callable[[Array, Array], tuple[Array, Array, int]] = dposv
     return solver
+
+
+def prepare() -> None:
+    """Import what the first sample that comes by itself would else wait for."""
+    _dposv()
 
 
 def _solve_definite(s: Array, b: Array) -> Array:

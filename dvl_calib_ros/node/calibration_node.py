@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from ..calibration import kalman
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, lever_arm, twist_terms
 from ..calibration.findings import Finding, finding
@@ -85,6 +87,8 @@ class CalibrationNode(AnsweringNode):
             initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
         if parameters.prior_source == "initial_window":
             self.get_logger().warning(str(finding("PRIOR_HOLDS_ERROR")))
+        kalman.prepare()
+        self._worker = ThreadPoolExecutor(1, "g2")
         self._begin(parameters, initial)
         # a saved calibration is one of the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
@@ -132,7 +136,9 @@ class CalibrationNode(AnsweringNode):
 
     def _begin(self, parameters: Parameters, initial: Mapping[str, GaussianState] | None) -> None:
         """Calibrate with these parameters from here on."""
-        self._calibrator = Calibrator(parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn)
+        self._calibrator = Calibrator(
+            parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn, worker=self._worker
+        )
         self._feed = MessageFeed(self._calibrator, self._warn)
         self._lever_arm: Sequence[float] | None = parameters.lever_arm if any(parameters.lever_arm) else None
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
     from .ending import Ending
 
+# A thread that computes gives way to one with a message after so long, s; by default after 0.005.
+GIVES_WAY_S = 0.0005
 # Says that standard input is a pipe, and that the node is to end with the process that holds its other end.
 ENDS_WITH_STDIN = "--ends-with-stdin"
 
@@ -54,6 +56,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
         return _refused(error)
     node = None
+    sys.setswitchinterval(GIVES_WAY_S)
     try:
         node = CalibrationNode(parameter_files(args))
         executor = ReceivingExecutor(node)

@@ -91,3 +91,27 @@ def test_a_command_imports_nothing_that_would_take_longer_than_its_work(command,
     script = f"import sys; {run}; print(*(name for name in {slow} if name in sys.modules), file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stderr.splitlines()[-1].split() == []
+
+
+def test_no_live_message_waits_for_an_import():
+    """The first one alone would for a fifth of a second, and those behind it."""
+    script = """
+import sys
+from dvl_calib_ros.calibration import kalman
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
+kalman.prepare()
+before = set(sys.modules)
+calibrator = Calibrator(Parameters(), block_size=512)
+for fifth in range(300):
+    stamp_ns = 1_700_000_000_000_000_000 + fifth * 200_000_000
+    calibrator.feed_imu(ImuSample(stamp_ns, (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.01)))
+    calibrator.feed_reference(ReferenceSample(stamp_ns, (1.5, 0.0, 0.0)))
+    calibrator.feed_dvl(DvlSample(stamp_ns, (1.5, 0.0, 0.0)))
+    calibrator.published(calibrator.selected)
+assert calibrator.selected == "G1" and calibrator.estimate("G2").used
+print(*sorted(set(sys.modules) - before))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout.split() == []

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from runs import START_NS, calibrate, feed, shifted
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.correction import lever_arm
 from dvl_calib_ros.calibration.delay import contradicted
-from dvl_calib_ros.calibration.delay import filter as delay_filter
+from dvl_calib_ros.calibration.delay import solver as delay_solver
 from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.delay.rows import BEYOND
 from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
@@ -208,6 +211,68 @@ def test_how_samples_are_gathered_changes_nothing(block_size):
     assert [s.model for s in one.result().segments] == [s.model for s in other.result().segments]
 
 
+class Lazy:
+    """A worker that does nothing before somebody waits for it, the latest that it could be done."""
+
+    def __init__(self, threads: int) -> None:
+        self.waiting = deque()
+
+    def submit(self, work):
+        self.waiting.append((solved := Future(), work))
+        return SimpleNamespace(result=lambda: self._done(solved))
+
+    def _done(self, solved):
+        while not solved.done():
+            future, work = self.waiting.popleft()
+            future.set_result(work())
+        return solved.result()
+
+
+@pytest.mark.parametrize("worker", [Lazy, ThreadPoolExecutor])
+def test_when_a_worker_is_done_changes_nothing_that_is_published(worker):
+    at_once = Calibrator(NOISE, block_size=64)
+    beside = Calibrator(NOISE, block_size=64, worker=worker(1))
+    models = set()
+    for number, sample in enumerate(late(-1.4, duration=80.0)):
+        feed(at_once, [sample])
+        feed(beside, [sample])
+        models.add(beside.selected)
+        assert beside.selected == at_once.selected
+        if number % 20 == 0:
+            for a, b in zip(at_once.published("G2"), beside.published("G2"), strict=True):
+                np.testing.assert_array_equal(a, b)
+        if number == 600:  # what is saved meanwhile has all that came, and nothing is published sooner for it
+            a, b = at_once.result().estimates["G2"], beside.result().estimates["G2"]
+            np.testing.assert_array_equal(a.state, b.state)
+    assert {"G1", "G2"} <= models
+    assert at_once.result().suggestion == beside.result().suggestion
+    assert at_once.result().segments == beside.result().segments
+    at_once.finish()
+    beside.finish()
+    np.testing.assert_array_equal(at_once.estimate("G2").covariance, beside.estimate("G2").covariance)
+
+
+def test_a_result_has_the_last_block_though_its_time_of_effect_has_not_come():
+    calibrator = Calibrator(NOISE, block_size=64)
+    used = []
+    for number, sample in enumerate(late(-1.4, duration=80.0)):
+        feed(calibrator, [sample])
+        if number % 10:
+            continue
+        before = calibrator.estimate("G2").used
+        used.append((before, calibrator.result().estimates["G2"].used, calibrator.estimate("G2").used))
+    ahead = [each for each in used if each[1] > each[0]]
+    assert ahead  # for a second of stamps
+    assert all(before == after for before, _, after in used)
+
+
+def test_what_raises_in_a_worker_is_raised_where_its_outcome_is_to_take_effect(monkeypatch):
+    monkeypatch.setattr(delay_solver, "delayed_rows", lambda *_, **__: 1 / 0)
+    calibrator = Calibrator(NOISE, worker=ThreadPoolExecutor(1))
+    with pytest.raises(ZeroDivisionError):
+        feed(calibrator, late(-1.4, duration=80.0))
+
+
 def test_after_a_restart_the_state_is_that_of_a_calibration_that_began_there():
     samples = late(-1.4)
     again = shifted(samples, -400_000_000_000)
@@ -281,7 +346,7 @@ def test_what_a_vehicle_does_between_two_samples_of_a_slow_dvl_is_not_left_out(m
         left_out.extend(np.flatnonzero(~kept))
         return kept, rows
 
-    monkeypatch.setattr(delay_filter, "without_contradicted", watched)
+    monkeypatch.setattr(delay_solver, "without_contradicted", watched)
     for seconds in (0.0, -1.4):
         calibrate(slow(late(seconds, bursts=(20.3, 41.1, 42.0, 66.6, 90.2, 110.9))), NOISE)
     assert len(looked_at) > 10 and not left_out
