@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `cli.main` does, before numpy is imported
+# for all participants of all processes, read once with the first; the demo, which CI runs, has the defaults
+os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
 
 if sys.dont_write_bytecode:  # hundreds of processes of tests would all compile everything, which none installed does
     sys.dont_write_bytecode = False

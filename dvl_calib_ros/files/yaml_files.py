@@ -20,6 +20,13 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     sections of a node, PyYAML only the last.
     """
 
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        if yaml.__with_libyaml__:  # a quarter of the time, and ROS parses with it as well
+            events = yaml.cyaml.CParser(text)
+            self.check_event, self.peek_event = events.check_event, events.peek_event
+            self.get_event = events.get_event
+
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]

@@ -59,7 +59,7 @@ def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_l
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         player = BagPlayer(world.node, [bag])
         player.wait_for_subscribers()
-        sent = player.play(speed=20.0)
+        sent = player.play(speed=50.0)
         until(lambda: said(diagnostics).get("dvl received") == str(sent["dvl/twist"]), "all DVL samples")
         until(lambda: said(diagnostics).get("imu received") == str(sent["imu/data"]), "all IMU samples")
         n = len(diagnostics)

@@ -123,7 +123,7 @@ def assert_calibrates_to_the_truth(heard: dict[str, list]) -> None:
 def test_what_a_run_publishes_is_what_its_bag_would_hold_bit_by_bit_and_calibrates_to_the_truth(world):
     seconds = 60.0
     run = simulate(scenario(seconds))
-    options = [*OPTIONS, "--trajectory", "free", "--duration", str(seconds), "--speed", "10", "--wait"]
+    options = [*OPTIONS, "--trajectory", "free", "--duration", str(seconds), "--speed", "60", "--wait"]
     with simulator(world, *options, ends_by_itself=True) as process:
         heard = listening(world)
         process.wait(PATIENCE_S)
