@@ -15,7 +15,7 @@ from dvl_calib_ros.errors import InputError
 PROGRAM = "python -m validation"
 # name: what it does. Each is a module of this package with `main(argv) -> int`, imported when it is asked for
 COMMANDS = {
-    "mutants": "faults put into ten rules, each of which the tests must see",
+    "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
 

@@ -74,4 +74,4 @@ def test_a_code_is_one_word_in_capitals(code):
 
 @pytest.mark.parametrize(("name", "kinds"), [("findings", FINDINGS), ("doctor", KINDS)])
 def test_the_troubleshooting_page_has_the_tables(name, kinds):
-    assert section(name) == finding_table(kinds.values()).strip(), "take it from: python .ci/tables.py"
+    assert section(name) == finding_table(kinds.values()).strip(), "take it from: python -m validation figures --render"

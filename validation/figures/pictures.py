@@ -1,35 +1,81 @@
-"""Make the pictures of the documentation anew, in docs/images: python .ci/pictures.py [NAME...]. Needs chromium."""
+"""The pictures of docs/images, each with the commit that it is of in its metadata. Needs chromium."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
 import subprocess
-import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from PIL import Image
-from rich.console import Console, RenderableType
-from rich.text import Text
+from dvl_calib_ros.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))  # this tree, whatever is installed
+from .registry import ROOT, dvl_calib, snapir_ins
+from .sea import GAZEBO, IMPORT, RECORDINGS
+from .stored import git, head
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
 TARGET = ROOT / "docs" / "images"
 HARBOUR_BOX = Path("bags", "harbour_box")  # as it is to stand in a report
 COLOURS = 64
 WIDTH = 1000  # pixels
 BARS = ("#bd1f01", "#ffa90e", "#b9ac70", "#3f90da")
-# A DVL as Gazebo has it: Gaussian noise of one size on the beams, its reference the truth
-GAZEBO = ("--trajectory", "free", "--duration", 300, "--beam-std", 0.01, "--dvl-rate", 5, "--gnss-std", 0,
-          "--gnss-rate", 10, "--seed", 3)  # fmt: skip
+
+COMMIT = "commit"  # key of the text in a picture's metadata
 
 
-def dvl_calib(*arguments: object) -> str:
-    """Output of a command."""
-    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", *map(str, arguments)]
-    return subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+def make(names: Sequence[str]) -> None:
+    """Make some, or all. Raises InputError for an unknown name, and where chromium is missing."""
+    for name in names:
+        if name not in PICTURES:
+            raise InputError(f"{name!r} is no picture; there are {', '.join(PICTURES)}")
+    TARGET.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in names or PICTURES:
+            try:
+                PICTURES[name](Path(scratch))
+            except FileNotFoundError as error:
+                raise InputError(f"{error.filename}: not there; pictures need chromium") from error
+
+
+def not_of_this_history() -> list[str]:
+    """Pictures that do not say of which commit they are, or that of another history. Raises InputError without one."""
+    from PIL import Image
+
+    git("rev-parse", "HEAD")
+    wrong = []
+    for path in sorted(TARGET.glob("*.png")):
+        with Image.open(path) as image:
+            commit = image.info.get(COMMIT)
+        if commit is None:
+            wrong.append(f"docs/images/{path.name}: says no commit; make it with: figures --pictures")
+        elif not _is_ancestor(commit.rstrip("+")):
+            wrong.append(f"docs/images/{path.name}: is of commit {commit}, which is not in the history of this tree")
+    return wrong
+
+
+def _is_ancestor(commit: str) -> bool:
+    try:
+        git("merge-base", "--is-ancestor", commit, "HEAD")
+    except InputError:
+        return False
+    return True
+
+
+def save(picture: Path, name: str) -> None:
+    """As a PNG of few colours, with the commit."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    image = Image.open(picture).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    said = PngInfo()
+    said.add_text(COMMIT, head())
+    image.save(TARGET / f"{name}.png", optimize=True, pnginfo=said)
+    print(f"{name}.png: {image.size}, {(TARGET / f'{name}.png').stat().st_size // 1000} kB")
 
 
 def screenshot(page: Path, name: str, height: int) -> None:
@@ -37,13 +83,13 @@ def screenshot(page: Path, name: str, height: int) -> None:
     shot = page.with_suffix(".png")
     command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={shot}"]
     subprocess.run([*command, f"--window-size={WIDTH},{height}", page.as_uri()], check=True, capture_output=True)
-    image = Image.open(shot).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-    image.save(TARGET / f"{name}.png", optimize=True)
-    print(f"{name}.png: {image.size}, {(TARGET / f'{name}.png').stat().st_size // 1000} kB")
+    save(shot, name)
 
 
 def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns: int, height: int) -> None:
     """What a terminal of this width shows."""
+    from rich.console import Console
+
     console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True, highlight=False)
     console.print(shown)
     page = folder / f"{name}.html"
@@ -53,6 +99,8 @@ def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns
 
 def demo(folder: Path) -> None:
     """The end of the demo."""
+    from rich.text import Text
+
     output = dvl_calib("demo", "--speed", 5)  # slow enough for a busy machine
     lines = [line.rstrip() for line in output.splitlines() if not line.startswith("   playing")]
     terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 916)
@@ -105,15 +153,14 @@ def simulators(folder: Path) -> None:
 
     from dvl_calib_ros.report.style import drawing
 
-    sea = Path(os.environ.get("DVL_CALIB_SNAPIR", ROOT.parent / "shared" / "data" / "snapir")).parent / "snapir_ins"
     bags, made, page = folder / "bags", folder / "gz", folder / "simulators.html"
-    dvl_calib("import", sea, "-o", bags, "--gnss-frame", "ned", "--dvl-std", 0.01, "--gnss-std", 0.01)
+    dvl_calib("import", snapir_ins(), "-o", bags, *IMPORT)
     dvl_calib("simulate", made, *GAZEBO)
     answers = {}
-    for bag in sorted(bags.iterdir()):
-        report = ["--report", page] if bag.name == "T03" else []
-        dvl_calib("diagnose", bag, "--simulator", made, "--json", folder / f"{bag.name}.json", *report)
-        answers[bag.name] = json.loads((folder / f"{bag.name}.json").read_text())
+    for name in RECORDINGS:
+        report = ["--report", page] if name == "T03" else []
+        dvl_calib("diagnose", bags / name, "--simulator", made, "--json", folder / f"{name}.json", *report)
+        answers[name] = json.loads((folder / f"{name}.json").read_text())
     screenshot(page, "simulators_report", 1300)
     models = ("as it is", "with lever_arm", "with dvl_time_offset", "all effects")
     with drawing():
@@ -131,16 +178,8 @@ def simulators(folder: Path) -> None:
         axes.set_xticks(range(len(answers)), list(answers))
         axes.set_ylabel("recorded less simulated, mm/s")
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4)
-        figure.savefig(TARGET / "simulators_gap.png", dpi=150)
-    image = Image.open(TARGET / "simulators_gap.png").convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-    image.save(TARGET / "simulators_gap.png", optimize=True)
-    print("simulators_gap.png")
+        figure.savefig(folder / "simulators_gap.png", dpi=150)
+    save(folder / "simulators_gap.png", "simulators_gap")
 
 
 PICTURES = {each.__name__: each for each in (demo, watch, report, diagnosis, simulators)}
-
-if __name__ == "__main__":
-    TARGET.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as scratch:
-        for wanted in sys.argv[1:] or PICTURES:
-            PICTURES[wanted](Path(scratch))

@@ -1,0 +1,8 @@
+"""All measurements, in the order in which they are made."""
+
+from __future__ import annotations
+
+from . import examples, performance, sea, trials
+from .registry import MEASUREMENTS
+
+__all__ = ["MEASUREMENTS", "examples", "performance", "sea", "trials"]
