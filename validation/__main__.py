@@ -16,6 +16,7 @@ PROGRAM = "python -m validation"
 # name: what it does. Each is a module of this package with `main(argv) -> int`, imported when it is asked for
 COMMANDS = {
     "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
+    "mutants": "faults put into ten rules, each of which the tests must see",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
 

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .batches import Batch, Index
 from .channels import Channel, Decoder, DecodingError
-from .layout import Columns, Layout, NoLayoutError, layout_of
+from .layout import Columns, Layout, NoLayoutError, Rows, layout_of
 from .reader import BagReader, Wanted
-from .sorting import BagMessage
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
 WINDOW_MESSAGES, WINDOW_BYTES = 4096, 4 << 20
 # A recorder has one layout or a few; garbage could have ever new ones.
 _MOST_LAYOUTS = 8
 Stamps = NDArray[np.int64]
-Index = NDArray[np.intp]
 _LATEST_NS = 2**63 - 1
 
 
@@ -35,7 +34,7 @@ class Part:
     arrival: Stamps
     log_ns: Stamps
     columns: Columns | None
-    _data: list[bytes]
+    _data: Sequence[bytes]
     _decoder: Decoder
 
     def __len__(self) -> int:
@@ -43,7 +42,7 @@ class Part:
 
     def messages(self) -> Iterator[tuple[Any, str]]:
         """One by one: the decoded message, None if it cannot be decoded, and then why."""
-        for data in self._data:
+        for data in self._data if self.columns is None else self.columns.messages():
             try:
                 yield self._decoder(self.channel, data), ""
             except DecodingError as error:
@@ -62,37 +61,61 @@ def windows(
     bag: BagReader, topics: Collection[str], one_by_one: Collection[str] = (), wanted: Wanted | None = None
 ) -> Iterator[Window]:
     """Messages of these topics that are wanted, None for all. one_by_one: topics of which no columns are asked for."""
-    messages = bag.raw_messages(topics, wanted)
     layouts = _Layouts(bag.decoder)
     arrived = 0
-    while taken := _taken(messages):
-        by_kind: dict[tuple[int, int], list[int]] = {}  # by the channel's id: its hash costs more than all else here
-        for place, (_, channel, data) in enumerate(taken):
-            by_kind.setdefault((id(channel), len(data)), []).append(place)
-        log_ns = np.array([min(message[0], _LATEST_NS) for message in taken], dtype=np.int64)
+    for batches in _windows(bag.batches(topics, wanted)):
+        places = np.cumsum([0, *(batch.size for batch in batches)])
+        log_ns = np.concatenate([np.minimum(batch.log_ns, _LATEST_NS).astype(np.int64) for batch in batches])
+        by_kind: dict[tuple[int, int], list[tuple[Batch, Index, Index]]] = {}
+        for batch, first in zip(batches, places.tolist(), strict=False):
+            for number, length, at in _kinds(batch):
+                kind = (id(batch.channels[number]), length)  # by the channel's id: its hash costs more than all else
+                by_kind.setdefault(kind, []).append((batch, at, first + at))
         parts = []
-        for places in by_kind.values():
-            channel = taken[places[0]][1]
-            at = np.array(places, dtype=np.intp)
-            contents = [taken[place][2] for place in places]
-            split = [(None, at)] if channel.topic in one_by_one else layouts.split(channel, contents, at)
-            for columns, rows in split:
-                own = contents if len(rows) == len(contents) else [taken[place][2] for place in rows.tolist()]
-                parts.append(Part(channel, rows.astype(np.int64) + arrived, log_ns[rows], columns, own, bag.decoder))
-        arrived += len(taken)
+        for (_, length), found in by_kind.items():
+            batch, at, _ = found[0]
+            channel = batch.channels[int(batch.number[at[0]])]
+            place = np.concatenate([place for *_, place in found])
+            if channel.topic in one_by_one or not length:
+                data = [each for batch, at, _ in found for each in batch.part(at).data()]
+                parts.append(Part(channel, place + arrived, log_ns[place], None, data, bag.decoder))
+                continue
+            contents = np.concatenate([batch.rows(at, length) for batch, at, _ in found])
+            for columns, rows in layouts.split(channel, contents):
+                own = place if len(rows) == len(place) else place[rows]
+                data = [] if columns is not None else [each.tobytes() for each in contents[rows]]
+                parts.append(Part(channel, own + arrived, log_ns[own], columns, data, bag.decoder))
+        arrived += len(log_ns)
         yield Window(parts, int(log_ns[-1]))
 
 
-def _taken(messages: Iterator[BagMessage]) -> list[BagMessage]:
-    """The messages of the next window."""
-    taken: list[BagMessage] = []
-    size = 0
-    for message in messages:
-        taken.append(message)
-        size += len(message[2])
-        if len(taken) >= WINDOW_MESSAGES or size >= WINDOW_BYTES:
-            break
-    return taken
+def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
+    """The messages of each window."""
+    taken: list[Batch] = []
+    count = size = 0
+    for batch in batches:
+        sizes = np.cumsum(batch.end - batch.start)
+        first = 0
+        while first < batch.size:
+            before = int(sizes[first - 1]) if first else 0
+            full = 1 + int(np.searchsorted(sizes, WINDOW_BYTES - size + before))
+            end = min(first + WINDOW_MESSAGES - count, full, batch.size)
+            taken.append(batch.part(slice(first, end)))
+            count, size, first = count + end - first, size + int(sizes[end - 1]) - before, end
+            if count >= WINDOW_MESSAGES or size >= WINDOW_BYTES:
+                yield taken
+                taken, count, size = [], 0, 0
+    if taken:
+        yield taken
+
+
+def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
+    """Channels' numbers and lengths of messages, each with where (M,) such messages are, in order of the first."""
+    lengths = batch.end - batch.start
+    kinds, firsts = np.unique(batch.number + (lengths << 16), return_index=True)
+    for kind in kinds[np.argsort(firsts)].tolist():
+        number, length = kind & 0xFFFF, kind >> 16
+        yield number, length, np.flatnonzero((batch.number == number) & (lengths == length))
 
 
 class _Layouts:
@@ -102,27 +125,26 @@ class _Layouts:
         self._decoder = decoder
         self._known: dict[tuple[Channel, int], list[Layout]] = {}
 
-    def split(self, channel: Channel, data: list[bytes], at: Index) -> Iterator[tuple[Columns | None, Index]]:
-        """Messages of one length, which are at these places, by layout; those without any last, with None."""
-        known = self._known.setdefault((channel, len(data[0])), [])
+    def split(self, channel: Channel, data: Rows) -> Iterator[tuple[Columns | None, Index]]:
+        """Messages of one length, and which of them they are, by layout; those without any last, with None."""
+        known = self._known.setdefault((channel, data.itemsize), [])
         left = np.arange(len(data))
         tried = 0
         while len(left):
-            if tried == len(known) and not self._learn(channel, data[left[0]], known):
+            if tried == len(known) and not self._learn(channel, data[left[0]].tobytes(), known):
                 break
             layout = known[tried]
             tried += 1
-            some = data if len(left) == len(data) else [data[place] for place in left.tolist()]
-            rows = layout.view(some)
+            rows = layout.view(data if len(left) == len(data) else data[left])
             shared = layout.shared(rows)
             if shared.all():
-                yield Columns(layout, rows), at[left]
+                yield Columns(layout, rows), left
                 return
             if shared.any():
-                yield Columns(layout, rows[shared]), at[left[shared]]
+                yield Columns(layout, rows[shared]), left[shared]
             left = left[~shared]
         if len(left):
-            yield None, at[left]
+            yield None, left
 
     def _learn(self, channel: Channel, data: bytes, known: list[Layout]) -> bool:
         store = self._decoder.typestore(channel)

@@ -9,6 +9,7 @@ https://www.omg.org/spec/DDS-XTYPES, 7.4.3 (XCDR version 1, plain).
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,9 +50,9 @@ class Layout:
     lengths: dict[str, int]
     flags: frozenset[str]
 
-    def view(self, messages: list[bytes]) -> Rows:
-        """Messages of this length in bytes as rows, of which those count that `shared` says."""
-        return np.frombuffer(b"".join(messages), dtype=self.dtype)
+    def view(self, messages: Rows) -> Rows:
+        """Messages (N,), items of this many bytes, as rows, of which those count that `shared` says."""
+        return messages.view(self.dtype)
 
     def shared(self, rows: Rows) -> Mask:
         """(N,) which rows are laid out so, with nothing but ASCII in their strings."""
@@ -87,6 +88,10 @@ class Columns:
             raise AttributeError(f"no field {path!r}")
         return Columns(layout, self._rows, f"{path}.")
 
+    def messages(self) -> Iterator[bytes]:
+        """The bytes of each message, as recorded."""
+        return (row.tobytes() for row in self._rows.view(("V", self._rows.itemsize)))
+
     def part(self, at: Any) -> Columns:
         """The rows of a slice, of indices or of a mask."""
         return Columns(self._layout, self._rows[at], self._prefix)
@@ -114,7 +119,7 @@ def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
         message = store.deserialize_cdr(data, msgtype)
     except SerdeError as error:
         raise NoLayoutError(str(error)) from error
-    _compare(layout, layout.view([data]), message)
+    _compare(layout, np.frombuffer(data, dtype), message)
     return layout
 
 

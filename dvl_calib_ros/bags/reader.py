@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from ..errors import InputError
+from .batches import Batch, batched, one_batch
 from .channels import Channel, Decoder, DecodingError
 from .files import ZSTD_MAGIC, files_of
 from .salvage.damage import LARGEST_RECORD
@@ -118,42 +119,49 @@ class BagReader:
             at += count
         return spans
 
-    def messages(self, topics: Iterable[str], wanted: Wanted | None = None) -> Iterator[DecodedMessage]:
-        """Messages of these topics. wanted: which are decoded, None for all; the others are left out."""
-        for log_ns, channel, data in self.raw_messages(topics, wanted):
+    def messages(self, topics: Iterable[str]) -> Iterator[DecodedMessage]:
+        """Messages of these topics."""
+        for log_ns, channel, data in self.raw_messages(topics):
             try:
                 message, why = self.decoder(channel, data), ""
             except DecodingError as error:
                 message, why = None, str(error)
             yield channel.topic, log_ns, message, why
 
-    def raw_messages(self, topics: Iterable[str], wanted: Wanted | None = None) -> Iterator[BagMessage]:
-        """Log time, channel and CDR bytes of the messages of these topics that are wanted, None for all."""
-        if wanted is not None:
-            return (message for message in self.raw_messages(topics) if wanted(message[1].topic, message[0]))
+    def raw_messages(self, topics: Iterable[str]) -> Iterator[BagMessage]:
+        """Log time, channel and CDR bytes of the messages of these topics."""
         chosen = frozenset(topics)
-        streams = [self._of_source(source, chosen) for source in self._sources]
-        if len(streams) == 1:
-            next(streams[0])  # the marker
-            return streams[0]
+        if len(self._sources) == 1:
+            return (message for batch in self._of_source(self._sources[0], chosen) for message in batch.messages())
+        streams = [self._singly(source, chosen) for source in self._sources]
         return (message for message in heapq.merge(*streams, key=itemgetter(0)) if message[1] is not _MARKER)
 
-    def _of_source(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
-        start_ns = newest_ns = source.span_ns[0]
+    def batches(self, topics: Iterable[str], wanted: Wanted | None = None) -> Iterator[Batch]:
+        """Messages of these topics that are wanted, None for all, by the thousand."""
+        chosen = frozenset(topics)
+        if len(self._sources) == 1:
+            found = self._of_source(self._sources[0], chosen)
+        else:
+            found = batched(self.raw_messages(chosen))
+        return found if wanted is None else _wanted(found, wanted)
+
+    def _singly(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
         # a marker where it begins: merging opens a recording only when its time has come
-        yield start_ns, _MARKER, b""
+        yield source.span_ns[0], _MARKER, b""
+        for batch in self._of_source(source, topics):
+            yield from batch.messages()
+
+    def _of_source(self, source: Source, topics: frozenset[str]) -> Iterator[Batch]:
+        start_ns = newest_ns = source.span_ns[0]
         read = lost = 0
         try:
-            for message in source.messages(topics):
-                newest_ns, channel, data = message
-                if data.startswith(ZSTD_MAGIC):  # message compression; CDR begins otherwise
-                    unpacked = _unpacked_message(data)
-                    if unpacked is None:
-                        lost += 1
-                        continue
-                    message = newest_ns, channel, unpacked
-                yield message
-                read += 1
+            for batch in source.batches(topics):
+                newest_ns = int(batch.log_ns[-1])
+                whole = _unpacked(batch)
+                lost += batch.size - whole.size
+                read += whole.size
+                if whole.size:
+                    yield whole
         except DAMAGE as error:
             if not source.damage_noted:
                 self.notes.append(
@@ -201,6 +209,26 @@ class BagReader:
 
 def _unreadable(path: Path, error: OSError) -> InputError:
     return InputError(f"{path}: cannot be read ({error.strerror}); check name, permissions and disk")
+
+
+def _wanted(batches: Iterator[Batch], wanted: Wanted) -> Iterator[Batch]:
+    for batch in batches:
+        topics = {number: channel.topic for number, channel in batch.channels.items()}
+        each = zip(batch.number.tolist(), batch.log_ns.tolist(), strict=True)
+        at = [place for place, (number, log_ns) in enumerate(each) if wanted(topics[number], log_ns)]
+        if at:
+            yield batch.part(at)
+
+
+def _unpacked(batch: Batch) -> Batch:
+    """Messages that were compressed by themselves as they were before; without those that are damaged."""
+    packed = batch.begin_with(ZSTD_MAGIC)  # CDR begins otherwise
+    if not packed.any():
+        return batch
+    each = zip(packed.tolist(), batch.messages(), strict=True)
+    unpacked = ((log_ns, channel, _unpacked_message(data) if is_packed else data)
+                for is_packed, (log_ns, channel, data) in each)  # fmt: skip
+    return one_batch((log_ns, channel, data) for log_ns, channel, data in unpacked if data is not None)
 
 
 def _unpacked_message(data: bytes) -> bytes | None:

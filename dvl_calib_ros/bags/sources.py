@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..errors import InputError
+from .batches import Batch, batched
 from .channels import Channel, definition_of
 from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
 from .raw_file import open_recording, unreadable
@@ -29,7 +30,7 @@ ROS1_MAGIC = b"#ROSBAG"
 MERGED_AT_ONCE = 64 << 20
 DAMAGE = (DamagedError, OSError, sqlite3.Error, struct.error)
 
-Messages = Callable[[Collection[str]], Iterator[BagMessage]]
+Batches = Callable[[Collection[str]], Iterator[Batch]]
 """Topics -> their messages."""
 Salvage = Callable[[Path], Iterator[Salvaged]]
 
@@ -38,7 +39,8 @@ class Source:
     """One recorded file.
 
     path: as the user knows it. counts: channel -> how many messages it announces. span_ns: first and last log time.
-    messages: of some topics, in order of log time; raises what is in `DAMAGE` after the last, unless damage_noted.
+    batches: messages of some topics, in order of log time; raises what is in `DAMAGE` after the last, unless
+    damage_noted.
     """
 
     def __init__(
@@ -46,13 +48,13 @@ class Source:
         path: Path,
         counts: Mapping[Channel, int],
         span_ns: tuple[int, int],
-        messages: Messages,
+        batches: Batches,
         damage_noted: bool = False,
     ) -> None:
         self.path = path
         self.counts = counts
         self.span_ns = span_ns
-        self.messages = messages
+        self.batches = batches
         self.damage_noted = damage_noted
 
     def channels(self, topic: str) -> list[Channel]:
@@ -121,23 +123,26 @@ def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
             raise DamagedError(f"its index counts messages of channel {number}, which it does not name")
         counts[channels[number]] += count
 
-    def messages(topics: Collection[str]) -> Iterator[BagMessage]:
-        wanted = {number for number, channel in channels.items() if channel.topic in topics}
+    def batches(topics: Collection[str]) -> Iterator[Batch]:
+        wanted = {number: channel for number, channel in channels.items() if channel.topic in topics}
         in_order = bytes_at_once(summary, wanted) <= MERGED_AT_ONCE
         found = indexed_messages(path, summary, wanted, in_order)
-        messages = ((log_ns, channels[number], data) for log_ns, number, data in found)
-        return messages if in_order else by_log_time(messages)
+        return found if in_order else batched(by_log_time(message for batch in found for message in batch.messages()))
 
     span_ns = (statistics.message_start_time, statistics.message_end_time)
-    return Source(shown, counts, span_ns, _until_damage(messages, path, salvage_mcap, counts))
+    return Source(shown, counts, span_ns, _until_damage(batches, path, salvage_mcap, counts))
 
 
 def _sqlite(path: Path, shown: Path, notes: list[str]) -> Source:
     database = Database(path)
     if database.astray:
         notes.append(f"{shown}: {database.astray} messages are of topics that it does not name, and left out")
-    messages = _until_damage(database.messages, path, salvage_sqlite, database.counts)
-    return Source(shown, database.counts, database.span_ns, messages)
+
+    def batches(topics: Collection[str]) -> Iterator[Batch]:
+        return batched(database.messages(topics))
+
+    found = _until_damage(batches, path, salvage_sqlite, database.counts)
+    return Source(shown, database.counts, database.span_ns, found)
 
 
 def _salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: list[str]) -> Source:
@@ -165,10 +170,10 @@ def _salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: list[s
         with suppress(*DAMAGE):  # it has been told of
             yield from (message for message in _with_channels(salvage(path)) if message[1].topic in topics)
 
-    def in_order_of_time(topics: Collection[str]) -> Iterator[BagMessage]:
-        return by_log_time(messages(topics))
+    def batches(topics: Collection[str]) -> Iterator[Batch]:
+        return batched(messages(topics) if in_order else by_log_time(messages(topics)))
 
-    return Source(shown, counts, (first_ns, last_ns), messages if in_order else in_order_of_time, damage_noted=True)
+    return Source(shown, counts, (first_ns, last_ns), batches, damage_noted=True)
 
 
 def _with_channels(salvaged: Iterator[Salvaged]) -> Iterator[BagMessage]:
@@ -182,31 +187,33 @@ def _with_channels(salvaged: Iterator[Salvaged]) -> Iterator[BagMessage]:
         yield log_ns, channel, data
 
 
-def _until_damage(messages: Messages, path: Path, salvage: Salvage, counts: Mapping[Channel, int]) -> Messages:
+def _until_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mapping[Channel, int]) -> Batches:
     """Messages as an index leads to them, after damage those that salvaging finds. counts: what the index announces."""
 
-    def all_messages(topics: Collection[str]) -> Iterator[BagMessage]:
+    def all_batches(topics: Collection[str]) -> Iterator[Batch]:
         newest_ns, read = -1, 0
         newest: list[BagMessage] = []
         try:
-            for message in messages(topics):
-                if message[0] != newest_ns:
-                    newest_ns, newest = message[0], []
-                newest.append(message)
-                read += 1
-                yield message
+            for batch in batches(topics):
+                if batch.log_ns[0] != newest_ns:
+                    newest = []
+                if batch.log_ns[-1] != newest_ns:
+                    newest_ns, newest = int(batch.log_ns[-1]), []
+                newest += batch.part(batch.log_ns == newest_ns).messages()
+                read += batch.size
+                yield batch
             if read < (announced := sum(count for channel, count in counts.items() if channel.topic in topics)):
                 raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
         except DAMAGE as error:
             damage = yield from _rest(salvage(path), topics, newest_ns, newest)
             raise DamagedError(damage or said(error)) from error
 
-    return all_messages
+    return all_batches
 
 
 def _rest(
     salvaged: Iterator[Salvaged], topics: Collection[str], newest_ns: int, newest: Sequence[BagMessage]
-) -> Generator[BagMessage, None, str]:
+) -> Generator[Batch, None, str]:
     """What of a damaged recording comes after the messages that its index led to (at newest_ns: `newest`).
 
     Returns what is damaged.
@@ -225,7 +232,7 @@ def _rest(
         except DAMAGE as error:
             damage = said(error)
 
-    yield from by_log_time(later())
+    yield from batched(by_log_time(later()))
     return damage
 
 

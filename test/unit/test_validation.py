@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 
 import pytest
+from conftest import ROOT
 
-from validation import repeat
+from validation import mutants, repeat
 from validation.__main__ import COMMANDS, main
 
 
@@ -18,7 +19,7 @@ def test_every_command_is_listed_and_there(capsys):
         assert callable(importlib.import_module(f"validation.{name}").main)
 
 
-@pytest.mark.parametrize("wrong", [["nonsense"], ["repeat", "--times", "0"]])
+@pytest.mark.parametrize("wrong", [["nonsense"], ["repeat", "--times", "0"], ["mutants", "nonsense"]])
 def test_a_wrong_call_is_refused_in_one_line(capsys, wrong):
     assert main(wrong) == 2
     said = capsys.readouterr()
@@ -44,3 +45,37 @@ def test_a_run_that_cannot_begin_is_a_failure(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(repeat, "SUITE", ("-q", str(tmp_path / "test_missing.py")))
     assert repeat.main(["--times", "1", "--logs", str(tmp_path / "logs")]) == 1
     assert "1 of 1 runs failed" in capsys.readouterr().out
+
+
+def test_every_mutant_changes_one_place_that_is_there_and_its_tests_are():
+    for each in mutants.MUTANTS:
+        assert (ROOT / each.path).read_text().count(each.old) == 1 and each.old != each.new, each.rule
+        for test in each.tests:
+            path, _, name = test.partition("::")
+            assert f"def {name}" in (ROOT / path).read_text(), test
+    assert len({each.rule for each in mutants.MUTANTS}) == 10
+
+
+@pytest.mark.parametrize(
+    ("text", "failed", "said"),
+    [
+        ("def test_good(): pass", None, ""),
+        ("def test_bad(): assert False", "test_it.py::test_bad", ""),
+        ("import nothing_like_it", None, "nothing_like_it"),  # no test has seen anything then
+    ],
+)
+def test_only_a_test_that_fails_kills_a_mutant(tmp_path, text, failed, said):
+    (tmp_path / "pytest.ini").write_text("[pytest]")
+    (tmp_path / "test_it.py").write_text(text)
+    by, output = mutants.tests_in(tmp_path, ["test_it.py"])
+    assert by == failed and (said in output if said else output == "")
+
+
+def test_a_mutant_that_survives_is_said_by_the_exit_code_and_the_copy_alone_is_changed(monkeypatch, capsys):
+    path = "dvl_calib_ros/errors.py"
+    before = (ROOT / path).read_text()
+    harmless = mutants.Mutant("nothing", path, before, f"{before}# more", ("test/unit/calibration/test_height.py",))
+    monkeypatch.setattr(mutants, "MUTANTS", (harmless,))
+    assert mutants.main([]) == 1
+    assert "nothing               SURVIVED" in capsys.readouterr().out
+    assert (ROOT / path).read_text() == before

@@ -8,22 +8,24 @@ the records that it is in.
 
 from __future__ import annotations
 
-import heapq
 import os
 import re
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import accumulate, chain
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
+from ..batches import Batch, one_batch, times
+from ..channels import Channel
 from ..raw_file import holes_in, open_recording
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 from .mcap_chunks import RECORD_HEAD, is_chunk, open_chunk
@@ -34,6 +36,7 @@ from .mcap_records import (
     Found,
     Tables,
     messages_of,
+    places_of,
     record_head,
     search,
     search_records,
@@ -106,26 +109,30 @@ def bytes_at_once(summary: Summary, channels: Collection[int]) -> int:
     return max(accumulate(change for *_, change in sorted(changes)), default=0)
 
 
-def indexed_messages(path: Path, summary: Summary, channels: Collection[int], in_order: bool = True) -> Iterator[Found]:
+def indexed_messages(
+    path: Path, summary: Summary, channels: Mapping[int, Channel], in_order: bool = True
+) -> Iterator[Batch]:
     """Messages of these channels in order of log time, or chunk by chunk. Raises DamagedError at damage.
 
     Merging takes as much memory as `bytes_at_once`.
     """
-
-    def read(index: ChunkIndex) -> Iterator[Found]:
-        yield from _whole_chunk(file, size, index, tables, wanted)
-
     tables = Tables(summary)
-    wanted = frozenset(channels)
     size = path.stat().st_size
     with open_recording(path) as file:
-        for group in _overlapping(summary.chunk_indexes, wanted):
-            if len(group) == 1 or not in_order:
-                yield from chain.from_iterable(map(read, group))
-            else:
-                # a marker where each begins: merging opens a chunk only when its time has come
-                streams = [chain([(index.message_start_time, -1, b"")], read(index)) for index in group]
-                yield from (found for found in heapq.merge(*streams, key=itemgetter(0)) if found[1] >= 0)
+        for group in _overlapping(summary.chunk_indexes, channels):
+            read = (_whole_chunk(file, size, index, tables, channels) for index in group)
+            found = _merged(group, read) if len(group) > 1 and in_order else read
+            yield from (batch for batch in found if batch.size)
+
+
+def _merged(group: Sequence[ChunkIndex], chunks: Iterator[Batch]) -> Iterator[Batch]:
+    """Chunks that overlap, in order of log time; each is read when its time has come."""
+    held = next(chunks)
+    for index in group[1:]:
+        before = int(np.searchsorted(held.log_ns, index.message_start_time, side="right"))
+        yield held.part(slice(before))
+        held = held.part(slice(before, None)).compact().merged(next(chunks))
+    yield held
 
 
 def _overlapping(indexes: Collection[ChunkIndex], wanted: Collection[int]) -> Iterator[list[ChunkIndex]]:
@@ -145,7 +152,9 @@ def _overlapping(indexes: Collection[ChunkIndex], wanted: Collection[int]) -> It
         yield group
 
 
-def _whole_chunk(file: BinaryIO, size: int, index: ChunkIndex, tables: Tables, wanted: Collection[int]) -> list[Found]:
+def _whole_chunk(
+    file: BinaryIO, size: int, index: ChunkIndex, tables: Tables, channels: Mapping[int, Channel]
+) -> Batch:
     at = index.chunk_start_offset
     opcode, length = record_head(file, at)
     if opcode != Opcode.CHUNK:
@@ -153,10 +162,17 @@ def _whole_chunk(file: BinaryIO, size: int, index: ChunkIndex, tables: Tables, w
     chunk = open_chunk(file, at, length, size)
     if chunk.damage:
         raise DamagedError(chunk.damage)
+    places = places_of(chunk.records, tables)
+    if places is not None:
+        found = Batch(times(places.log_ns), *places[1:], chunk.records, channels)
+        if len(channels) < len(tables.channels):
+            found = found.part(np.isin(found.number, list(channels)))
+        return found.sorted()
     damage = Damage()
-    found = messages_of(at, chunk.records, tables, damage, wanted)
+    messages = messages_of(at, chunk.records, tables, damage, channels)
     damage.raise_if_any()
-    return found
+    singly = ((log_ns, channels[number], data) for log_ns, number, data in messages)
+    return one_batch(singly)
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:

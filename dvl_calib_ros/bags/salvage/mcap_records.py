@@ -8,13 +8,15 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from io import BytesIO
 from operator import itemgetter
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from mcap.summary import Summary
+from numpy.typing import NDArray
 
 from ..raw_file import Hole
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
@@ -30,8 +32,20 @@ _LARGEST_FILE = 1 << 62
 # What damaged bytes make the mcap library raise when it parses records
 PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
 
+# The same from where the record begins, for thousands of them; of its content begins what comes after
+_HEAD_AT = np.dtype({"names": ["channel", "log_ns"], "formats": ["<u2", "<u8"], "offsets": [9, 15], "itemsize": 31})
+
 Found = tuple[int, int, bytes]
 """Log time (ns), channel and content of a message."""
+
+
+class Places(NamedTuple):
+    """Of N messages: log time (ns), number of the channel, and where its content begins and ends."""
+
+    log_ns: NDArray[np.uint64]
+    number: NDArray[np.intp]
+    start: NDArray[np.intp]
+    end: NDArray[np.intp]
 
 
 class Tables:
@@ -133,6 +147,40 @@ def _records_follow(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
             at += RECORD_HEAD.size + length
         return True
     return False
+
+
+def places_of(records: bytes, tables: Tables) -> Places | None:
+    """The messages of sound records in their order; None where something is wrong, which `messages_of` looks into."""
+    places, here, n = [], 0, len(records)
+    head = RECORD_HEAD.unpack_from
+    try:
+        while here < n:
+            places.append(here)
+            here += 9 + head(records, here)[1]
+    except struct.error:
+        return None
+    if here != n or n < _HEAD_AT.itemsize:
+        return None
+    start = np.array(places, dtype=np.intp)
+    end = np.append(start[1:], n)
+    opcode = np.frombuffer(records, dtype=np.uint8)[start]
+    is_message = opcode == MESSAGE
+    others = np.flatnonzero(~is_message).tolist()
+    start, end = start[is_message], end[is_message]
+    if (end - start < _HEAD_AT.itemsize).any():
+        return None
+    heads = np.ndarray((n - _HEAD_AT.itemsize + 1,), _HEAD_AT, records, strides=(1,))[start]
+    number = heads["channel"].astype(np.intp)
+    if not tables.channels.keys() >= set(np.flatnonzero(np.bincount(number)).tolist()):
+        return None
+    for other in others:
+        if not SCHEMA <= opcode[other] < MESSAGE:
+            return None
+        try:
+            tables.note(places[other], int(opcode[other]), records[places[other] + 9 : (*places, n)[other + 1]])
+        except DamagedError:
+            return None
+    return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
 
 
 def messages_of(

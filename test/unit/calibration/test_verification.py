@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from filter_problems import random_problem
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
+from scipy.stats import chi2
 
 from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.error_model import correct, correction_jacobian
@@ -148,3 +149,20 @@ def test_the_verdict_and_its_first_reason(arguments, word, reason):
     verification = judged(**arguments)
     assert verification.verdict is word
     assert reason in verification.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("limit", "above", "changes"),
+    [
+        ("what chance makes of the prediction", Word.MARGINAL, {}),
+        ("what chance makes of the prediction", Word.MARGINAL, {"max_error_ratio": 1.5}),
+        ("several times the prediction", Word.REJECT, {}),
+    ],
+)
+def test_the_verdict_changes_at_its_limit_and_not_before(limit, above, changes):
+    ratio = Parameters(**changes).max_error_ratio
+    by_chance = ratio * np.sqrt(chi2.isf(0.01, 3 * 1000) / (3 * 1000))
+    times = by_chance if limit.startswith("what chance") else 3.0
+    words = [judged(HeldOutError(1000, 1.0, 0.05 * times * (1.0 + by), 0.05, 0.002), **changes) for by in (-1e-3, 1e-3)]
+    below = Word.ACCEPT if above is Word.MARGINAL else Word.MARGINAL
+    assert [each.verdict for each in words] == [below, above]

@@ -1,0 +1,138 @@
+"""Recorded messages by the thousand: where each is among bytes that were read at once, instead of each by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .channels import Channel
+from .sorting import BagMessage
+
+# What single messages are gathered to, and their bytes.
+_MOST, _MOST_BYTES = 4096, 4 << 20
+_LATEST_NS = 2**63 - 1
+
+Times = NDArray[Any]
+"""(N,) ns, int64; Python's integers where damage made some that int64 does not hold."""
+Index = NDArray[np.intp]
+
+
+class Batch(NamedTuple):
+    """N messages that follow each other in a recording, in order of log time.
+
+    log_ns: (N,). number: (N,) of each message's channel in `channels`. start, end: (N,) where it lies in `content`.
+    """
+
+    log_ns: Times
+    number: NDArray[np.intp]
+    start: Index
+    end: Index
+    content: bytes
+    channels: Mapping[int, Channel]
+
+    @property
+    def size(self) -> int:
+        """N."""
+        return len(self.log_ns)
+
+    def part(self, at: Any) -> Batch:
+        """Those of a slice, of indices or of a mask."""
+        return self._replace(log_ns=self.log_ns[at], number=self.number[at], start=self.start[at], end=self.end[at])
+
+    def data(self) -> Iterator[bytes]:
+        """The bytes of each message."""
+        content = self.content
+        return (content[start:end] for start, end in zip(self.start.tolist(), self.end.tolist(), strict=True))
+
+    def messages(self) -> Iterator[BagMessage]:
+        """One by one."""
+        channels = self.channels
+        of_each = [channels[number] for number in self.number.tolist()]
+        return zip(self.log_ns.tolist(), of_each, self.data(), strict=True)
+
+    def begin_with(self, magic: bytes) -> NDArray[np.bool_]:
+        """Which (N,) messages begin so."""
+        found = np.zeros(self.size, dtype=bool)
+        at = np.flatnonzero(self.end - self.start >= len(magic))
+        content = np.frombuffer(self.content, dtype=np.uint8)
+        for place, byte in enumerate(magic):
+            at = at[content[self.start[at] + place] == byte]
+        found[at] = True
+        return found
+
+    def rows(self, at: Index, length: int) -> NDArray[Any]:
+        """A copy of messages of one length above zero, as (M,) items of so many bytes."""
+        item = np.dtype(("V", length))
+        everywhere = np.ndarray((len(self.content) - length + 1,), item, self.content, strides=(1,))
+        return everywhere[self.start[at]]  # `take` would copy all that overlaps first
+
+    def compact(self) -> Batch:
+        """The same without bytes that are in no message."""
+        end = np.cumsum(self.end - self.start)
+        return self._replace(start=end - (self.end - self.start), end=end, content=b"".join(self.data()))
+
+    def merged(self, later: Batch) -> Batch:
+        """With another one's of the same channels, which come after those of the same time."""
+        if not self.size:
+            return later
+        shift = len(self.content)
+        log_ns = np.concatenate([self.log_ns, later.log_ns])
+        joined = Batch(
+            log_ns,
+            np.concatenate([self.number, later.number]),
+            np.concatenate([self.start, later.start + shift]),
+            np.concatenate([self.end, later.end + shift]),
+            self.content + later.content,
+            self.channels,
+        )
+        return joined.sorted()
+
+    def sorted(self) -> Batch:
+        """In order of log time, those of one time as they are."""
+        if (self.log_ns[1:] >= self.log_ns[:-1]).all():
+            return self
+        return self.part(np.argsort(self.log_ns, kind="stable"))
+
+
+def times(log_ns: Any) -> Times:
+    """Log times (N,), of damaged recordings among them."""
+    array = np.asarray(log_ns)
+    if array.dtype.kind == "u":
+        return array.astype(np.int64 if not len(array) or array.max() <= _LATEST_NS else object)
+    try:
+        return np.array(log_ns, dtype=np.int64)
+    except OverflowError:
+        return np.array(log_ns, dtype=object)
+
+
+def batched(messages: Iterable[BagMessage]) -> Iterator[Batch]:
+    """Single messages, which are in order of log time; those before what is raised come before it."""
+    held: list[BagMessage] = []
+    size = 0
+    try:
+        for message in messages:
+            held.append(message)
+            size += len(message[2])
+            if len(held) >= _MOST or size >= _MOST_BYTES:
+                yield one_batch(held)
+                held, size = [], 0
+    except Exception:
+        if held:
+            yield one_batch(held)
+        raise
+    if held:
+        yield one_batch(held)
+
+
+def one_batch(messages: Iterable[BagMessage]) -> Batch:
+    """Messages as one batch, in the order that they have."""
+    log_ns, channels, data = tuple(zip(*messages, strict=True)) or ((), (), ())
+    numbers: dict[int, int] = {}  # by the channel's id: its hash costs more than all else here
+    number = np.array([numbers.setdefault(id(channel), len(numbers)) for channel in channels], dtype=np.intp)
+    known = {numbers[id(channel)]: channel for channel in channels}
+    end = np.cumsum([len(each) for each in data], dtype=np.intp)
+    start = np.concatenate([[0], end[:-1]]).astype(np.intp)
+    return Batch(times(log_ns), number, start, end, b"".join(data), known)
