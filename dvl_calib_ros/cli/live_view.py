@@ -91,9 +91,9 @@ def _table(status: Status) -> RenderableType:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE, pad_edge=False)
-    for column in ("", "estimate", "± 1σ", "to fine", "still to fly"):
+    for column in ("", "estimate", "± 1σ", "to fine", "still to drive"):
         table.add_column(
-            column, justify="right" if column in ("estimate", "± 1σ") else "left", no_wrap=column != "still to fly"
+            column, justify="right" if column in ("estimate", "± 1σ") else "left", no_wrap=column != "still to drive"
         )
     for name, unit in status.parameters:
         key = f"{name} [{unit}]"

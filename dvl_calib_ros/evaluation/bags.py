@@ -26,6 +26,7 @@ from ..parallel import Workers, run_all
 from ..replay.navigation import Navigation, dead_reckoned, navigation_document
 from ..replay.replay import Topics, replay
 from .metrics import Moments, vrmse
+from .results import Failure
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class _Replayed:
     """corrections: (M, 3, 3), nan where a model had no sample. moments: of the paired samples, None without.
 
     delayed: by model with a lever arm and delay, if it claims any, what it corrects. recording: all streams, thinned.
-    selected: model that was selected, and what it corrects; None if it used nothing.
+    selected: model that was selected, and what it corrects; None if it used nothing. failed: why there is none of this.
     """
 
     corrections: Array
@@ -65,6 +66,7 @@ class _Replayed:
     delayed: Mapping[str, Terms]
     recording: Recording | None
     selected: tuple[str, Terms | None]
+    failed: tuple[str, ...] = ()
 
 
 def cross_check(
@@ -78,8 +80,10 @@ def cross_check(
     """Replay every bag, verify on all others. Raises InputError."""
     if len(set(bags)) < len(bags):
         raise InputError(f"{', '.join(map(str, bags))}: a bag is named twice; it cannot be checked against itself")
-    found = run_all(partial(_replay_one, parameters, tuple(models), topics), bags, workers, on_progress)
+    found = run_all(partial(_replay_or_nothing, parameters, tuple(models), topics), bags, workers, on_progress)
     if not any(each.moments for each in found):
+        if failed := [f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in each.failed]:
+            raise InputError(f"nothing is left to check: {failed[0]}")
         raise InputError(f"{', '.join(map(str, bags))}: no sample has a reference to check against; set --gnss-topic")
     uncorrected = np.full(len(bags), np.nan)
     corrected = np.full((len(bags), len(models), len(bags)), np.nan)
@@ -102,7 +106,9 @@ def cross_check(
         n_paired=tuple(each.n_paired for each in found),
         uncorrected=uncorrected,
         corrected=corrected,
-        notes=tuple(f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in each.notes),
+        notes=tuple(
+            f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in (*each.failed, *each.notes)
+        ),
         parameters=parameters.as_dict(),
         selected=tuple(each.selected[0] for each in found),
         navigation=_navigation(bags, found, parameters),
@@ -140,6 +146,17 @@ def _navigation(
             if reckoned is not None:
                 navigation[str(calibrated), str(verified)] = reckoned
     return navigation
+
+
+def _replay_or_nothing(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:
+    """What raises costs its own bag, not the others. Raises InputError for one that cannot be read."""
+    try:
+        return _replay_one(parameters, models, topics, bag)
+    except InputError:
+        raise
+    except Exception as error:
+        failed = f"failed, and is in none of the figures: {Failure.of(error, 'replay')}"
+        return _Replayed(np.full((len(models), 3, 3), np.nan), None, 0, (), {}, None, ("-", None), (failed,))
 
 
 def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:

@@ -10,6 +10,7 @@ from command_line import succeed
 from report_fixtures import drawn
 
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.evaluation import bags as evaluation_of_bags
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +45,24 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
 def test_the_table_for_spreadsheets_is_for_trajectories_only(bags, tmp_path, capsys):
     assert main(["evaluate", *map(str, bags), "--csv", str(tmp_path / "x.csv")]) == 2
     assert "only for a folder of trajectories" in capsys.readouterr().err
+
+
+def test_a_bag_whose_replay_fails_is_named_and_the_others_are_checked(bags, tmp_path, monkeypatch, capsys):
+    real, out = evaluation_of_bags._replay_one, tmp_path / "x.json"
+
+    def failing(*asked):
+        if asked[-1] == bags[0]:
+            raise ZeroDivisionError("division by zero")
+        return real(*asked)
+
+    monkeypatch.setattr(evaluation_of_bags, "_replay_one", failing)
+    _, warned = succeed(capsys, "evaluate", *bags, "--models", "G1", "--jobs", "1", "--json", out)
+    why = "failed, and is in none of the figures: replay: ZeroDivisionError: division by zero"
+    assert why in " ".join(warned.split())
+    document = json.loads(out.read_text())
+    assert document["notes"][0] == f"{bags[0]}: {why}"
+    assert document["paired"][str(bags[0])] == 0 and document["paired"][str(bags[1])] > 100
+    monkeypatch.setattr(evaluation_of_bags, "_replay_one", lambda *_: real())
+    assert main(["evaluate", *map(str, bags), "--models", "G1", "--jobs", "1"]) == 2
+    error = capsys.readouterr().err
+    assert "nothing is left to check" in error and "TypeError" in error and error.count("\n") == 1

@@ -212,7 +212,7 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
             message.header.stamp.sec, message.header.frame_id = 1000 + i, "dvl_link"
             message.twist.twist.linear.x = 1.5
             publisher.publish(message)
-        for text in ("20 used", "still to fly", "phi_x deg", ": model auto"):
+        for text in ("20 used", "still to drive", "phi_x deg", ": model auto"):
             screen.until(text)
         assert not saved.exists()
         screen.key(b"\x03")

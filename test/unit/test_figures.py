@@ -20,7 +20,7 @@ from validation.figures.unmarked import unmarked
 DEFINITIONS = {
     "evaluation.md": ("R 0.2 m/s with GNSS and 0.025 m/s without",),
     "lever_arm.md": (
-        "x -1.86 ± 0.02 ... m", "two hundred simulated runs of 120 s", "delays within 2.9 s", "mounting_rpy 0 0 0.785",
+        "two hundred simulated runs of 120 s", "delays within 2.9 s", "mounting_rpy 0 0 0.785",
     ),
     "models.md": (
         "the paper's own, 0.0323", "`reference_offset_std` (5 mm/s", "within the 68 / 95 % interval",

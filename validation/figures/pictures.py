@@ -129,7 +129,7 @@ def watch(folder: Path) -> None:
     found = diagnose(calibrator, feed.decoder.dvl_type, [], Silence(0.0), RecentCounts(), 0.0)
     values = {item.key: item.value for item in found.values}
     shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
-    terminal(shown, folder, "watch", "dvl-calib run --watch", 100, 318)
+    terminal(shown, folder, "watch", "dvl-calib run --watch", 100, 400)
 
 
 def report(folder: Path) -> None:
@@ -145,6 +145,17 @@ def diagnosis(folder: Path) -> None:
     dvl_calib("simulate", bag, "--trajectory", "free", "--gnss-std", 0.03, "--effect", "lever_arm:x_m=0.5,y_m=-0.2")
     dvl_calib("diagnose", bag, "--report", page)
     screenshot(page, "diagnosis", 1100)
+
+
+def real_data(folder: Path) -> None:
+    """Of the diagnosis' report of one recording at sea, what each effect makes."""
+    page = folder / "real_data.html"
+    dvl_calib("import", snapir_ins(), "-o", folder / "sea", *IMPORT)
+    dvl_calib("diagnose", folder / "sea" / "T01", "--report", page)
+    before, found, rest = page.read_text().partition("<h3>lever_arm: measured")
+    head, body, _ = before.partition("<main>")
+    page.write_text(head + body + found + rest.partition("</section>")[0].partition("<h2>")[0])
+    screenshot(page, "real_data", 840)
 
 
 def simulators(folder: Path) -> None:
@@ -182,4 +193,4 @@ def simulators(folder: Path) -> None:
     save(folder / "simulators_gap.png", "simulators_gap")
 
 
-PICTURES = {each.__name__: each for each in (demo, watch, report, diagnosis, simulators)}
+PICTURES = {each.__name__: each for each in (demo, watch, report, diagnosis, real_data, simulators)}
