@@ -81,6 +81,8 @@ class CoarseFits:
         each of `DELAYS_S`. rates: (N, 3) rad/s, body frame; None where they are not known.
         """
         self._declared[_FRAMES.index(declared)] += len(reference)
+        flat = velocity.reshape(len(velocity), -1)  # of all delays in one product
+        squares = np.einsum("nka,nka->k", velocity, velocity)
         for index, frame in enumerate(_FRAMES):
             g = reference
             if frame is not VelocityFrame.BODY:
@@ -91,9 +93,9 @@ class CoarseFits:
             if frame is declared and rates is not None:
                 for fit in self._fits:
                     fit.add(g, velocity, rates)
-            self._gv[index] += np.tensordot(velocity, g, (0, 0)).swapaxes(1, 2)
+            self._gv[index] += (g.T @ flat).reshape(3, len(DELAYS_S), 3).swapaxes(0, 1)
             self._gg[index] += np.sum(g * g)
-            self._vv[index] += np.einsum("nka,nka->k", velocity, velocity)
+            self._vv[index] += squares
             self._count[index] += len(g)
 
     def suggestion(self) -> Suggestion | None:
@@ -178,19 +180,25 @@ class _AxesFit:
     def add(self, reference: Array, velocity: Array, rates: Array) -> None:
         """Add N samples: reference (N, 3) m/s and rates (N, 3) rad/s in the body, velocity (N, K, 3) m/s of the DVL."""
         known = np.isfinite(rates).all(axis=1)
-        in_body = velocity[known] @ self._rotation.T
-        rest = reference[known, None] - in_body
-        columns = [skew(in_body), in_body[..., None]]
+        if not known.all():
+            reference, velocity, rates = reference[known], velocity[known], rates[known]
+        if not len(rates):
+            return
+        in_body = velocity @ self._rotation.T
+        rest = reference[:, None] - in_body
+        k, n = len(DELAYS_S), len(rates)
+        h = np.empty((k, n, 3, self._vector.shape[1]))
+        h[..., :3], h[..., 3] = skew(in_body).swapaxes(0, 1), in_body.swapaxes(0, 1)
         if self._with_lever_arm:
-            columns.append(np.broadcast_to(skew(rates[known])[:, None], (*in_body.shape, 3)))
-        h = np.concatenate(columns, axis=3).transpose(1, 0, 2, 3).reshape(len(DELAYS_S), -1, self._vector.shape[1])
-        r = rest.swapaxes(0, 1).reshape(len(DELAYS_S), -1, 1)
-        turned = h.swapaxes(1, 2)
-        self._normal += turned @ h
+            h[..., 4:] = skew(rates)
+        flat = h.reshape(k, 3 * n, -1)
+        r = rest.swapaxes(0, 1).reshape(k, 3 * n, 1)
+        turned = flat.swapaxes(1, 2)
+        self._normal += turned @ flat
         self._vector += (turned @ r)[:, :, 0]
-        self._square += (r * r).sum(axis=(1, 2))
+        self._square += np.einsum("kji,kji->k", r, r)
         self._speed += np.einsum("nka,nka->k", in_body, in_body)
-        self.samples += int(known.sum())
+        self.samples += n
 
     def left(self) -> float:
         """Sum of squares (m/s)² that is left at the best delay."""

@@ -39,13 +39,17 @@ class FoldInformation:
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples, as far as models used them (K, N)."""
-        h = data.h.swapaxes(2, 3)  # (K, N, n, m)
-        wh = h @ np.linalg.inv(data.r) * (data.weight * used)[:, :, None, None]
+        h, z = data.whitened
+        rows = np.concatenate([h, z[:, None]], axis=1).transpose(2, 1, 0, 3)  # (K, n + 1, m, N)
+        weight = data.weight * used
         for fold in set(folds.tolist()):
-            at = folds == fold
-            wh_fold = _rows(wh[:, at])
-            self._information[fold] += wh_fold.swapaxes(1, 2) @ _rows(h[:, at])
-            self._information_state[fold] += (wh_fold.swapaxes(1, 2) @ data.z[:, at].reshape(len(wh), -1, 1))[:, :, 0]
+            at = np.flatnonzero(folds == fold)
+            some = rows.take(at, axis=3)
+            weighted = some * weight[:, None, None, at]
+            flat = (*some.shape[:2], -1)
+            told = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
+            self._information[fold] += told[:, :-1, :-1]
+            self._information_state[fold] += told[:, :-1, -1]
 
     def add_told(self, told: Array) -> None:
         """Add what rows (H, z) of each fold told (FOLDS, K, n+1, n+1)."""
@@ -81,12 +85,6 @@ def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np
     p[..., :, which] = 0.0
     p[..., which[:, None], which] = other.p[..., which[:, None], which]
     return GaussianState(x, p)
-
-
-def _rows(h: Array) -> Array:
-    """(K, N, n, m) -> (K, N m, n)."""
-    k, n_samples, n, m = h.shape
-    return h.swapaxes(2, 3).reshape(k, n_samples * m, n)
 
 
 class Moments:

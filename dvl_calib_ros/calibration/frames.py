@@ -36,9 +36,9 @@ def skew(a: ArrayLike) -> Array:
 
 
 def turned_skew(rotation: Array, a: Array) -> Array:
-    """``rotation @ skew(a)``, (..., m, 3) of (m, 3) and (..., 3): one product, as it is linear in a."""
-    of_axes = rotation @ _SKEW.reshape(3, 3, 3)
-    return (a @ of_axes.reshape(3, -1)).reshape(*a.shape[:-1], *of_axes.shape[1:])
+    """``rotation @ skew(a)`` of (m, 3) and vectors as columns (3, N), (m, 3, N): one product, as it is linear in a."""
+    of_axes = (rotation @ _SKEW.reshape(3, 3, 3)).reshape(3, -1)
+    return (of_axes.T @ a).reshape(len(rotation), 3, a.shape[1])
 
 
 def cross(a: Array, b: Array) -> Array:

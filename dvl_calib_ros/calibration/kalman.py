@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -60,6 +60,13 @@ class Measurements:
     weight: Array
     usable: Mask
     gate: Array
+
+    @cached_property
+    def whitened(self) -> tuple[Array, Array]:
+        """H (m, n, K, N) and z (m, K, N) of rows that are turned and scaled so that their noise is 1."""
+        h, z = np.moveaxis(self.h, (2, 3), (0, 1)), np.moveaxis(self.z, 2, 0)
+        low, inverse_diagonal = _cholesky([[self.r[..., i, j] for j in range(i + 1)] for i in range(len(z))])
+        return np.stack(_forward(low, inverse_diagonal, [*h])), np.stack(_forward(low, inverse_diagonal, [*z]))
 
     def part(self, at: slice) -> Measurements:
         """The samples of a slice."""
@@ -262,7 +269,7 @@ def _solve(x: Array, p: Array, data: Measurements) -> _Solved | None:
     n = x.shape[1]
     prior = np.linalg.inv(p)
     prior_state = (prior @ x[:, :, None])[:, :, 0]
-    h, z = _whitened(data)
+    h, z = data.whitened
     wh = h if (data.weight == 1.0).all() else h * data.weight
     # with room in front for the prior: the running sums are then taken in place
     room = (x.shape[0], data.z.shape[1] + 1)
@@ -301,13 +308,6 @@ def _passes_before(x: Array, prior: Array, prior_state: Array, h: Array, z: Arra
         nis = _normalised_innovation_squared(information, [*prior_state[k].T], h[:, :, k, at], z[:, k, at])
         passes[k, at] = nis <= np.broadcast_to(gate, passes.shape)[k, at]
     return passes
-
-
-def _whitened(data: Measurements) -> tuple[Array, Array]:
-    """H (m, n, K, N) and z (m, K, N) of rows that are turned and scaled so that their noise is 1."""
-    h, z = np.moveaxis(data.h, (2, 3), (0, 1)), np.moveaxis(data.z, 2, 0)
-    low, inverse_diagonal = _cholesky([[data.r[..., i, j] for j in range(i + 1)] for i in range(len(z))])
-    return np.stack(_forward(low, inverse_diagonal, [*h])), np.stack(_forward(low, inverse_diagonal, [*z]))
 
 
 def _gain(a: Array, b: Array, room: tuple[int, int]) -> Array:

@@ -28,27 +28,40 @@ CHANCE = 0.1
 class TimeBlocks:
     """Information of consecutive blocks of time, for K hypotheses or models at once.
 
-    kept: of each block, in order, Λ_b (K, n, n) and y_b (K, n). weight: number of samples that all count for.
+    count: number of blocks. weight: number of samples that all count for.
     """
 
     def __init__(self) -> None:
-        self.kept: list[tuple[Array, Array]] = []
+        # with room for MOST of them
+        self._information = np.zeros((0, 0, 0, 0))
+        self._vector = np.zeros((0, 0, 0))
+        self.count = 0
         self._each = 1  # additions in a full block
         self._in_last = 0
         self.weight = 0.0
 
+    @property
+    def kept(self) -> tuple[Array, Array]:
+        """Of each block, in order, Λ_b (B, K, n, n) and y_b (B, K, n)."""
+        return self._information[: self.count], self._vector[: self.count]
+
     def add(self, information: Array, vector: Array, weight: float) -> None:
         """Add what a stretch told: Λ_b (K, n, n), y_b (K, n). weight: number of samples that it counts for."""
         self.weight += weight
-        if self.kept and self._in_last < self._each:
-            last = self.kept[-1]
-            self.kept[-1] = last[0] + information, last[1] + vector
+        if self.count and self._in_last < self._each:
+            self._information[self.count - 1] += information
+            self._vector[self.count - 1] += vector
             self._in_last += 1
             return
-        if len(self.kept) == MOST:
-            self.kept = [_joined(pair) for pair in zip(self.kept[::2], self.kept[1::2], strict=True)]
+        if not self.count:
+            self._information, self._vector = np.empty((MOST, *information.shape)), np.empty((MOST, *vector.shape))
+        if self.count == MOST:
+            self.count = MOST // 2
+            for each in (self._information, self._vector):
+                each[: self.count] = each[0::2] + each[1::2]
             self._each *= 2
-        self.kept.append((information.copy(), vector.copy()))
+        self._information[self.count], self._vector[self.count] = information, vector
+        self.count += 1
         self._in_last = 1
 
     def end_day(self, of_day: NDArray[np.intp], information: Array, vector: Array, source: NDArray[np.intp]) -> None:
@@ -66,24 +79,22 @@ class TimeBlocks:
         onto[:, :, of_day] -= information[:, :, of_day] @ within
         onto[:, of_day] = 0.0
         found = (within @ vector[:, of_day, None])[..., 0]
-
-        def left(told: Array, y: Array) -> tuple[Array, Array]:
+        for told, y in zip(*self.kept, strict=True):
             rest = y - (told[:, :, of_day] @ found[..., None])[..., 0]
-            return (onto @ told @ onto.swapaxes(1, 2))[source], (onto @ rest[..., None])[source, :, 0]
-
-        self.kept = [left(*each) for each in self.kept]
+            told[:] = (onto @ told @ onto.swapaxes(1, 2))[source]
+            y[:] = (onto @ rest[..., None])[source, :, 0]
 
     def inflation(self, index: int, x: Array, p: Array) -> Array:
         """By how much σ of each state (n,) has to grow, at least 1. index: which of the K. x (n,), P (n, n) of it.
 
         The largest over blocks as they are, and over two and four of them together.
         """
-        scores = np.array([vector[index] - information[index] @ x for information, vector in self.kept])
         factor = np.ones(len(x))
-        if len(scores) < FEWEST:
+        if self.count < FEWEST:
             return factor
-        information = sum(each[0][index] for each in self.kept)
-        claimed = np.diag(p @ information @ p)
+        information, vector = (each[:, index] for each in self.kept)
+        scores = vector - information @ x
+        claimed = np.diag(p @ information.sum(axis=0) @ p)
         while len(scores) >= FEWEST:
             m = len(scores)
             scatter = p @ scores.T
@@ -160,8 +171,3 @@ class BlockScatter:
 def _information(x: Array, p: Array) -> tuple[Array, Array]:
     information = np.linalg.inv(p)
     return information, (information @ x[..., None])[..., 0]
-
-
-def _joined(pair: tuple[tuple[Array, Array], tuple[Array, Array]]) -> tuple[Array, Array]:
-    (a, b), (c, d) = pair
-    return a + c, b + d

@@ -41,7 +41,9 @@ class Kept(NamedTuple):
         first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
         at = first + _thinned_seconds(imu.times[first:last])
         # a sample of a fast stream is noisier than what the vehicle turns by until the next one that is kept
-        rates = _mean_around(imu.times, imu.angular_velocity, imu.times[at], 0.5 * KEPT_EVERY_S)
+        reach = 0.5 * KEPT_EVERY_S
+        first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
+        rates = _mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
         turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
         return Kept(own, noise_dvl, reference, turning)
 

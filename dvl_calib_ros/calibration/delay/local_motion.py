@@ -35,6 +35,10 @@ class LocalFit(NamedTuple):
     slope_gain: Array
     found: NDArray[np.bool_]
 
+    def part(self, at: slice) -> LocalFit:
+        """Those at some of the times."""
+        return LocalFit(self.value[at], self.slope[at], self.value_gain[at], self.slope_gain[at], self.found[at])
+
 
 def spacing_at(times: Array, at: Array) -> Array:
     """Mean interval of the six samples of times (N,) s around each time (...); nan near an end."""
@@ -72,22 +76,23 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     falling = 1.0 - near * near * near
     weight = np.where(there & (near < 1.0), falling * falling * falling, 0.0)
     used = weight > 0.0
-    found &= ((used & (u <= 0.0)).sum(axis=0) >= ON_EACH_SIDE) & ((used & (u >= 0.0)).sum(axis=0) >= ON_EACH_SIDE)
+    before, after = used & (u <= 0.0), used & (u >= 0.0)
+    found &= np.minimum(np.add.reduce(before, 0, dtype=np.intp), np.add.reduce(after, 0, dtype=np.intp)) >= ON_EACH_SIDE
     first = weight * u
     second = first * u
     # the normal equations of a + b u + c u² and, by cofactors, the first two rows of their inverse
-    s0, s1, s2 = weight.sum(axis=0), first.sum(axis=0), second.sum(axis=0)
-    s3, s4 = (second * u).sum(axis=0), (second * u * u).sum(axis=0)
+    third = second * u
+    s0, s1, s2, s3, s4 = (np.add.reduce(each) for each in (weight, first, second, third, third * u))
     c00, c01, c02 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
     c11, c12 = s0 * s4 - s2 * s2, s1 * s2 - s0 * s3
     determinant = s0 * c00 + s1 * c01 + s2 * c02
     found &= determinant > 1e-12 * s0**3
     scale = 1.0 / np.where(found, determinant, 1.0)
-    for_value = (c00 * weight + c01 * first + c02 * second) * scale
-    for_slope = (c01 * weight + c11 * first + c12 * second) * scale
-    columns = [column.take(index) for column in values.T]
-    value = np.stack([(for_value * column).sum(axis=0) for column in columns], axis=1)
-    slope = np.stack([(for_slope * column).sum(axis=0) for column in columns], axis=1)
     unit = np.where(found, reach, 1.0)
-    gains = ((for_value**2).sum(axis=0), (for_slope**2).sum(axis=0) / unit**2)
-    return LocalFit(value, slope / unit[:, None], *gains, found)
+    for_value = (c00 * scale) * weight + (c01 * scale) * first + (c02 * scale) * second
+    scale = scale / unit
+    for_slope = (c01 * scale) * weight + (c11 * scale) * first + (c12 * scale) * second
+    near_by = values.take(index, axis=0)
+    value, slope = np.einsum("wm,wmc->mc", for_value, near_by), np.einsum("wm,wmc->mc", for_slope, near_by)
+    value_gain, slope_gain = (np.einsum("wm,wm->m", each, each) for each in (for_value, for_slope))
+    return LocalFit(value, slope, value_gain, slope_gain, found)

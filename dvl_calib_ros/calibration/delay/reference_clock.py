@@ -196,7 +196,7 @@ class ReferenceClock:
         level = max(1.0, float(misfit.min()) / (self._blocks.weight - _N))
         # noise that lasts makes more evidence of itself than white noise, by as much as σ of lever arm and delay say
         inflation = UNKNOWN_INFLATION
-        if len(self._blocks.kept) >= FEWEST:
+        if self._blocks.count >= FEWEST:
             likeliest = int(misfit.argmin())
             own = np.linalg.inv(self._information.reshape(-1, _N, _N)[likeliest])
             inflation = float(self._blocks.inflation(likeliest, x.reshape(-1, _N)[likeliest], own)[_SHOWS].max())

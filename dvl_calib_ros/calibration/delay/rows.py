@@ -195,8 +195,10 @@ def _read(dvl: DvlColumns, times: Array) -> _Reading:
     grid = STEP_S * np.arange(first, last + 2)
     spacing = spacing_at(dvl.times, grid)
     reach = reach_at(spacing, LEAST_REACH_S, MOST_REACH_S)
-    fit = local_fit(dvl.times, dvl.velocity, grid, reach)
-    wide = local_fit(dvl.times, dvl.velocity, grid, np.maximum(reach, LEAST_SLOPE_REACH_S))
+    # both in one call: so few numbers take as long as twice as many
+    reaches = np.concatenate([reach, np.maximum(reach, LEAST_SLOPE_REACH_S)])
+    both = local_fit(dvl.times, dvl.velocity, np.concatenate([grid, grid]), reaches)
+    fit, wide = both.part(slice(len(grid))), both.part(slice(len(grid), None))
     steps = times / STEP_S
     middle = np.floor(steps).astype(np.intp)
     part = steps - middle  # at every delay, as they are whole steps
@@ -234,28 +236,30 @@ def _rows(
     k, n = velocity_dvl.shape[1:]
     body_from_dvl = template.rotation_dvl_from_body.T
     lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
-    # the same reference beside the DVL at every delay
+    # the same reference beside the DVL at every delay; in memory the samples of each element follow each other
     each = Observations(
-        velocity_dvl=velocity_dvl.transpose(1, 2, 0).reshape(k * n, 3),
-        reference_body=np.tile(body, (k, 1)),
-        lever_velocity=None if lever is None else np.tile(lever, (k, 1)),
+        velocity_dvl=velocity_dvl.reshape(3, k * n).T,
+        reference_body=np.tile(body.T, k).T,
+        lever_velocity=None if lever is None else np.tile(lever.T, k).T,
         rotation_dvl_from_body=template.rotation_dvl_from_body,
         sway_heave=template.sway_heave,
-        earth_in_body=np.tile(earth, (k, 1, 1)),
+        earth_in_body=np.tile(earth.transpose(1, 2, 0), k).transpose(2, 0, 1),
     )
     z, h_g1 = linearise_g1(each)
     rows = np.empty((k, N_STATE + 1, 3, n))
-    rows[:, :N_G1] = h_g1.reshape(k, n, 3, N_G1).transpose(0, 3, 2, 1)
+    rows[:, :N_G1] = h_g1.transpose(2, 1, 0).reshape(N_G1, 3, k, n).transpose(2, 0, 1, 3)
     rows[:, LEVER_ARM] = -skew(turning).transpose(2, 1, 0)
     rows[:, DELAY] = np.tensordot(body_from_dvl, slope, 1).swapaxes(0, 1)
     rows[:, N_STATE] = z.reshape(k, n, 3).swapaxes(1, 2)
-    heave = np.zeros((n, k, N_STATE + 1))
-    heave[..., [*range(N_G1), N_STATE]] = g1_heave(each).reshape(k, n, N_G1 + 1).swapaxes(0, 1)
+    heave = np.empty((n, k, N_STATE + 1))
+    of_g1 = g1_heave(each).T.reshape(N_G1 + 1, k, n).transpose(2, 1, 0)
+    heave[..., :N_G1], heave[..., N_STATE] = of_g1[..., :N_G1], of_g1[..., N_G1]
     heave[..., BEYOND] = rows[:, BEYOND, 2].transpose(2, 0, 1)
+    part = np.empty((k, N_STATE + 1, n))
     for i in (2, 1, 0):  # from the last on, as those before go into it
         rows[:, :, i] *= white[:, i, i]
         for j in range(i):
-            rows[:, :, i] += white[:, i, j] * rows[:, :, j]
+            rows[:, :, i] += np.multiply(white[:, i, j], rows[:, :, j], out=part)
     told = uncertain.information(white.swapaxes(1, 2) @ white)
     return DelayedRows(index, rows, weight, heave, told)
 
@@ -279,12 +283,14 @@ def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> tuple[A
     stamps, rates, variance = turns
     if len(stamps) < 2:
         return np.full((len(times), 3), np.nan), np.zeros(3)
-    interpolated = np.column_stack([np.interp(times, stamps, column) for column in rates.T])
     reach = reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S)
     smooth = local_fit(stamps, rates, times, reach)
     after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
     outside = (times < stamps[0]) | (times > stamps[-1]) | (stamps[after] - stamps[after - 1] > gap_s)
-    value = np.where(smooth.found[:, None], smooth.value, interpolated)
+    value = smooth.value
+    if not smooth.found.all():
+        interpolated = np.column_stack([np.interp(times, stamps, column) for column in rates.T])
+        value = np.where(smooth.found[:, None], value, interpolated)
     value[outside] = np.nan
     return value, variance * float(np.nanmean(smooth.value_gain)) if smooth.found.any() else np.zeros(3)
 
@@ -325,22 +331,23 @@ def _in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> _InB
 def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
     """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,)."""
     given = ~np.isnan(imu.orientation[:, 0])
-    stamps, quaternions = imu.times[given], imu.orientation[given]
+    every = bool(given.all())
+    stamps, quaternions = (imu.times, imu.orientation) if every else (imu.times[given], imu.orientation[given])
     if len(stamps) < 2:
         return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
-    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
-    gap = stamps[after] - stamps[after - 1]
-    fraction = np.clip((times - stamps[after - 1]) / gap, 0.0, 1.0)
-    a, b = quaternions[after - 1], quaternions[after]
-    dot = (a * b).sum(axis=1)
-    b, dot = np.where(dot[:, None] < 0.0, -b, b), np.minimum(np.abs(dot), 1.0)
-    angle = np.arccos(dot)
+    after = np.minimum(np.maximum(np.searchsorted(stamps, times), 1), len(stamps) - 1)
+    before = after - 1
+    gap = stamps[after] - stamps[before]
+    fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
+    a, b = quaternions.take(before, axis=0), quaternions.take(after, axis=0)
+    dot = np.einsum("nq,nq->n", a, b)
+    angle = np.arccos(np.minimum(np.abs(dot), 1.0))
     sine = np.sin(angle)
     small = sine < 1e-6  # the chord is exact then
     divisor = np.where(small, 1.0, sine)
     left = np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / divisor)
-    right = np.where(small, fraction, np.sin(fraction * angle) / divisor)
+    right = np.where(small, fraction, np.sin(fraction * angle) / divisor) * np.where(dot < 0.0, -1.0, 1.0)
     mixed = left[:, None] * a + right[:, None] * b
-    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+    mixed /= np.sqrt(np.einsum("nq,nq->n", mixed, mixed))[:, None]
     known = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= gap_s)
     return rotation_from_quaternion(mixed), known

@@ -36,13 +36,14 @@ def linearise_g1(seen: Observations) -> Linearised:
     """
     assert seen.reference_body is not None
     body_from_dvl = seen.rotation_dvl_from_body.T
-    fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
-    h = np.zeros((len(fast), 3, 8))
-    h[:, :, :3] = turned_skew(body_from_dvl, seen.velocity_dvl)
-    h[:, :, 3:5] = -(body_from_dvl * (fast * seen.velocity_dvl)[:, None, :])[:, :, :2]
+    v = seen.velocity_dvl.T
+    # in memory the samples of each element follow each other, as those work on them who are given it
+    h = np.zeros((3, 8, v.shape[1]))
+    h[:, :3] = turned_skew(body_from_dvl, v)
+    h[:, 3:5] = -body_from_dvl[:, :2, None] * _shown(v)[:2]
     if seen.earth_in_body is not None:
-        h[:, :, 6:] = seen.earth_in_body
-    return seen.reference_body - seen.velocity_in_body, h
+        h[:, 6:] = seen.earth_in_body.transpose(1, 2, 0)
+    return seen.reference_body - seen.velocity_in_body, h.transpose(2, 0, 1)
 
 
 def g1_heave(seen: Observations) -> Array:
@@ -51,14 +52,19 @@ def g1_heave(seen: Observations) -> Array:
     κ acts on level motion only: what is assumed to be near zero must not be read as a scale that makes it so.
     """
     body_from_dvl = seen.rotation_dvl_from_body.T
-    fast = np.abs(seen.velocity_dvl) > SCALE_SHOWN_FROM
-    level = seen.velocity_dvl @ body_from_dvl.T * (1.0, 1.0, 0.0) @ body_from_dvl
-    row = np.zeros((len(fast), 9))
-    row[:, :3] = turned_skew(body_from_dvl[2:], seen.velocity_dvl)[:, 0]
-    row[:, 3:5] = -(body_from_dvl[2] * fast * level)[:, :2]
-    row[:, 5] = -1.0
-    row[:, 8] = -seen.velocity_in_body[:, 2]
-    return row
+    v = seen.velocity_dvl.T
+    level = body_from_dvl.T[:, :2] @ (body_from_dvl[:2] @ v)
+    row = np.zeros((9, v.shape[1]))
+    row[:3] = turned_skew(body_from_dvl[2:], v)[0]
+    row[3:5] = -body_from_dvl[2, :2, None] * np.where(np.abs(v[:2]) > SCALE_SHOWN_FROM, level[:2], 0.0)
+    row[5] = -1.0
+    row[8] = -seen.velocity_in_body[:, 2]
+    return row.T
+
+
+def _shown(v: Array) -> Array:
+    """Velocities (3, N) m/s in the DVL's frame, zero along axes that are too slow to show their scale."""
+    return np.where(np.abs(v) > SCALE_SHOWN_FROM, v, 0.0)
 
 
 def _noise_in_body(seen: Observations) -> Array:

@@ -160,7 +160,7 @@ def test_blocks_of_a_day_that_is_over_say_of_what_goes_on_what_they_said_with_th
     p = np.linalg.inv(information[0])
     x = p @ vector[0]
     blocks.end_day(of_day, information, vector, np.array([0]))
-    left, rest = (np.sum([each[i][0] for each in blocks.kept], axis=0) for i in (0, 1))
+    left, rest = (each.sum(axis=0)[0] for each in blocks.kept)
     np.testing.assert_allclose(np.linalg.inv(left[:2, :2]), p[:2, :2], rtol=1e-9)
     np.testing.assert_allclose(rest[:2], left[:2, :2] @ x[:2], rtol=1e-9)
     assert not left[2:].any() and not rest[2:].any()
