@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
+from yaml_text import parsed
 
 from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -118,7 +118,7 @@ def holoocean(path: Path) -> OtherDvl:
 
 def dvl_simulator(path: Path) -> OtherDvl:
     """With its generator and its ways: rotations in the order z, y, x, the lever arm in the sensor's axes."""
-    document = yaml.safe_load(path.read_text())["dvl_simulator"]
+    document = parsed(path.read_text())["dvl_simulator"]
     general, model = document["general_settings"], document["model_parameter_settings"]
     assert all(document["model_enable_settings"].values()) and len(document["model_enable_settings"]) == 7
     assert general["use_constant_seed"], "scale is drawn by chance"

@@ -85,5 +85,5 @@ COMMANDS = (
         "list every parameter, model, effect, driver, warning or command, or write a parameter file",
         "dvl-calib parameters --yaml > calibration.yaml",
     ),
-    Command("demo", "live node, replay and truth side by side on a shipped bag", "dvl-calib demo --speed 20"),
+    Command("demo", "live node, replay and truth side by side on a shipped bag", "dvl-calib demo --speed 5"),
 )

@@ -32,7 +32,7 @@ SCALE_PERCENT = 0.5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("--speed", type=float, default=10.0, help="times real time; default: %(default)g")
+    parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
     add_report_option(parser)
 
 

@@ -37,8 +37,8 @@ SHOWN = {
 
 # Under which name the node says how many messages of a topic it has taken.
 RECEIVED = {Topics.dvl: "dvl received", Topics.gnss: "reference received", Topics.imu: "imu received"}
-# A busy machine falls behind a bag that is played ten times faster. So many messages of a topic may wait, half of what
-# a node's queue holds; and who is silent for so long, s, is not waited for.
+# A busy machine falls behind a bag that is played faster than recorded. So many messages of a topic may wait, half of
+# what a node's queue holds; and who is silent for so long, s, is not waited for.
 WAITING, PATIENCE_S = QUEUE // 2, 30.0
 
 

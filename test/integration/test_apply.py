@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from command_line import room_for
 from io_fixtures import replayed, run, selected_alone, write_bag
 from scipy.spatial.transform import Rotation
+from yaml_text import parsed, written
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
@@ -76,7 +76,7 @@ def change(path: Path, result, turned: bool = False, **changes) -> Path:
 
 
 def corrected(saved: Path) -> Rotation:
-    return Rotation.from_euler("xyz", yaml.safe_load(saved.read_text())["mounting"]["corrected_rpy"])
+    return Rotation.from_euler("xyz", parsed(saved.read_text())["mounting"]["corrected_rpy"])
 
 
 def words(values) -> str:
@@ -183,7 +183,7 @@ def test_of_a_driver_that_points_down_the_urdf_keeps_its_axes_and_the_transform_
     path = robot(tmp_path / "robot.urdf", mounting=(Rotation.from_euler("xyz", MOUNTING) * axes).as_euler("xyz"))
     assert apply(saved, "--urdf", path) == 0
     assert difference(mounted(path), corrected(saved) * axes) < 1e-8  # nine digits are written
-    line = yaml.safe_load(saved.read_text())["mounting"]["static_transform_publisher"]
+    line = parsed(saved.read_text())["mounting"]["static_transform_publisher"]
     assert line in capsys.readouterr().out
     given = shlex.split(line)
     quaternion = [float(given[given.index(f"--q{axis}") + 1]) for axis in "xyzw"]
@@ -288,7 +288,7 @@ def test_a_frame_name_from_a_bag_cannot_make_a_launch_file_run_something(tmp_pat
 def test_the_fusion_file_makes_the_node_publish_what_was_calibrated(tmp_path, saved, result):
     target = tmp_path / "fusion.yaml"
     assert apply(saved, "--fusion", target) == 0
-    content = yaml.safe_load(target.read_text())
+    content = parsed(target.read_text())
     localization = content["ekf_filter_node"]["ros__parameters"]
     assert [i for i, used in enumerate(localization["twist0_config"]) if used] == [6, 7, 8]
     assert len(localization["twist0_config"]) == 15 and localization["twist0"] == "/dvl_calibration/calibrated_twist"
@@ -339,9 +339,9 @@ def test_a_calibration_that_has_seen_nothing_is_not_applied(tmp_path, capsys):
 def test_what_the_data_has_not_shown_or_verified_is_said(tmp_path, saved, capsys):
     assert apply(saved) == 0
     assert "its convergence is coarse" in capsys.readouterr().err
-    document = yaml.safe_load(saved.read_text())
+    document = parsed(saved.read_text())
     del document["verification"]  # as the node writes it
-    saved.write_text(yaml.safe_dump(document))
+    saved.write_text(written(document))
     assert apply(saved) == 0
     assert "not verified on held-out data" in capsys.readouterr().err
     write_scenario(Scenario("straight", 30.0, imu_rate=20), tmp_path / "bag", Storage.MCAP, Compression.NONE)
@@ -458,7 +458,7 @@ def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_
     assert apply(saved, "--params", parameters) == 0
     assert "s late, today" in capsys.readouterr().out
     written = load_parameters(parameters)
-    mounting = yaml.safe_load(saved.read_text())["mounting"]
+    mounting = parsed(saved.read_text())["mounting"]
     assert written.dvl_time_offset == pytest.approx(mounting["dvl_time_offset"], abs=1e-8)
     assert written.lever_arm == pytest.approx(mounting["lever_arm"], abs=1e-8)
     assert "# by hand" in parameters.read_text()
@@ -510,7 +510,7 @@ def test_the_joint_is_moved_to_the_lever_arm_that_was_found(tmp_path, displaced,
     urdf.write_bytes(before)
     np.testing.assert_allclose(place(urdf), 0.0, atol=1e-9)
     assert apply(saved, "--urdf", urdf) == 0
-    found = yaml.safe_load(saved.read_text())["mounting"]["lever_arm"]
+    found = parsed(saved.read_text())["mounting"]["lever_arm"]
     np.testing.assert_allclose(place(urdf), found, atol=1e-8)
     assert difference(mounted(urdf), corrected(saved)) < 1e-8
     after = urdf.read_bytes()
@@ -526,7 +526,7 @@ def test_python_and_the_terminal_paste_the_origin_that_apply_writes(tmp_path, di
     assert main(["replay", str(bag), "--save", str(saved)]) == 0
     mounting = dc.replay(bag).mounting
     assert mounting.urdf in capsys.readouterr().out
-    document = yaml.safe_load(saved.read_text())["mounting"]
+    document = parsed(saved.read_text())["mounting"]
     np.testing.assert_allclose(mounting.xyz_m, document["lever_arm"], atol=1e-12)
     assert mounting.xyz_m[0] == pytest.approx(-1.2, abs=4.0 * mounting.xyz_std_m[0]) and mounting.xyz_std_m[0] < 0.1
     assert mounting.time_offset_s == document["dvl_time_offset"] == pytest.approx(0.6, abs=0.05)
@@ -548,7 +548,7 @@ def test_of_a_driver_that_is_forward_right_down_both_origins_are_said(tmp_path, 
         for rpy in re.findall(r'<origin xyz="[^"]*" rpy="([^"]*)"/>', out)
     ]
     assert "(forward-left-up axes)" in out and "of the driver: forward-right-down)" in out
-    document = yaml.safe_load(saved.read_text())["mounting"]
+    document = parsed(saved.read_text())["mounting"]
     assert difference(ours, Rotation.from_euler("xyz", document["corrected_rpy"])) < 2e-6
     words_of = re.search(
         r"--qx (\S+) --qy (\S+) --qz (\S+) --qw (\S+)", document["static_transform_publisher"]
@@ -565,7 +565,7 @@ def test_a_urdf_with_another_position_is_moved_by_force_only_or_turned_alone(tmp
     np.testing.assert_allclose(place(urdf), there, atol=1e-12)
     assert difference(mounted(urdf), corrected(saved)) < 1e-8
     assert apply(saved, "--urdf", urdf, "--force") == 0
-    np.testing.assert_allclose(place(urdf), yaml.safe_load(saved.read_text())["mounting"]["lever_arm"], atol=1e-8)
+    np.testing.assert_allclose(place(urdf), parsed(saved.read_text())["mounting"]["lever_arm"], atol=1e-8)
 
 
 def test_a_calibration_without_a_lever_arm_leaves_the_position_where_it_is(tmp_path, saved):

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from command_line import fail, in_fresh_process, succeed
 from conftest import ROOT
 from io_fixtures import estimates, raw, rewrite, run, write_bag
+from yaml_text import parsed
 
 from dvl_calib_ros import __version__
 from dvl_calib_ros.bags.reader import BagReader
@@ -249,7 +249,7 @@ def test_replay_shows_estimates_and_counts_and_keeps_warnings_apart(capsys, bag)
 
 def test_replay_saves_a_result_file_that_replay_starts_from(capsys, bag, tmp_path):
     succeed(capsys, "replay", bag, "--save", tmp_path / "r.yaml")
-    assert yaml.safe_load((tmp_path / "r.yaml").read_text())["model"] == "G1"
+    assert parsed((tmp_path / "r.yaml").read_text())["model"] == "G1"
     saved = f"initial_calibration:={tmp_path / 'r.yaml'}"
     succeed(capsys, "replay", bag, "-p", saved, "--json", tmp_path / "o.json")
     again = json.loads((tmp_path / "o.json").read_text())["models"]["M3"]

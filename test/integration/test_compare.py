@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 
 import pytest
-import yaml
 from command_line import fail
 from report_fixtures import drawn
+from yaml_text import parsed
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.cli.main import main
@@ -26,7 +26,7 @@ def place(tmp_path_factory) -> Path:
         assert main(["simulate", bag, *SHORT, "--seed", str(seed), "--misalignment", "1", "-1", yaw]) == 0
         assert main(["replay", bag, "--save", f"{bag}.yaml"]) == 0
     for day, name in enumerate("abc"):
-        document = yaml.safe_load((folder / f"{name}.yaml").read_text())
+        document = parsed((folder / f"{name}.yaml").read_text())
         for key in document["time_span"]:
             document["time_span"][key] += day * 86_400_000_000_000
         (folder / f"{name}.yaml").write_text(json.dumps(document))
@@ -83,7 +83,7 @@ def test_garbage_is_one_line(place, tmp_path, capsys, content, says):
 
 
 def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp_path, capsys):
-    document = yaml.safe_load((place / "b.yaml").read_text())
+    document = parsed((place / "b.yaml").read_text())
     for path, says in (
         (("time_span",), "damaged"), (("mounting", "corrected_rpy"), "damaged"), (("model",), "damaged"),
         (("parameters",), "damaged"),

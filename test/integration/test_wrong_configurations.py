@@ -8,9 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-import yaml
 from io_fixtures import write_bag
 from scipy.spatial.transform import Rotation
+from yaml_text import written
 
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -133,7 +133,7 @@ def test_what_the_node_saves_of_a_wrong_configuration_is_refused_too_though_it_c
     document = result_document(result)
     del document["verification"]
     saved, launch = tmp_path / "result.yaml", tmp_path / "tf.launch.xml"
-    saved.write_text(yaml.safe_dump(document))
+    saved.write_text(written(document))
     assert main(["apply", str(saved), "--launch", str(launch)]) == 2
     error = capsys.readouterr().err
     assert "the data fit mounting_rpy 0 0 0.785" in error and not launch.exists()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from io_fixtures import (
     JAZZY,
     TOPICS,
@@ -26,6 +25,7 @@ from io_fixtures import (
 from mcap.writer import CompressionType, IndexType
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from yaml_text import parsed, written
 
 from dvl_calib_ros.bags import sorting, sources
 from dvl_calib_ros.bags.reader import BagReader
@@ -108,9 +108,9 @@ def test_the_parts_of_a_split_bag_are_read_in_order_and_only_those_that_metadata
     for number, samples in ((2, run()[100:200]), (10, run()[200:300])):
         part = write_bag(tmp_path / f"part{number}", samples)
         shutil.copy(storage_file(part), bag / f"bag_{number}.mcap")
-    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
+    metadata = parsed((bag / "metadata.yaml").read_text())
     metadata["rosbag2_bagfile_information"]["relative_file_paths"] += ["bag_2.mcap", "bag_3.mcap"]
-    (bag / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    (bag / "metadata.yaml").write_text(written(metadata))
     messages, notes = raw_and_notes(bag)
     assert len(messages) == 200
     assert any("bag_3.mcap is missing" in note for note in notes)

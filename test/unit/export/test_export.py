@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 import pytest
-import yaml
 from command_line import fail, room_for, succeed
 from conftest import searched
 from hypothesis import given
 from hypothesis import strategies as st
 from other_simulators import READERS, mt19937_doubles
 from scipy.spatial.transform import Rotation
+from yaml_text import parsed, written
 
 from dvl_calib_ros.export.description import DvlDescription, Other, load_description
 from dvl_calib_ros.export.simulator import export
@@ -260,7 +260,7 @@ def test_of_a_result_file_is_written_what_apply_would_write_and_what_speaks_agai
     bag, saved = tmp_path / "bag", tmp_path / "r.yaml"
     succeed(capsys, "simulate", bag, "--trajectory", "straight", "--duration", "20", "--misalignment", 0, 0, 9)
     succeed(capsys, "replay", bag, "--save", saved)
-    content = yaml.safe_load(saved.read_text())
+    content = parsed(saved.read_text())
     succeed(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
     remarks = json.loads((tmp_path / "dvl.sdf.missing.json").read_text())["remarks"]
     assert any(f"its verdict is {content['verification']['verdict']}" in each for each in remarks)
@@ -271,7 +271,7 @@ def test_of_a_result_file_is_written_what_apply_would_write_and_what_speaks_agai
     ):
         changed = copy.deepcopy(content)
         changed[part][key] = value
-        (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed, sort_keys=False))
+        (tmp_path / "changed.yaml").write_text(written(changed, sort_keys=False))
         assert said in fail(capsys, "export", "gazebo", tmp_path / "changed.yaml", "-o", tmp_path / "other.sdf")
 
 

@@ -6,9 +6,9 @@ import math
 from pathlib import Path
 
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from yaml_text import parsed
 
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.errors import InputError
@@ -247,7 +247,7 @@ def test_parameters_of_ros_itself_can_be_given_as_overrides():
 def test_the_generated_file_holds_every_parameter_at_its_default(tmp_path):
     path = file_with(tmp_path, parameter_file_text())
     assert load_parameters(path) == Parameters()
-    assert set(yaml.safe_load(path.read_text())["/**"]["ros__parameters"]) == set(SCHEMA)
+    assert set(parsed(path.read_text())["/**"]["ros__parameters"]) == set(SCHEMA)
 
 
 def test_the_table_has_one_row_of_five_cells_for_every_parameter():

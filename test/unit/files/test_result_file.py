@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import estimates, replayed, run, steady_run, write_bag
 from scipy.spatial.transform import Rotation
+from yaml_text import parsed, written
 
 from dvl_calib_ros.calibration.error_model import corrected_mounting
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
@@ -79,11 +79,11 @@ def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))
 def test_any_double_comes_back_bit_for_bit(values):
-    assert yaml.safe_load(result_text({"state": values}))["state"] == values
+    assert parsed(result_text({"state": values}))["state"] == values
 
 
 def test_the_corrected_mounting_as_quaternion_rpy_and_command_line_agree_with_the_estimate(saved, result):
-    mounting = yaml.safe_load(saved.read_text())["mounting"]
+    mounting = parsed(saved.read_text())["mounting"]
     expected = corrected_mounting(result.estimate.misalignment, rotation_from_rpy(MOUNTING).T)
     quaternion = mounting["corrected_quaternion_xyzw"]
     assert Rotation.from_quat(quaternion).as_matrix() == pytest.approx(expected, abs=1e-12)
@@ -101,7 +101,7 @@ def test_a_frame_name_from_a_bag_cannot_smuggle_a_command_into_the_line_to_paste
 
 
 def test_the_file_says_what_a_user_asks_of_it(saved, result):
-    content = yaml.safe_load(saved.read_text())
+    content = parsed(saved.read_text())
     assert content["model"] == result.selected
     assert content["state"] == result.estimate.state.tolist()
     assert content["state_names"] == list(MODELS[result.selected].state_names)
@@ -125,7 +125,7 @@ def document(used: int, convergence: str = "coarse", first_ns: int | None = 0) -
 def uses(folder: Path) -> list[int]:
     """Samples used in the file and its backups, from the newest."""
     names = sorted(os.listdir(folder), key=lambda name: (len(name), name))
-    return [yaml.safe_load((folder / name).read_text())["used"] for name in names]
+    return [parsed((folder / name).read_text())["used"] for name in names]
 
 
 def test_a_result_of_no_sample_replaces_nothing_that_holds_something(tmp_path, saved, result):
@@ -210,9 +210,9 @@ def test_a_backup_that_is_no_result_file_any_more_is_the_first_to_go(tmp_path):
 
 
 def change(path: Path, edit) -> Path:
-    content = yaml.safe_load(path.read_text())
+    content = parsed(path.read_text())
     edit(content)
-    path.write_text(yaml.safe_dump(content))
+    path.write_text(written(content))
     return path
 
 

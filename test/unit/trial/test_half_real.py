@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from yaml_text import parsed
 
 from dvl_calib_ros.trial import generator, recorded
 from dvl_calib_ros.trial.cases import draw
@@ -157,7 +157,7 @@ def test_recordings_of_a_vehicle_have_a_delay_a_day_and_a_mounting_that_moved_on
 
 def test_recordings_of_a_day_each_are_as_many_bags_on_as_many_days(tmp_path):
     recorded_case = generator.record(case(Category.NULL, family=Family.SEVERAL), 2, tmp_path / "case")
-    metadata = [yaml.safe_load((bag / "metadata.yaml").read_text()) for bag in recorded_case.bags]
+    metadata = [parsed((bag / "metadata.yaml").read_text()) for bag in recorded_case.bags]
     starts = [each["rosbag2_bagfile_information"]["starting_time"]["nanoseconds_since_epoch"] for each in metadata]
     assert len(starts) == len(recorded_case.drawn.scene.motions) >= 2
     assert np.allclose(np.diff(starts) * 1e-9, 86400.0, atol=5.0)
