@@ -5,6 +5,7 @@ What takes long to import is imported below, so that signals are looked after fr
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -60,6 +61,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     try:
         node = CalibrationNode(parameter_files(args))
         executor = ReceivingExecutor(node)
+        gc.freeze()  # what the start has made stays: to look through it takes 0.01 s now and then, and a message waits
         # spin_until_future_complete would remember one callback more with every message
         ending.tell(lambda: executor.create_task(lambda: None))
         while not ending.requested:
