@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..attitude_rates import AttitudeRates
 from ..bank import ModelCounts
 from ..coarse_mounting import DELAYS_S, CoarseFits
 from ..frames import ENU_FROM_NED, Array
@@ -135,6 +136,7 @@ class BlockSolver:
             sway_heave=np.zeros(2),
         )
         self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
+        self._attitude_rates = AttitudeRates()
         self._reference_clock = ReferenceClock(parameters)
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
@@ -155,6 +157,8 @@ class BlockSolver:
 
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
+        if contradiction := self._attitude_rates.says():
+            return contradiction
         found = self._coarse.suggestion()
         if found is not None:
             return found.says
@@ -199,6 +203,8 @@ class BlockSolver:
         imu = self._imu(block.imu)
         self._compare_coarsely(block, dvl, imu)
         from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
+        first, end = np.searchsorted(imu.times, (from_s, to_s)).tolist()
+        self._attitude_rates.add(*(column[first:end] for column in imu))
         binned_dvl, turns = DvlColumns(*binned(*dvl)), TurnRates.of(imu)
         rows = None
         if len(dvl.times) >= 6 and len(imu.times) >= 2:

@@ -1,0 +1,157 @@
+"""Whether an IMU's angular velocity is how its own attitude turns.
+
+Both come from one instrument, and the calibration uses both: the attitude turns the reference into the body, the
+angular velocity moves the DVL about the reference point. Where a driver mixes conventions (rates negated, in degrees,
+in the earth's axes, a compass heading as ENU yaw), a lever arm of the wrong sign or size explains the data nearly as
+well, and no residual shows it. So the attitude is differentiated and held against the rates, with no other sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import permutations
+from itertools import product as all_of
+
+import numpy as np
+
+from .frames import ENU_FROM_NED, Array, product, rotation_from_quaternion
+
+# The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
+SPAN_S, LONGEST_S = 0.5, 1.6
+# A vehicle with a DVL turns no faster than this, rad/s: such a difference is an outlier of the attitude.
+FASTEST = 1.5
+# So many differences, and a turning of so much (rms, rad/s), tell anything.
+ENOUGH, LEAST_TURNING = 60, 0.005
+# What is left of the attitude's turning, as a share of its square: of another convention, and beside that as given.
+LEFT_AT_MOST, BETTER_BY, WRONG_FROM = 0.25, 0.25, 0.02
+# Explanations within so much of the best one are named with it; a rotation or a scale this near 1 is none.
+AS_GOOD, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
+# A rotation whose rows have an element this near 1 only exchanges axes, which has been looked at.
+EXCHANGED_FROM = 0.95
+# An attitude that is nowhere tilted by so much (sine of the angle) is a heading alone.
+LEVEL_BELOW = 1e-6
+_BODY, _ENU, _NED = range(3)
+_AXES = "xyz"
+_KNOWN = {
+    (1, 1, -1): "a heading that turns against the angular velocity about z, as a compass counts it (clockwise)",
+    (-1, -1, -1): "an angular velocity of the other sign",
+    (1, -1, -1): "an attitude and an angular velocity of which one is forward-left-up, the other forward-right-down",
+}
+
+
+def _conventions() -> Iterator[tuple[str, Array]]:
+    """All axes that may be exchanged or negated, in words, and as B (3, 3), turning = B rates; the likely ones first.
+
+    On a level vehicle that only turns about z many fit alike.
+    """
+    known_ones = [(words, np.diag(signs).astype(float)) for signs, words in _KNOWN.items()]
+    yield from known_ones
+    for order in permutations(range(3)):
+        for signs in all_of((1, -1), repeat=3):
+            axes = ", ".join("-"[: sign < 0] + _AXES[axis] for sign, axis in zip(signs, order, strict=True))
+            matrix = np.diag(signs).astype(float) @ np.eye(3)[list(order)]
+            if axes != "x, y, z" and not any((matrix == known).all() for _, known in known_ones):
+                yield f"an attitude whose turning about x, y, z is the angular velocity's about {axes}", matrix
+
+
+CONVENTIONS = tuple(_conventions())
+
+
+class AttitudeRates:
+    """Sums over the turning of an attitude and the angular velocity meanwhile; constant memory."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._tilted = False
+        self._turning = np.zeros((3, 3))  # Σ a aᵀ, a: turning of the attitude, rad/s
+        # with the angular velocity w taken to be in the body, ENU and NED: Σ a wᵀ and Σ w wᵀ
+        self._both = np.zeros((3, 3, 3))
+        self._rates = np.zeros((3, 3, 3))
+
+    def add(self, times: Array, orientation: Array, angular_velocity: Array) -> None:
+        """Take samples in order of time that follow those before.
+
+        times: (M,) s. orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``. angular_velocity: (M, 3)
+        rad/s, body. Both nan where not known.
+        """
+        known = ~(np.isnan(orientation).any(axis=1) | np.isnan(angular_velocity).any(axis=1))
+        times, orientation, rates = times[known], orientation[known], angular_velocity[known]
+        if len(times) < 2:
+            return
+        wanted = np.searchsorted(times, np.arange(times[0], times[-1] + SPAN_S, SPAN_S)).clip(max=len(times) - 1)
+        at = wanted[np.flatnonzero(np.diff(wanted, prepend=-1))]
+        first, last = at[:-1], at[1:]
+        seconds = times[last] - times[first]
+        a = _turn(orientation[first], orientation[last]) / seconds[:, None]
+        steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        w = (sums[last] - sums[first]) / seconds[:, None]
+        good = (seconds <= LONGEST_S) & ((a**2).sum(axis=1) < FASTEST**2)
+        a, w = a[good], w[good]
+        middle = (
+            orientation[first[good]]
+            + np.copysign(1.0, (orientation[first[good]] * orientation[last[good]]).sum(axis=1))[:, None]
+            * orientation[last[good]]
+        )
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
+        self._n += len(a)
+        self._tilted = self._tilted or bool((np.abs(body_from_enu[:, :2, 2]) > LEVEL_BELOW).any())
+        self._turning += a.T @ a
+        for frame, in_body in enumerate((w, product(body_from_enu, w), product(body_from_enu, w @ ENU_FROM_NED.T))):
+            self._both[frame] += a.T @ in_body
+            self._rates[frame] += in_body.T @ in_body
+
+    def says(self) -> str:
+        """What the data fit, in words, where attitude and angular velocity do not agree; else ''."""
+        shown = slice(None) if self._tilted else slice(2, None)  # of a heading alone, what is about the vertical
+        total = float(np.trace(self._turning[shown, shown]))
+        if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
+            return ""
+        given = self._left(_BODY, np.eye(3), shown)
+        if given < WRONG_FROM * total:
+            return ""
+        explained = [(self._left(frame, matrix, shown), words) for frame, matrix, words in self._explanations()]
+        best = min(left for left, _ in explained)
+        if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
+            return ""
+        named = [words for left, words in explained if left <= AS_GOOD * best + 1e-3 * total]
+        return f"the data fit {', or '.join(named[:2])} (IMU: its orientation and its angular velocity contradict)"
+
+    def _left(self, frame: int, matrix: Array, shown: slice) -> float:
+        """Σ|a - B w|² over the axes that are shown, for one B (3, 3) and a frame of w."""
+        matrix = matrix[shown]
+        crossed = float((matrix * self._both[frame][shown]).sum())
+        turning = float(np.trace(self._turning[shown, shown]))
+        return turning - 2.0 * crossed + float(np.trace(matrix @ self._rates[frame] @ matrix.T))
+
+    def _explanations(self) -> Iterator[tuple[int, Array, str]]:
+        """Frames of the angular velocity, and B (3, 3), that may be what was recorded, and each in words."""
+        yield from ((_BODY, matrix, words) for words, matrix in CONVENTIONS)
+        both, rates = self._both[_BODY], self._rates[_BODY]
+        scale = float(np.trace(both) / np.trace(rates)) if np.trace(rates) > 0.0 else 1.0
+        if scale > 0.0 and abs(math.log(scale)) > SCALED_FROM:
+            in_degrees = abs(math.log(scale * 180.0 / math.pi)) < SCALED_FROM
+            size = "in degrees per second" if in_degrees else f"that is {1.0 / scale:.2g} times as large"
+            yield _BODY, scale * np.eye(3), f"an angular velocity {size}"
+        yield _ENU, np.eye(3), "an angular velocity about the axes of the earth (ENU), not of the body"
+        yield _NED, np.eye(3), "an angular velocity about the axes of the earth (NED), not of the body"
+        yield _ENU, -np.eye(3), "an inverted attitude (a quaternion that turns the earth into the body)"
+        u, _, vt = np.linalg.svd(both)
+        turned = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+        angle = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0))))
+        if angle > TURNED_FROM_DEG and np.abs(turned).max(axis=1).min() < EXCHANGED_FROM:
+            yield _BODY, turned, f"an angular velocity whose axes are turned by {angle:.0f}° against the attitude's"
+
+
+def _turn(before: Array, after: Array) -> Array:
+    """Rotation vectors (N, 3), rad, in the body, from one attitude to another: quaternions (N, 4)."""
+    v0, w0, v1, w1 = -before[:, :3], before[:, 3:], after[:, :3], after[:, 3:]
+    vector = w0 * v1 + w1 * v0 + np.cross(v0, v1)
+    scalar = w0[:, 0] * w1[:, 0] - (v0 * v1).sum(axis=1)
+    vector *= np.copysign(1.0, scalar)[:, None]
+    sine = np.linalg.norm(vector, axis=1)
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    turn: Array = vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)[:, None]
+    return turn
