@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .directions import Directions
 from .frames import ENU_FROM_NED, FLU_FROM_FRD, Array, product, rotation_from_rpy, rpy_from_rotation, skew
 from .samples import VelocityFrame
 
@@ -63,6 +64,7 @@ class CoarseFits:
         self._vv = np.zeros((len(_FRAMES), len(DELAYS_S)))
         self._count = np.zeros(len(_FRAMES), dtype=np.int64)
         self._declared = np.zeros(len(_FRAMES), dtype=np.int64)
+        self._directions = Directions()
         # of the axes given with a lever arm, and of those turned round without one
         self._fits = _AxesFit(self._nominal, True), _AxesFit(self._nominal @ FLU_FROM_FRD, False)
 
@@ -81,6 +83,8 @@ class CoarseFits:
         each of `DELAYS_S`. rates: (N, 3) rad/s, body frame; None where they are not known.
         """
         self._declared[_FRAMES.index(declared)] += len(reference)
+        if rotation_enu_from_body is not None:
+            self._directions.add(velocity[:, len(DELAYS_S) // 2] @ self._nominal.T, rotation_enu_from_body)
         flat = velocity.reshape(len(velocity), -1)  # of all delays in one product
         squares = np.einsum("nka,nka->k", velocity, velocity)
         for index, frame in enumerate(_FRAMES):
@@ -104,6 +108,12 @@ class CoarseFits:
         if self._count[declared] < ENOUGH:
             return None
         given = float(self._misfits(declared, self._nominal).min())
+        if self._directions.turn_with_heading:
+            says = (
+                "the DVL's velocities turn with the heading, as those in the earth's frame do (let its driver give "
+                "them in its own axes)"
+            )
+            return Suggestion(says, {}, given)
         if given < WRONG_FROM or self._fits[0].left_by_little() < WRONG_FROM * self._gg[declared, 0]:
             return self._flipped(given)
         rotations = [self._rotations(index) for index in range(len(_FRAMES))]

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..bags.reader import BagReader
 from ..calibration.coarse_mounting import DELAYS_S
+from ..calibration.directions import Directions
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.samples import VelocityFrame
@@ -30,11 +31,13 @@ from .fit import (
     Fit,
     Hypothesis,
     ImuFrame,
+    Together,
     at_delays,
     best_rotation,
     explained,
     fit,
     nominal_rpy,
+    rotation_enu_from_body,
     together,
 )
 from .survey import Look, Survey, survey
@@ -344,10 +347,28 @@ class _Search:
         own = next((each for each in fits if each.hypothesis == wanted), None)
         if decided is None or own is None or decided is own:
             return decided
+        to_body = decided.hypothesis.reference is VelocityFrame.BODY
+        if to_body and declared not in (None, VelocityFrame.BODY) and not self._is_in_body(data, decided):
+            return own
         mounting = None if known is None else known.T
         delayed = at_delays(dvl, reference, imu)
         best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (decided, own))
         return decided if best < CLEARLY * as_declared else own
+
+    def _is_in_body(self, data: Together, fit: Fit) -> bool:
+        """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
+        imu = fit.hypothesis.imu
+        if data.orientation is None or imu is None:
+            return True
+        directions = Directions()
+        dvl = data.dvl @ FLU_FROM_FRD if fit.hypothesis.turned else data.dvl
+        directions.add(dvl @ fit.rotation_dvl_from_body, rotation_enu_from_body(data.orientation, imu))
+        if directions.stay_in_the_body:
+            return True
+        self._contradictions.append(
+            "DVL and reference agree as if both were in the body, and so they would if both were in the earth's frame"
+        )
+        return False
 
     def _take(
         self,

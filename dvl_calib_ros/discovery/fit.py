@@ -122,11 +122,16 @@ def body_velocity(data: Together, hypothesis: Hypothesis) -> Array | None:
     if data.orientation is None or hypothesis.imu is None:
         return None
     enu = data.reference @ ENU_FROM_NED.T if hypothesis.reference is VelocityFrame.NED else data.reference
-    world_from_imu = rotation_from_quaternion(data.orientation)
-    if hypothesis.imu.world == "ned":
+    return np.einsum("nij,ni->nj", rotation_enu_from_body(data.orientation, hypothesis.imu), enu)
+
+
+def rotation_enu_from_body(orientation: Array, imu: ImuFrame) -> Array:
+    """(N, 3, 3) of an IMU's quaternions (N, 4), as they are meant."""
+    world_from_imu = rotation_from_quaternion(orientation)
+    if imu.world == "ned":
         world_from_imu = ENU_FROM_NED @ world_from_imu
-    imu = np.einsum("nij,ni->nj", world_from_imu, enu)
-    return imu @ hypothesis.imu.rotation_body_from_imu.T
+    rotation: Array = world_from_imu @ imu.rotation_body_from_imu.T
+    return rotation
 
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:

@@ -79,6 +79,38 @@ def swinging(samples):
     return references(samples, change)
 
 
+def rates(samples, change):
+    return [
+        sample._replace(angular_velocity=tuple(change(np.array(sample.angular_velocity)).tolist()))
+        if isinstance(sample, ImuSample)
+        else sample
+        for sample in samples
+    ]
+
+
+def with_a_compass(samples):
+    """Headings from north, clockwise, in quaternions that say ENU."""
+
+    def change(sample):
+        yaw, pitch, roll = Rotation.from_quat(sample.orientation).as_euler("ZYX")
+        return tuple(Rotation.from_euler("ZYX", [0.5 * math.pi - yaw, pitch, roll]).as_quat().tolist())
+
+    return [s._replace(orientation=change(s)) if isinstance(s, ImuSample) else s for s in samples]
+
+
+def in_the_earth(samples):
+    """A DVL whose driver has turned its velocities to ENU, by the attitude that came last."""
+    made, attitude = [], None
+    for sample in samples:
+        if isinstance(sample, ImuSample):
+            attitude = Rotation.from_quat(sample.orientation)
+        if not isinstance(sample, DvlSample):
+            made.append(sample)
+        elif attitude is not None:
+            made.append(sample._replace(velocity=tuple(attitude.apply(sample.velocity).tolist())))
+    return made
+
+
 YAW = {deg: (0.0, 0.0, math.radians(deg)) for deg in (45, 90, 180)}
 WRONG = {
     "yaw off by 45 degrees": (lambda: run(YAW[45]), {}, "the data fit mounting_rpy 0 0 0.785"),
@@ -95,6 +127,13 @@ WRONG = {
     "body, ENU claimed": (lambda: run(frame=BODY), {"gnss_frame": "enu"}, "the reference looks like the body frame"),
     "attitude in NED": (lambda: [attitude_in_ned(s) for s in run()], {}, "the IMU's orientation looks like NED"),
     "a reference with the DVL in it": (lambda: of_the_dvl(run()), {}, "Was the DVL fused into the reference?"),
+    "rates negated": (lambda: rates(run(), np.negative), {}, "the data fit an angular velocity of the other sign"),
+    "rates in degrees": (lambda: rates(run(), np.degrees), {}, "an angular velocity in degrees per second"),
+    "a compass heading as yaw": (lambda: with_a_compass(run()), {}, "as a compass counts it (clockwise)"),
+    "a DVL in ENU": (lambda: in_the_earth(run()), {}, "turn with the heading, as those in the earth's frame do"),
+    "a DVL in ENU, body claimed": (
+        lambda: in_the_earth(run()), {"gnss_frame": "body"}, "turn with the heading, as those in the earth's frame do",
+    ),
     "an effect beyond the model": (lambda: swinging(run(gnss_std=0.01)), {}, "contradict it and were gated"),
     "a vehicle that stands": (
         lambda: [s._replace(velocity=(0.0, 0.0, 0.0)) if not isinstance(s, ImuSample) else s for s in run()], {},

@@ -157,9 +157,9 @@ class BlockSolver:
 
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
-        if contradiction := self._attitude_rates.says():
-            return contradiction
-        found = self._coarse.suggestion()
+        contradiction, found = self._attitude_rates.says(), self._coarse.suggestion()
+        if contradiction:  # of what follows from it only what mends it is worth a word
+            return f"{contradiction}; {found.says}" if found and "imu_frame" in found.parameters else contradiction
         if found is not None:
             return found.says
         late = self._reference_clock.found()
