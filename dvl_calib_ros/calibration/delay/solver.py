@@ -159,7 +159,7 @@ class BlockSolver:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
         contradiction, found = self._attitude_rates.says(), self._coarse.suggestion()
         if contradiction:  # of what follows from it only what mends it is worth a word
-            return f"{contradiction}; {found.says}" if found and "imu_frame" in found.parameters else contradiction
+            return f"{contradiction}; {found.says}" if found and "imu_frame" in found.says else contradiction
         if found is not None:
             return found.says
         late = self._reference_clock.found()
