@@ -142,7 +142,7 @@ def delayed_rows(
     """
     times = reference.times
     turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s)
-    seen = _in_body(reference, imu, imu_gap_s)
+    seen = in_body(reference, imu, imu_gap_s)
     body, noise, earth = seen.velocity, seen.noise, seen.earth_in_body
     moving = (body**2).sum(axis=1) >= min_speed**2
     if max_turn_rate > 0.0:
@@ -306,7 +306,7 @@ def _noise_of(times: Array, values: Array) -> Array:
     return bent
 
 
-class _InBody(NamedTuple):
+class InBody(NamedTuple):
     """Velocity (J, 3), noise (J, 3, 3) in the body frame, where that is known (J,), `Observations.earth_in_body`."""
 
     velocity: Array
@@ -315,17 +315,18 @@ class _InBody(NamedTuple):
     earth_in_body: Array
 
 
-def _in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> _InBody:
+def in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> InBody:
+    """References as in the body, by an attitude that is interpolated across gaps of this length (s) at most."""
     in_body = reference.in_body
     if in_body.all():
         n = len(in_body)
-        return _InBody(reference.velocity, reference.noise, np.ones(n, dtype=bool), np.zeros((n, 3, 2)))
+        return InBody(reference.velocity, reference.noise, np.ones(n, dtype=bool), np.zeros((n, 3, 2)))
     rotation, known = attitude_at(imu, reference.times, gap_s)
     body_from_enu = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
     velocity = np.matmul(body_from_enu, reference.velocity[..., None])[..., 0]
     noise = body_from_enu @ reference.noise @ body_from_enu.swapaxes(1, 2)
     earth = body_from_enu[:, :, :2] * ~in_body[:, None, None]
-    return _InBody(velocity, noise, known | in_body, earth)
+    return InBody(velocity, noise, known | in_body, earth)
 
 
 def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:

@@ -20,10 +20,11 @@ from ..observations import Observations
 from ..parameters import Parameters
 from ..robust import median
 from ..samples import FRAME_CODES, FRAMES, Codes, Index, Mask, Stamps, VelocityFrame
+from ..shared_noise import SharedNoise
 from ..spikes import without_spikes
 from .bank import DelayBank, Posterior
 from .contradicted import without_contradicted
-from .hold_out import NOT_MEASURED, Kept, thinned
+from .hold_out import MEASURED_BELOW, NOT_MEASURED, Kept, thinned
 from .reference_clock import ReferenceClock
 from .rows import (
     MARGIN_S,
@@ -35,6 +36,7 @@ from .rows import (
     attitude_at,
     binned,
     delayed_rows,
+    in_body,
 )
 
 MARGIN_NS = round(MARGIN_S * 1e9)
@@ -137,6 +139,7 @@ class BlockSolver:
         )
         self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._attitude_rates = AttitudeRates()
+        self._shared_noise = SharedNoise()
         self._reference_clock = ReferenceClock(parameters)
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
@@ -162,6 +165,8 @@ class BlockSolver:
             return f"{contradiction}; {found.says}" if found and "imu_frame" in found.says else contradiction
         if found is not None:
             return found.says
+        if shared := self._shared_noise.says():
+            return shared
         late = self._reference_clock.found()
         return "" if late is None else late.says(self._parameters)
 
@@ -202,6 +207,7 @@ class BlockSolver:
         dvl, noise_dvl, dvl_ns = self._dvl_columns(block)
         imu = self._imu(block.imu)
         self._compare_coarsely(block, dvl, imu)
+        self._compare_noise(block, dvl, reference, imu)
         from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
         first, end = np.searchsorted(imu.times, (from_s, to_s)).tolist()
         self._attitude_rates.add(*(column[first:end] for column in imu))
@@ -277,6 +283,17 @@ class BlockSolver:
                     self._coarse.add(
                         FRAMES[code], raw[use], attitude, velocity[use], None if rates is None else rates[use]
                     )
+
+    def _compare_noise(self, block: Block, dvl: DvlColumns, reference: ReferenceColumns, imu: ImuColumns) -> None:
+        """Give a block's streams, in the body, to `_shared_noise`."""
+        body = in_body(reference, imu, self._parameters.imu_timeout)
+        variance = np.diagonal(body.noise, axis1=1, axis2=2)
+        known = body.known[:, None] & (variance < MEASURED_BELOW)
+        first, end = np.searchsorted(dvl.times, self._seconds(np.array([block.from_ns, block.end_ns]))).tolist()
+        in_the_body = dvl.velocity[first:end] @ self._parameters.rotation_dvl_from_body
+        self._shared_noise.add(
+            dvl.times[first:end], in_the_body, reference.times, np.where(known, body.velocity, np.nan)
+        )
 
     def _dvl_columns(self, block: Block) -> tuple[DvlColumns, Array, Stamps]:
         """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), and their stamps (N,)."""
