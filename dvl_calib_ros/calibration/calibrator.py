@@ -20,8 +20,9 @@ from .alignment import Aligner
 from .assembly import gate_of, nis_bounds, prior
 from .bank import Group, ModelCounts, groups_of
 from .days import day_covariance
-from .delay.filter import DelayFilter, Worker
+from .delay.filter import DelayFilter
 from .delay.hold_out import Recording, Terms
+from .delay.workers import Worker
 from .frames import Array, Vector
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace

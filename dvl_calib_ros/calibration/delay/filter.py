@@ -3,7 +3,8 @@
 A hypothesis of 3 s of delay needs what comes 3 s later, so G2's samples are used when the others' have long been. What
 the aligner holds of a block is copied as soon as all that may belong to it has come or is overdue, and solved: at once,
 or by a worker while the node goes on receiving. Either way the outcome takes effect when the stamps have gone on by
-SOLVED_WITHIN_NS, so that a live run and a replay of its recording agree whatever the machine was doing.
+SOLVED_WITHIN_NS, so that a live run and a replay of its recording agree whatever the machine was doing. (Long, because
+all that the other models' world knows of G2 is asked here.)
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,9 +28,11 @@ from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
 from .bank import DayState, Posterior
+from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .hold_out import Recording, held_out_error
 from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
-from .solver import MARGIN_NS, Block, BlockSolver, DvlSamples, ImuSamples, Outcome, ReferenceSamples
+from .solver import BlockSolver, Outcome
+from .workers import AtOnce, Solved, Worker
 
 BLOCK_NS = 10_000_000_000
 LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
@@ -40,39 +43,6 @@ _BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
 AXES = ("x", "y", "z")
 # What is less than so many σ from nothing is not worth a word.
 NAMED_FROM = 4.0
-
-
-class Solved(Protocol):
-    """What a worker was given to do, as `concurrent.futures.Future`."""
-
-    def result(self) -> Outcome:
-        """The outcome, waited for; raises what the solving raised."""
-
-
-class Worker(Protocol):
-    """Does one thing after the other, as a `concurrent.futures.ThreadPoolExecutor` with one thread."""
-
-    def submit(self, work: Callable[[], Outcome], /) -> Solved:
-        """Do this after all that was submitted before."""
-
-
-class _Now:
-    """What was done at once."""
-
-    def __init__(self, outcome: Outcome) -> None:
-        self._outcome = outcome
-
-    def result(self) -> Outcome:
-        """The outcome."""
-        return self._outcome
-
-
-class _AtOnce:
-    """A worker that has done what it is given before anything else goes on."""
-
-    def submit(self, work: Callable[[], Outcome], /) -> Solved:
-        """Do it."""
-        return _Now(work())
 
 
 class _Dvl(Table):
@@ -115,7 +85,7 @@ class DelayFilter:
         self._aligner = aligner
         self._on_block = on_block
         self._solver = BlockSolver(parameters, prior, unknown, gate, verified)
-        self._worker = _AtOnce() if worker is None else worker
+        self._worker = AtOnce() if worker is None else worker
         # asked for once a second live, and at the end of a recording
         self._suggested = worker is not None
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU

@@ -19,15 +19,15 @@ from ..kalman import GaussianState
 from ..observations import Observations
 from ..parameters import Parameters
 from ..robust import median
-from ..samples import FRAME_CODES, FRAMES, Codes, Index, Mask, Stamps, VelocityFrame
+from ..samples import FRAME_CODES, FRAMES, Index, Mask, Stamps, VelocityFrame
 from ..shared_noise import SharedNoise
 from ..spikes import without_spikes
 from .bank import DelayBank, Posterior
+from .blocks import MARGIN_NS, Block, ImuSamples
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, NOT_MEASURED, Kept, thinned
 from .reference_clock import ReferenceClock
 from .rows import (
-    MARGIN_S,
     DelayedRows,
     DvlColumns,
     ImuColumns,
@@ -39,7 +39,6 @@ from .rows import (
     in_body,
 )
 
-MARGIN_NS = round(MARGIN_S * 1e9)
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 # No vehicle with a DVL turns faster, rad/s.
 FASTEST_TURN = 20.0
@@ -47,50 +46,6 @@ _BITS = np.array([1, 2, 4], dtype=np.uint8)
 # A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
 # further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
 LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
-
-
-class DvlSamples(NamedTuple):
-    """stamps_ns (N,), velocity (N, 3) m/s and covariance (N, 3, 3) (m/s)², nan where not given; DVL frame."""
-
-    stamps_ns: Stamps
-    velocity: Array
-    covariance: Array
-
-
-class ReferenceSamples(NamedTuple):
-    """stamps_ns (J,), values (J, 12), frames (J,) and unmeasured (J,), as in `Track`."""
-
-    stamps_ns: Stamps
-    values: Array
-    frames: Codes
-    unmeasured: Codes
-
-    def part(self, at: Index) -> ReferenceSamples:
-        """Some of them."""
-        return ReferenceSamples(self.stamps_ns[at], self.values[at], self.frames[at], self.unmeasured[at])
-
-
-class ImuSamples(NamedTuple):
-    """stamps_ns (M,) and values (M, 12), as in `Track`."""
-
-    stamps_ns: Stamps
-    values: Array
-
-
-class Block(NamedTuple):
-    """All streams from MARGIN_NS before from_ns until MARGIN_NS behind end_ns, copied.
-
-    new_days: how many days begin with it. silent: the DVL stops behind it for so long that tracks forget what was
-    before.
-    """
-
-    from_ns: int
-    end_ns: int
-    new_days: int
-    silent: bool
-    dvl: DvlSamples
-    reference: ReferenceSamples
-    imu: ImuSamples
 
 
 class Outcome(NamedTuple):
