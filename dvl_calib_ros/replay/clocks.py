@@ -17,11 +17,15 @@ SPOKEN: Mapping[Stream, str] = {Stream.REFERENCE: "the reference's", Stream.IMU:
 WELL_KNOWN = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37: "TAI is 37 s ahead of UTC"}
 
 
+# So many messages of a stream, evenly spread, tell well enough how far its stamps are ahead; no more are kept.
+MOST = 8192
+
+
 class StreamClocks:
-    """Of every message the stamp against that of the DVL's message that arrived last before it."""
+    """Of messages the stamp against that of the DVL's message that arrived last before it."""
 
     def __init__(self) -> None:
-        self._ahead_ns: dict[Stream, list[Stamps]] = {stream: [] for stream in SPOKEN}
+        self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in SPOKEN}
 
     def add(self, streams: Streams) -> None:
         """Take what arrived one after the other."""
@@ -30,14 +34,14 @@ class StreamClocks:
             other = _read(block)
             other = other.part(other.arrival > dvl.arrival[0]) if len(dvl) else other.part(slice(0))
             before = np.searchsorted(dvl.arrival, other.arrival) - 1
-            self._ahead_ns[stream].append(other.stamps_ns - dvl.stamps_ns[before])
+            self._ahead[stream].add(other.stamps_ns - dvl.stamps_ns[before])
 
     def objections(self, parameters: Parameters) -> list[tuple[Word, str]]:
         """What clocks that differ by more than any model looks for say against every calibration."""
         offsets = {Stream.REFERENCE: parameters.reference_time_offset, Stream.IMU: parameters.imu_time_offset}
         said = []
         for stream, whose in SPOKEN.items():
-            ahead_ns = np.concatenate(self._ahead_ns[stream] or [np.zeros(0, dtype=np.int64)])
+            ahead_ns = self._ahead[stream].kept
             if not len(ahead_ns):
                 continue
             ahead_s = float(median(1e-9 * ahead_ns)) - offsets[stream] + parameters.dvl_time_offset
@@ -53,6 +57,25 @@ class StreamClocks:
                 )
             )
         return said
+
+
+class _Spread:
+    """Every so many-th of some numbers, for them to be no more than MOST. kept: those (M,)."""
+
+    def __init__(self) -> None:
+        self.kept: Stamps = np.zeros(0, dtype=np.int64)
+        self._every = 1
+        self._next = 0  # of what comes, the place of the next one to be kept
+
+    def add(self, values: Stamps) -> None:
+        """Take further ones (N,)."""
+        self.kept = np.concatenate([self.kept, values[self._next :: self._every]])
+        self._next = (self._next - len(values)) % self._every
+        while len(self.kept) > MOST:
+            # the next one to be kept is the one after the last by so many, where that one stays
+            self._next += self._every * (len(self.kept) % 2)
+            self.kept = self.kept[::2]
+            self._every *= 2
 
 
 def _read(block: SampleBlock) -> SampleBlock:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.delay.hold_out import NO_TERMS, Compared, Recording, Terms
+from ..calibration.delay.hold_out import NO_TERMS, Recording, Terms
 from ..calibration.folds import folds_of
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
@@ -32,6 +32,8 @@ SHORTEST_M = 20.0
 GAP_INTERVALS, GAP_S = 5.0, 2.0
 # By chance the drift over few stretches is not so many times larger with a calibration than without.
 WORSE = 1.5
+# Samples that are compared in one go.
+COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
 POINTS = 1500
 # Median of chi-square with one degree of freedom.
@@ -120,19 +122,21 @@ def dead_reckoned(
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
-    every = np.arange(len(recording.dvl.times))
-    before = recording.compared(every, NO_TERMS, parameters)
-    after = _joined([recording.compared(np.flatnonzero(folds == k), each, parameters) for k, each in enumerate(terms)],
-                    np.argsort(folds, kind="stable"))  # fmt: skip
+    n = len(recording.dvl.times)
+    before, after = (_Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool)) for _ in range(2))
+    before.fill(recording, np.arange(n), NO_TERMS, parameters)
+    for k, each in enumerate(terms):
+        after.fill(recording, np.flatnonzero(folds == k), each, parameters)
     known = np.isfinite(before.error[:, 0]) & np.isfinite(after.error[:, 0])
     on_a_map = bool(known.any() and (before.oriented & after.oriented)[known].all())
     use = np.flatnonzero(known)
     step_s = _steps(recording.dvl.times[use])
-    velocity = _level(before.body[use], before, use, on_a_map)
+    axes = slice(2, 4) if on_a_map else slice(0, 2)
+    velocity = before.velocity[use, axes]
     along = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
     if not len(along) or along[-1] < SHORTEST_M:
         return None
-    errors = [_level(each.error[use], each, use, on_a_map) for each in (before, after)]
+    errors = [each.error[use, axes] for each in (before, after)]
     astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     ends = _stretches(along)
     kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
@@ -154,10 +158,24 @@ def dead_reckoned(
     )
 
 
-def _joined(parts: Sequence[Compared], order: Index) -> Compared:
-    """Parts as one, in the order of the samples. order: (N,) numbers of the samples in the order of the parts."""
-    back = np.argsort(order)
-    return Compared(*(np.concatenate(columns)[back] for columns in zip(*parts, strict=True)))
+class _Level(NamedTuple):
+    """Of N samples (N, 4) m/s ahead and to port, and east and north where that is known: reference velocity, and error
+    of the DVL's; and whether that is known (N,)."""
+
+    velocity: Array
+    error: Array
+    oriented: NDArray[np.bool_]
+
+    def fill(self, recording: Recording, at: Index, terms: Terms, parameters: Parameters) -> None:
+        """Write those of some samples, corrected by these terms."""
+        # on the way to them is twenty times as much
+        for start in range(0, len(at), COMPARED_AT_ONCE):
+            some = at[start : start + COMPARED_AT_ONCE]
+            seen = recording.compared(some, terms, parameters)
+            self.oriented[some] = seen.oriented
+            for level, body in ((self.velocity, seen.body), (self.error, seen.error)):
+                level[some, :2] = body[:, :2]
+                level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
 def _steps(times: Array) -> Array:
@@ -167,13 +185,6 @@ def _steps(times: Array) -> Array:
         return np.zeros(len(times))
     usual = float(median(interval[1:]))
     return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
-
-
-def _level(vectors: Array, seen: Compared, use: Index, on_a_map: bool) -> Array:
-    """(K, 2): east and north of body vectors (K, 3), or ahead and to port where no heading is known."""
-    if not on_a_map:
-        return vectors[:, :2]
-    return np.asarray(np.matmul(seen.rotation_enu_from_body[use], vectors[..., None])[:, :2, 0])
 
 
 def _stretches(along: Array) -> Index:

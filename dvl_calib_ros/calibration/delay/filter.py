@@ -357,9 +357,10 @@ class DelayFilter:
 
     def held_out_error(self) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
-        if self.recording is None:
+        kept = self.recording
+        if kept is None:
             return None
-        recording, epoch_ns = self.recording
+        recording, epoch_ns = kept
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         bank = self._idle_solver().bank
         return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), bank, self._parameters)

@@ -45,7 +45,8 @@ class Kept(NamedTuple):
         first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
         rates = _mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
         turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
-        return Kept(own, noise_dvl, reference, turning)
+        # what is a part of larger arrays would keep these
+        return Kept(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
 
 
 def held_out_error(
