@@ -123,24 +123,25 @@ class Group:
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp) if self._scatter is None else self._scatter.cuts(stamps_ns)
-        every = ends if not len(cuts) else np.array(sorted({*cuts.tolist(), *([] if ends is None else ends.tolist())}))
+        every, shown = _joined_ends(cuts, ends), _joined_ends(cuts[-1:], ends)
         if self._heave is None:
             after = self._after(data, process, every)
-            self._x, self._p, states = after.x, after.p, after.at
+            self._x, self._p, states, known_at = after.x, after.p, after.at, every
         else:
-            after, states = self._with_heave(stamps_ns, self._assembler.heave_rows(seen), data, process, every)
+            rows = self._assembler.heave_rows(seen)
+            after, states = self._with_heave(stamps_ns, rows, data, process, every, shown)
+            known_at = shown
         if self._scatter is not None and len(cuts):
-            assert every is not None and after.at is not None and states is not None
-            at = np.searchsorted(every, cuts)
-            last = GaussianState(states.x[at[-1]], states.p[at[-1]])
-            self._scatter.add(after.at.x[at], after.at.p[at], last)
+            assert every is not None and known_at is not None and after.at is not None and states is not None
+            at, last = np.searchsorted(every, cuts), int(np.searchsorted(known_at, cuts[-1]))
+            self._scatter.add(after.at.x[at], after.at.p[at], GaussianState(states.x[last], states.p[last]))
         self._states.clear()
         if self._folds is not None:
             folds = folds_of(stamps_ns, self._parameters)
             self._folds.add(folds, data, after.used)
             if self.needs is Needs.REFERENCE:
                 self.moments.add(folds, seen)
-        standing = None if ends is None or every is None else self._standing_at(after, states, ends, every)
+        standing = None if ends is None or known_at is None else self._standing_at(after, states, ends, known_at)
         n_used = after.used.sum(axis=1)
         self._used += n_used
         self._gated += data.usable.sum(axis=1) - n_used
@@ -171,30 +172,45 @@ class Group:
         self._states.clear()
 
     def _with_heave(
-        self, stamps_ns: Stamps, rows: Array, data: kalman.Measurements, process: Array | None, every: Ends | None
+        self,
+        stamps_ns: Stamps,
+        rows: Array,
+        data: kalman.Measurements,
+        process: Array | None,
+        every: Ends | None,
+        shown: Ends | None,
     ) -> tuple[kalman.Updated, GaussianState | None]:
-        """Take a block, and its rows of heave; the filter's states, and with heave those after `every` samples."""
+        """Take a block, and its rows of heave.
+
+        Returns the filter's states after `every` so many samples, and with heave those after `shown`, some of these.
+        """
         assert self._heave is not None
         n_samples = len(stamps_ns)
         # under a random walk what a row tells ages with the rest: it goes into the filter where its block ends
         starts = self._heave.starts(stamps_ns) if process is not None else np.zeros(0, dtype=np.intp)
         cuts = sorted({0, n_samples, *starts.tolist()})
-        wanted = np.zeros(0, dtype=np.intp) if every is None else every
+        none = np.zeros(0, dtype=np.intp)
+        wanted, with_rows = none if every is None else every, none if shown is None else shown
         parts, found = [], []
         for start, end in pairwise(cuts):
             if start in starts:
                 self._heave.close()
                 self._absorb_heave()
-            own = wanted[(wanted > start) & (wanted <= end) | (wanted == 0) & (start == 0)] - start
+            own, own_shown = (
+                each[(each > start) & (each <= end) | (each == 0) & (start == 0)] - start
+                for each in (wanted, with_rows)
+            )
             at = slice(start, end)
             after = self._after(data.part(at), None if process is None else process[at], own if len(own) else None)
-            sums = self._heave.add(stamps_ns[at], rows[at], after.used[0], own.tolist())
+            sums = self._heave.add(stamps_ns[at], rows[at], after.used[0], own_shown.tolist())
             self._x, self._p = after.x, after.p
             parts.append(after)
-            if after.at is not None:
-                found.append(_joined(after.at, HeaveSums.stacked(sums), self._parameters.motion_std))
-        states = GaussianState(*map(np.concatenate, zip(*found, strict=True))) if found else None
-        return kalman.one_after_another(parts), states
+            if after.at is not None and len(own_shown):
+                places = np.searchsorted(own, own_shown)
+                states = GaussianState(after.at.x[places], after.at.p[places])
+                found.append(_joined(states, HeaveSums.stacked(sums), self._parameters.motion_std))
+        joined = GaussianState(*map(np.concatenate, zip(*found, strict=True))) if found else None
+        return kalman.one_after_another(parts), joined
 
     def _absorb_heave(self) -> None:
         assert self._heave is not None
@@ -332,6 +348,11 @@ class Group:
             float(self._rows_sum[index] / used) if used else float(model.n_measurement),
             int(self._restarted[index]),
         )
+
+
+def _joined_ends(cuts: Ends, ends: Ends | None) -> Ends | None:
+    """Numbers of samples of both, ascending; None without any."""
+    return ends if not len(cuts) else np.array(sorted({*cuts.tolist(), *([] if ends is None else ends.tolist())}))
 
 
 def _joined(state: GaussianState, sums: HeaveSums, motion_std: float) -> GaussianState:

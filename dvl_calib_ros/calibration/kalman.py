@@ -206,12 +206,37 @@ def _solve_definite(s: Array, b: Array) -> Array:
 
 def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None = None) -> Updated:
     """Filter N samples at once, without process noise; the same result as `recursion`."""
-    solved = _solve(x, p, data)
+    h, _ = data.whitened
+    # states that no sample sees change only with those that they are correlated with
+    seen = np.flatnonzero([column.any() for column in h.swapaxes(0, 1)])
+    solved = _solve(x[:, seen], p[:, seen[:, None], seen], data, seen)
     if solved is None:
         return recursion(x, p, data, None, ends)
     after = solved.after(np.append([] if ends is None else ends, data.z.shape[1]).astype(np.intp))
+    if len(seen) < x.shape[1]:
+        after = _with_unseen(x, p, seen, after)
     at = None if ends is None else GaussianState(after.x[:-1], after.p[:-1])
     return Updated(after.x[-1], after.p[-1], solved.used, solved.nis, at)
+
+
+def _with_unseen(x: Array, p: Array, seen: NDArray[np.intp], after: GaussianState) -> GaussianState:
+    """All states x (E, K, n), P (E, K, n, n) after measurements of some.
+
+    x (K, n), P (K, n, n): of all, before. seen: (s,) which are measured. after: of these, x (E, K, s), P (E, K, s, s).
+    """
+    rest = np.setdiff1d(np.arange(x.shape[1]), seen)
+    before = p[:, seen[:, None], seen]
+    gain = np.linalg.solve(before, p[:, seen[:, None], rest]).swapaxes(1, 2)  # (K, r, s)
+    of_all = np.empty((*after.x.shape[:2], x.shape[1]))
+    of_all[..., seen] = after.x
+    of_all[..., rest] = x[:, rest] + (gain @ (after.x - x[:, seen])[..., None])[..., 0]
+    covariance = np.empty((*of_all.shape, x.shape[1]))
+    across = gain @ after.p
+    covariance[..., seen[:, None], seen] = after.p
+    covariance[..., rest[:, None], seen], covariance[..., seen[:, None], rest] = across, across.swapaxes(-1, -2)
+    left = p[:, rest[:, None], rest] - gain @ (before - after.p) @ gain.swapaxes(1, 2)
+    covariance[..., rest[:, None], rest] = 0.5 * (left + left.swapaxes(-1, -2))
+    return GaussianState(of_all, covariance)
 
 
 def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -> GaussianState:
@@ -258,8 +283,8 @@ class _Solved(NamedTuple):
         return GaussianState((p @ state[..., None])[..., 0], p)
 
 
-def _solve(x: Array, p: Array, data: Measurements) -> _Solved | None:
-    """The information after every sample.
+def _solve(x: Array, p: Array, data: Measurements, seen: NDArray[np.intp]) -> _Solved | None:
+    """The information after every sample, on the states (s,) that are seen: x (K, s), P (K, s, s).
 
     Whether a sample passes the gate depends on the samples before it. So: guess by the state before all of them which
     pass, compute every state at once, gate every sample against its state, and repeat with what passed until nothing
@@ -270,6 +295,8 @@ def _solve(x: Array, p: Array, data: Measurements) -> _Solved | None:
     prior = np.linalg.inv(p)
     prior_state = (prior @ x[:, :, None])[:, :, 0]
     h, z = data.whitened
+    if len(seen) < h.shape[1]:
+        h = h[:, seen]
     wh = h if (data.weight == 1.0).all() else h * data.weight
     # with room in front for the prior: the running sums are then taken in place
     room = (x.shape[0], data.z.shape[1] + 1)

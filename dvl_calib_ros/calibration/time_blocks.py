@@ -9,6 +9,9 @@ estimation of misspecified models", 1982).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import suppress
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -139,11 +142,7 @@ class BlockScatter:
 
         last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by.
         """
-        for each in zip(x, p, strict=True):
-            try:
-                information, vector = _information(*each)
-            except np.linalg.LinAlgError:  # numbers that ran away: the filter goes on from before, and so do these
-                continue
+        for information, vector in _informations(x, p):
             self._blocks.add(information - self._told[0], vector - self._told[1], 1.0)
             self._told = information, vector
         self._state = last
@@ -166,6 +165,18 @@ class BlockScatter:
             x, p = self._state
             self._factors[index] = self._blocks.inflation(index, x[index], p[index])
         return self._factors[index]
+
+
+def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array]]:
+    """Of E states x (K, n), P (K, n, n); without those whose numbers ran away: the filter goes on from before them."""
+    try:
+        yield from zip(*_information(x, p), strict=True)
+        return
+    except np.linalg.LinAlgError:
+        pass
+    for each in zip(x, p, strict=True):
+        with suppress(np.linalg.LinAlgError):
+            yield _information(*each)
 
 
 def _information(x: Array, p: Array) -> tuple[Array, Array]:
