@@ -10,7 +10,7 @@ question that is asked of it is a method.)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -63,6 +63,7 @@ class _Seen(NamedTuple):
 class Calibrator:
     """Calibrates with all models at once, see the module's picture.
 
+    models: names of those that it calibrates with, where not all are wanted: each costs. Of others nothing is known.
     prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
     by model name. block_size: samples that are gathered before the models are updated, if nobody asks for their state
     earlier. on_event: told of restarts in words. on_rows: given the aligned rows, in order, once all models have had
@@ -86,10 +87,13 @@ class Calibrator:
         trace: StateTrace | None = None,
         recordings_ns: Sequence[int] = (),
         worker: Worker | None = None,
+        models: Collection[str] = tuple(MODELS),
     ) -> None:
         if parameters.prior_source == "reference" and prior_sway_heave is None:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
         self.parameters = parameters
+        self._models = tuple(name for name in MODELS if name in models)
+        self._extends = [base for name in self._models if (base := MODELS[name].extends) is not None]
         self._initial = initial
         self._block_size = block_size
         self._on_event = on_event
@@ -113,7 +117,11 @@ class Calibrator:
     def _start(self) -> None:
         self.selection = Selection()
         self._n_selected = 0  # rows that the selection knows of
-        self._groups = groups_of(LINEAR_MODELS, self.parameters, self._initial, self._verified)
+        wanted = {*self._models, *self._extends}
+        if self._verified:  # every model is judged by the samples of one with a reference
+            wanted.add(next((name for name in wanted if MODELS[name].aided), "M1"))
+        linear = [model for model in LINEAR_MODELS if model.name in wanted]
+        self._groups = groups_of(linear, self.parameters, self._initial, self._verified)
         self._group_of = {name: group for group in self._groups for name in group.index}
         extended = MODELS["G2"]
         unknown = prior(extended, self.parameters)
@@ -127,6 +135,8 @@ class Calibrator:
             self._verified,
             self._worker,
         )
+        if self._extends:
+            self._delay.attach()
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
         self._seen: dict[Needs, _Seen] = {}
@@ -171,9 +181,10 @@ class Calibrator:
     def _advance(self) -> None:
         """Let the selection know what is paired, and update the models if enough samples have come together."""
         aligner = self._aligner
-        if aligner.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
-            self._delay.take_rows()
-        self._delay.advance()
+        if self._extends:
+            if aligner.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
+                self._delay.take_rows()
+            self._delay.advance()
         self._look_at_headings()
         if aligner.n_paired > self._n_selected:
             rows = aligner.rows
@@ -274,7 +285,8 @@ class Calibrator:
     def _forget_rows(self) -> None:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
-        done = min(self._n_selected, self._delay.n_taken, *(group.next_row for group in self._groups))
+        done = min(self._n_selected, *(group.next_row for group in self._groups))
+        done = min(done, self._delay.n_taken) if self._extends else done
         done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
@@ -330,8 +342,8 @@ class Calibrator:
         pairing["awaiting_reference"] = aligner.n_judged - aligner.n_paired
         pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
         counts["calibration"] = {"restarts": self.restarts}
-        for name, model in MODELS.items():
-            tally = self._group_of[name].counts(name) if model.extends is None else self._delay.counts
+        for name in self._models:
+            tally = self._group_of[name].counts(name) if MODELS[name].extends is None else self._delay.counts
             if restarted := tally.restarted:
                 counts["calibration"][f"{name} restarted"] = restarted
         return counts
@@ -519,13 +531,13 @@ class Calibrator:
         return Result(
             selected=self.selected,
             selected_because=self.selection.reason(self.parameters),
-            estimates={name: self.estimate(name) for name in MODELS},
+            estimates={name: self.estimate(name) for name in self._models},
             segments=tuple(self.selection.segments),
             counts=self.counts,
             first_ns=self.first_ns,
             last_ns=self.last_ns,
             parameters=self.parameters.as_dict(),
-            verifications={name: self.verification(name) for name in MODELS} if self._verified else {},
+            verifications={name: self.verification(name) for name in self._models} if self._verified else {},
             suggestion=self.suggestion,
             days=self.days,
         )

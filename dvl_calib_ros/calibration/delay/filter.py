@@ -97,9 +97,12 @@ class DelayFilter:
         self._told = self._solver.outcome(suggested=self._suggested)
         self._coming: deque[tuple[int, Solved]] = deque()  # by the stamp from which on they are told
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
-        for track in (aligner.reference, aligner.imu):
+
+    def attach(self) -> None:
+        """Have the aligner keep what the blocks need, for who will `advance` with it."""
+        for track in (self._aligner.reference, self._aligner.imu):
             track.needed_from_ns = LONG_AGO_NS  # until the first block is known
-        aligner.before_clearing = self.advance
+        self._aligner.before_clearing = self.advance
 
     # ------------------------------------------------------------------ what is known
 

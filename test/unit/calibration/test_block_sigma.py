@@ -54,8 +54,9 @@ def test_noise_that_lasts_raises_sigma_and_noise_as_claimed_hardly_does(name):
 
 @pytest.mark.parametrize("block_size", [1, 500])
 def test_how_samples_are_gathered_changes_nothing(block_size):
-    one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size) for size in (64, block_size))
-    for name in ("M3", "G1", "F1", "A1"):
+    names = ("M3", "G1", "F1", "A1")
+    one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size, models=names) for size in (64, block_size))
+    for name in names:
         found = one.estimate(name).covariance, other.estimate(name).covariance
         np.testing.assert_allclose(*found, rtol=1e-7, atol=1e-12)
 
@@ -68,7 +69,7 @@ def test_a_covariance_is_symmetric_to_the_last_bit_however_much_each_sigma_is_ra
 
 
 def test_a_random_walk_is_left_as_the_filter_has_it():
-    estimate = calibrate(run(0.1), CLAIMED.replace(process_std_misalignment=1e-4)).estimate("G1")
+    estimate = calibrate(run(0.1), CLAIMED.replace(process_std_misalignment=1e-4), models=("G1",)).estimate("G1")
     np.testing.assert_allclose(estimate.std, estimate.filter_std)
 
 
@@ -83,7 +84,7 @@ def test_the_state_is_the_same_and_the_result_file_has_both_sigmas():
 @cache
 def on_course(offset: tuple[float, float], headings: bool) -> Calibrator:
     """Of `level_course` as claimed; not to be fed any more."""
-    return calibrate(level_course(offset, headings), CLAIMED)
+    return calibrate(level_course(offset, headings), CLAIMED, models=("G1", "M3"))
 
 
 @cache
@@ -122,7 +123,9 @@ def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may
     estimate = on_course((0.006, 0.004), False).estimate("G1")
     assert np.radians(0.18) < estimate.std[2] < np.radians(0.25)
     assert abs(estimate.state[2]) < 2.0 * estimate.std[2] and abs(estimate.state[3]) < 2.0 * estimate.std[3]
-    trusting = calibrate(level_course((0.006, 0.004), False), CLAIMED.replace(reference_offset_std=1e-6))
+    trusting = calibrate(
+        level_course((0.006, 0.004), False), CLAIMED.replace(reference_offset_std=1e-6), models=("G1",)
+    )
     assert abs(trusting.estimate("G1").state[2]) > 2.0 * trusting.estimate("G1").std[2]
 
 
@@ -131,7 +134,7 @@ def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed
         each._replace(frame=VelocityFrame.BODY, velocity=(1.5, 0.0, 0.0)) if isinstance(each, ReferenceSample) else each
         for each in level_course((0.0, 0.0), False)
     ]
-    estimate = calibrate(samples, CLAIMED).estimate("G1")
+    estimate = calibrate(samples, CLAIMED, models=("G1",)).estimate("G1")
     assert estimate.state_of("reference_east") == estimate.state_of("reference_north") == 0.0
     assert estimate.std[2] < np.radians(0.1)
 

@@ -28,6 +28,11 @@ SPARSE = variant(NOISY, **ONE_HERTZ)  # for what is tried sample by sample
 AIDED = [name for name, model in MODELS.items() if model.aided]
 
 
+def with_m1(samples, parameters=WIDE) -> Calibrator:
+    """With this model alone, where it is what a test looks at: all of them cost four times as much."""
+    return calibrate(samples, parameters, models=("M1",))
+
+
 def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
     for name in MODELS:
         np.testing.assert_allclose(a.state(name).x, b.state(name).x, rtol=0, atol=atol)
@@ -36,6 +41,25 @@ def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
 
 
 # ---------------------------------------------------------------- what comes out
+
+
+@pytest.mark.parametrize("names", [("M1",), ("F1", "A1"), ("G2",), ("G1", "M7")], ids=" ".join)
+def test_a_model_without_the_others_is_what_it_is_among_them(names, one_by_one):
+    samples = make_samples(variant(NOISY, seconds=30))
+    alone = calibrate(samples, models=names, verified=True)
+    assert [*alone.result().estimates] == [*alone.result().verifications] == [name for name in MODELS if name in names]
+    for name in names:
+        np.testing.assert_allclose(alone.state(name).x, one_by_one.state(name).x, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(alone.state(name).p, one_by_one.state(name).p, rtol=0, atol=1e-12)
+    assert alone.counts == one_by_one.counts
+
+
+def test_what_no_model_needs_any_more_is_forgotten():
+    samples = make_samples(variant(NOISY, seconds=600, dvl_every=100, gnss_every=100))
+    alone, all_of_them = calibrate(samples, models=("M1",)), calibrate(samples)
+    for one, other in ((each.reference, each.imu) for each in (alone._aligner, all_of_them._aligner)):
+        assert one.size - one.begin < 300 and other.size - other.begin < 6000
+    assert alone._aligner.rows.size <= all_of_them._aligner.rows.size
 
 
 @pytest.mark.parametrize(
@@ -49,25 +73,26 @@ def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
 )
 def test_gnss_models_recover_the_errors_from_a_reference_in_any_frame(frame, mounting):
     run = variant(EXACT, frame=frame, mounting_rpy=mounting, imu_every=1)
-    calibrator = calibrate(make_samples(run), WIDE.replace(mounting_rpy=mounting))
-    for name in ("M1", "M3"):
+    names = ("M1", "M3")
+    calibrator = calibrate(make_samples(run), WIDE.replace(mounting_rpy=mounting), models=names)
+    for name in names:
         np.testing.assert_allclose(calibrator.state(name).x, [*PHI, SCALE], atol=2e-7)
 
 
 def test_a_lever_arm_is_compensated_with_the_angular_velocity():
     run = variant(EXACT, lever_arm=(2.0, -0.5, 1.0), imu_every=1)
-    bent = calibrate(make_samples(run), WIDE)
-    straight = calibrate(make_samples(run), WIDE.replace(lever_arm=run.lever_arm))
+    bent = with_m1(make_samples(run), WIDE)
+    straight = with_m1(make_samples(run), WIDE.replace(lever_arm=run.lever_arm))
     np.testing.assert_allclose(straight.state("M1").x, [*PHI, SCALE], atol=1e-7)
     assert np.abs(bent.state("M1").x - [*PHI, SCALE]).max() > 1e-3
-    unknown = calibrate(only(make_samples(run), DvlSample, ReferenceSample), WIDE.replace(lever_arm=run.lever_arm))
+    unknown = with_m1(only(make_samples(run), DvlSample, ReferenceSample), WIDE.replace(lever_arm=run.lever_arm))
     assert unknown.counts["dvl"]["lever_arm_uncompensated"] == unknown.counts["dvl"]["usable"]
 
 
 def test_late_dvl_stamps_are_compensated_before_pairing():
     run = variant(EXACT, dvl_late_ns=340_000_000)
-    late = calibrate(make_samples(run), WIDE)
-    right = calibrate(make_samples(run), WIDE.replace(dvl_time_offset=0.34))
+    late = with_m1(make_samples(run), WIDE)
+    right = with_m1(make_samples(run), WIDE.replace(dvl_time_offset=0.34))
     np.testing.assert_allclose(right.state("M1").x, [*PHI, SCALE], atol=1e-7)
     assert np.abs(late.state("M1").x - [*PHI, SCALE]).max() > 1e-5
 
@@ -76,13 +101,13 @@ def test_late_dvl_stamps_are_compensated_before_pairing():
 def test_streams_late_by_seconds_are_paired_once_that_is_said_even_beyond_the_latency(late_s):
     samples = make_samples(EXACT)
     names = {DvlSample: "dvl_time_offset", ReferenceSample: "reference_time_offset", ImuSample: "imu_time_offset"}
-    expected = calibrate(samples, WIDE)
+    expected = with_m1(samples, WIDE)
     for kind, name in names.items():
         late = [
             sample._replace(stamp_ns=sample.stamp_ns + round(late_s * 1e9)) if isinstance(sample, kind) else sample
             for sample in samples
         ]
-        right = calibrate(late, WIDE.replace(**{name: late_s}))
+        right = with_m1(late, WIDE.replace(**{name: late_s}))
         assert right.counts["pairing"] == expected.counts["pairing"], name
         np.testing.assert_allclose(right.state("M1").x, expected.state("M1").x, atol=1e-9)
 
@@ -97,10 +122,10 @@ def test_an_earth_fixed_error_of_the_reference_is_taken_off_in_its_own_frame(fra
         else sample
         for sample in make_samples(run)
     ]
-    expected = calibrate(make_samples(run), WIDE)
-    right = calibrate(off, WIDE.replace(reference_velocity_offset=(0.3, -0.2)))
+    expected = with_m1(make_samples(run), WIDE)
+    right = with_m1(off, WIDE.replace(reference_velocity_offset=(0.3, -0.2)))
     np.testing.assert_allclose(right.state("M1").x, expected.state("M1").x, atol=1e-9)
-    assert np.abs(calibrate(off, WIDE).state("M1").x - expected.state("M1").x).max() > 1e-3
+    assert np.abs(with_m1(off, WIDE).state("M1").x - expected.state("M1").x).max() > 1e-3
 
 
 def test_a_dvl_clock_that_drifts_and_jumps_is_put_right():
@@ -116,8 +141,8 @@ def test_a_dvl_clock_that_drifts_and_jumps_is_put_right():
         return sample._replace(stamp_ns=first_ns + round((sample.stamp_ns - first_ns + jump_ns) / (1.0 - 1e-3)))
 
     clock = {"dvl_clock_drift": 1e-3, "dvl_time_jump": 0.7, "dvl_time_jump_at": 1e-9 * jump_at_ns}
-    wrong = calibrate(list(map(stamped, samples)), WIDE)
-    right = calibrate(list(map(stamped, samples)), WIDE.replace(**clock))
+    wrong = with_m1(list(map(stamped, samples)), WIDE)
+    right = with_m1(list(map(stamped, samples)), WIDE.replace(**clock))
     error, error_as_stamped = (np.abs(each.state("M1").x - [*PHI, SCALE]).max() for each in (right, wrong))
     assert error < 1e-7 and error_as_stamped > 10.0 * error, (error, error_as_stamped)
 
@@ -131,7 +156,7 @@ def test_message_covariances_are_turned_into_the_dvl_frame_and_added():
         for sample in make_samples(run)
     ]  # fmt: skip
     parameters = Parameters(mounting_rpy=run.mounting_rpy, gate_probability=0.0)
-    calibrator = calibrate(samples, parameters)
+    calibrator = with_m1(samples, parameters)
     t = parameters.rotation_dvl_from_body
     r = t @ gnss @ t.T + own  # = diag(0.04, 0.01, 0.09) + own
     information, right = np.diag([1 / 0.05**2] * 3 + [1 / 0.006**2]), np.zeros(4)
