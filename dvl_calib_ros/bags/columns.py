@@ -111,11 +111,12 @@ def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
 
 def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
     """Channels' numbers and lengths of messages, each with where (M,) such messages are, in order of the first."""
-    lengths = batch.end - batch.start
-    kinds, firsts = np.unique(batch.number + (lengths << 16), return_index=True)
-    for kind in kinds[np.argsort(firsts)].tolist():
-        number, length = kind & 0xFFFF, kind >> 16
-        yield number, length, np.flatnonzero((batch.number == number) & (lengths == length))
+    kinds = batch.number + ((batch.end - batch.start) << 16)
+    order = np.argsort(kinds, kind="stable")
+    of_each = np.split(order, np.flatnonzero(np.diff(kinds[order])) + 1)
+    for at in sorted(of_each, key=lambda at: int(at[0])):
+        kind = int(kinds[at[0]])
+        yield kind & 0xFFFF, kind >> 16, at
 
 
 class _Layouts:

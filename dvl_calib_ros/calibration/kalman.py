@@ -224,7 +224,7 @@ def _with_unseen(x: Array, p: Array, seen: NDArray[np.intp], after: GaussianStat
 
     x (K, n), P (K, n, n): of all, before. seen: (s,) which are measured. after: of these, x (E, K, s), P (E, K, s, s).
     """
-    rest = np.setdiff1d(np.arange(x.shape[1]), seen)
+    rest = np.delete(np.arange(x.shape[1]), seen)
     before = p[:, seen[:, None], seen]
     gain = np.linalg.solve(before, p[:, seen[:, None], rest]).swapaxes(1, 2)  # (K, r, s)
     of_all = np.empty((*after.x.shape[:2], x.shape[1]))
