@@ -15,7 +15,7 @@ from itertools import product as all_of
 
 import numpy as np
 
-from .frames import ENU_FROM_NED, Array, product, rotation_from_quaternion
+from .frames import ENU_FROM_NED, Array, cross, product, rotation_from_quaternion
 
 # The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
 SPAN_S, LONGEST_S = 0.5, 1.6
@@ -148,7 +148,7 @@ class AttitudeRates:
 def _turn(before: Array, after: Array) -> Array:
     """Rotation vectors (N, 3), rad, in the body, from one attitude to another: quaternions (N, 4)."""
     v0, w0, v1, w1 = -before[:, :3], before[:, 3:], after[:, :3], after[:, 3:]
-    vector = w0 * v1 + w1 * v0 + np.cross(v0, v1)
+    vector = w0 * v1 + w1 * v0 + cross(v0, v1)
     scalar = w0[:, 0] * w1[:, 0] - (v0 * v1).sum(axis=1)
     vector *= np.copysign(1.0, scalar)[:, None]
     sine = np.linalg.norm(vector, axis=1)

@@ -125,7 +125,7 @@ class DelayedRows:
 def delayed_rows(
     dvl: DvlColumns,
     reference: ReferenceColumns,
-    imu: ImuColumns,
+    seen: InBody,
     turns: TurnRates,
     *,
     noise_dvl: Array,
@@ -137,13 +137,12 @@ def delayed_rows(
 ) -> DelayedRows:
     """Rows of the references that lie within what is known of the other streams.
 
-    noise_dvl: (3, 3) (m/s)², DVL frame. template: whose mounting and assumptions hold; its samples are not looked at.
-    lever_arm: (3,) m, body, as far as it is known already. min_speed (m/s), max_turn_rate (rad/s, 0 for none): as the
-    parameters. imu_gap_s: longest gap that is interpolated across.
+    seen: the references as in the body. noise_dvl: (3, 3) (m/s)², DVL frame. template: whose mounting and assumptions
+    hold; its samples are not looked at. lever_arm: (3,) m, body, as far as it is known already. min_speed (m/s),
+    max_turn_rate (rad/s, 0 for none): as the parameters. imu_gap_s: longest gap that is interpolated across.
     """
     times = reference.times
     turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s)
-    seen = in_body(reference, imu, imu_gap_s)
     body, noise, earth = seen.velocity, seen.noise, seen.earth_in_body
     moving = (body**2).sum(axis=1) >= min_speed**2
     if max_turn_rate > 0.0:

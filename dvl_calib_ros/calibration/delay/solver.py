@@ -31,6 +31,7 @@ from .rows import (
     DelayedRows,
     DvlColumns,
     ImuColumns,
+    InBody,
     ReferenceColumns,
     TurnRates,
     attitude_at,
@@ -162,14 +163,15 @@ class BlockSolver:
         dvl, noise_dvl, dvl_ns = self._dvl_columns(block)
         imu = self._imu(block.imu)
         self._compare_coarsely(block, dvl, imu)
-        self._compare_noise(block, dvl, reference, imu)
+        seen = in_body(reference, imu, self._parameters.imu_timeout)
+        self._compare_noise(block, dvl, reference.times, seen)
         from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
         first, end = np.searchsorted(imu.times, (from_s, to_s)).tolist()
         self._attitude_rates.add(*(column[first:end] for column in imu))
         binned_dvl, turns = DvlColumns(*binned(*dvl)), TurnRates.of(imu)
         rows = None
         if len(dvl.times) >= 6 and len(imu.times) >= 2:
-            rows_of = partial(self._rows, reference=reference, imu=imu, turns=turns, noise_dvl=noise_dvl)
+            rows_of = partial(self._rows, reference=reference, seen=seen, turns=turns, noise_dvl=noise_dvl)
             if _is_slow(dvl.times):
                 good, rows = without_contradicted(dvl, reference.times, rows_of, self.bank.misfits)
                 self._leave_out(dvl_ns[~good], block.from_ns)
@@ -187,13 +189,13 @@ class BlockSolver:
         return len(rows) > 0
 
     def _rows(
-        self, dvl: DvlColumns, *, reference: ReferenceColumns, imu: ImuColumns, turns: TurnRates, noise_dvl: Array
+        self, dvl: DvlColumns, *, reference: ReferenceColumns, seen: InBody, turns: TurnRates, noise_dvl: Array
     ) -> DelayedRows:
         p = self._parameters
         return delayed_rows(
             dvl,
             reference,
-            imu,
+            seen,
             turns,
             noise_dvl=noise_dvl,
             template=self._template,
@@ -239,16 +241,13 @@ class BlockSolver:
                         FRAMES[code], raw[use], attitude, velocity[use], None if rates is None else rates[use]
                     )
 
-    def _compare_noise(self, block: Block, dvl: DvlColumns, reference: ReferenceColumns, imu: ImuColumns) -> None:
-        """Give a block's streams, in the body, to `_shared_noise`."""
-        body = in_body(reference, imu, self._parameters.imu_timeout)
-        variance = np.diagonal(body.noise, axis1=1, axis2=2)
-        known = body.known[:, None] & (variance < MEASURED_BELOW)
+    def _compare_noise(self, block: Block, dvl: DvlColumns, times: Array, reference: InBody) -> None:
+        """Give a block's streams to `_shared_noise`. times: (J,) s, of the references."""
+        variance = np.diagonal(reference.noise, axis1=1, axis2=2)
+        known = reference.known[:, None] & (variance < MEASURED_BELOW)
         first, end = np.searchsorted(dvl.times, self._seconds(np.array([block.from_ns, block.end_ns]))).tolist()
         in_the_body = dvl.velocity[first:end] @ self._parameters.rotation_dvl_from_body
-        self._shared_noise.add(
-            dvl.times[first:end], in_the_body, reference.times, np.where(known, body.velocity, np.nan)
-        )
+        self._shared_noise.add(dvl.times[first:end], in_the_body, times, np.where(known, reference.velocity, np.nan))
 
     def _dvl_columns(self, block: Block) -> tuple[DvlColumns, Array, Stamps]:
         """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), and their stamps (N,)."""
