@@ -13,7 +13,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from dvl_calib_ros.errors import InputError
 from validation.__main__ import main
-from validation.figures import command, pages, pictures, registry, stored
+from validation.figures import command, pages, performance, pictures, registry, stored
 from validation.figures.unmarked import unmarked
 
 # What looks measured and is not, by page: parameters, limits, arithmetic, what the paper says, examples of output
@@ -209,3 +209,20 @@ def test_texts_may_differ_in_the_last_digit_of_a_number_and_in_nothing_else():
     assert one.differs(stored.Value("rises from 99.4 to 88.0 mm/s"))
     with pytest.raises(InputError, match="make it with: python -m validation figures nothing"):
         stored.load("nothing")
+
+
+def test_benchmarks_are_taken_from_files_of_different_parts_and_only_their_ratios_are_compared(tmp_path):
+    for part, ratio in (("batch", 20.0), ("replay", 0.3)):
+        line = {"what": part, "ours": "1 s", "peer": "2 s", "ratio": f"{ratio}", "target": "", "ratio_value": ratio}
+        document = {"commit": "abc", "load": [0.1, 0.2], "parts": {part: {"measurements": [line], "failed": None}}}
+        (tmp_path / f"{part}.json").write_text(json.dumps(document))
+    performance.take([tmp_path / "batch.json", tmp_path / "replay.json"])
+    found = performance.benchmarks(tmp_path)
+    assert found["ratio.batch.batch"] == 20.0 and found["ratio.replay.replay"] == 0.3
+    assert found["rows"] == "| batch | 1 s | 2 s | 20.0 |  |\n| replay | 1 s | 2 s | 0.3 |  |"
+    assert found["at"].startswith("batch at commit abc, load 0.1 before and 0.2 after; replay at")
+    (tmp_path / "none.json").write_text("{}")
+    performance.take([tmp_path / "none.json"])
+    with pytest.raises(InputError, match=r"none\.json: is not of `python -m benchmarks --json`"):
+        performance.benchmarks(tmp_path)
+    performance.take([])

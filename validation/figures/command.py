@@ -34,14 +34,12 @@ def main(argv: Sequence[str]) -> int:
     )
     what.add_argument("--pictures", action="store_true", help="make the pictures NAMES, or all; needs chromium")
     parser.add_argument(
-        "--benchmarks",
-        type=Path,
-        metavar="FILE",
-        help="take what `python -m benchmarks --json FILE` wrote, else run it",
-    )
+        "--benchmarks", type=Path, metavar="FILE", action="append",
+        help="take what `python -m benchmarks --json FILE` wrote, else run it; may be given again, for other parts",
+    )  # fmt: skip
     parser.add_argument("names", nargs="*", metavar="NAMES", help="measurements, or pictures")
     arguments = parser.parse_args(argv)
-    if arguments.benchmarks is not None:
+    if arguments.benchmarks:
         performance.take(arguments.benchmarks)
     if arguments.pictures:
         from . import pictures
@@ -120,8 +118,8 @@ def _check(chosen: list[Measurement]) -> int:
                     wrong.append(f"{use.page}, block {use.block}: {use.value} of {each.name} is not measured any more")
             elif one.differs(other):
                 wrong.append(
-                    f"{use.page}, block {use.block}: {use.value} of {each.name} is {one.value} on the page, "
-                    f"{other.value} as measured now; it may differ by {one.tolerance:.3g}"
+                    f"{use.page}, block {use.block}: {use.value} of {each.name} is {one} on the page, "
+                    f"{other} as measured now; it may differ by {one.tolerance:.3g}"
                 )
     left = len(uses) - checked - skipped
     try:

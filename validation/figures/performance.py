@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from dvl_calib_ros.errors import InputError
 
@@ -18,9 +18,9 @@ COLUMNS = ("what", "ours", "peer", "ratio", "target")
 _taken: list[Path] = []
 
 
-def take(path: Path) -> None:
-    """Use a file of `python -m benchmarks --json` instead of running it."""
-    _taken[:] = [path]
+def take(paths: Sequence[Path]) -> None:
+    """Use files of `python -m benchmarks --json`, of different parts, instead of running it."""
+    _taken[:] = paths
 
 
 @measurement(
@@ -31,23 +31,24 @@ def take(path: Path) -> None:
     partial=True,
 )
 def benchmarks(folder: Path) -> Found:
-    """The table of benchmarks, and each ratio by the part and the place of its line."""
-    path = _taken[0] if _taken else folder / "benchmarks.json"
+    """The table of benchmarks, and each ratio by its part and its line."""
+    paths = _taken or [folder / "benchmarks.json"]
     if not _taken:
-        command = [sys.executable, "-m", "benchmarks", *QUICK, "--json", str(path)]
+        command = [sys.executable, "-m", "benchmarks", *QUICK, "--json", str(paths[0])]
         subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        before, after = document["load"]
-        rows, found = [], dict[str, Any]()
-        for part, measured in document["parts"].items():
-            for each in measured["measurements"]:
-                rows.append(
-                    f"| {each['what']} | {each['ours']} | {each['peer']} | {each['ratio']} | {each['target']} |"
-                )
-                found[f"ratio.{part}.{each['what']}"] = float(each["ratio_value"])
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise InputError(f"{path}: is not of `python -m benchmarks --json` ({error!r}); make it with that") from error
-    found["rows"] = "\n".join(rows)
-    found["at"] = f"commit {document['commit']}, load {before:.1f} at the beginning and {after:.1f} at the end"
-    return found
+    rows, made, found = list[str](), list[str](), dict[str, float | str]()
+    for path in paths:
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            for part, measured in document["parts"].items():
+                for each in measured["measurements"]:
+                    rows.append("| " + " | ".join(each[column] for column in COLUMNS) + " |")
+                    found[f"ratio.{part}.{each['what']}"] = float(each["ratio_value"])
+            before, after = document["load"]
+            load = f"load {before:.1f} before and {after:.1f} after"
+            made.append(f"{', '.join(document['parts'])} at commit {document['commit']}, {load}")
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise InputError(
+                f"{path}: is not of `python -m benchmarks --json` ({error!r}); make it with that"
+            ) from error
+    return {**found, "rows": "\n".join(rows), "at": "; ".join(made)}

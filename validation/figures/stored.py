@@ -31,6 +31,9 @@ class Value:
     high: float | None = None
     n: int | None = None
 
+    def __str__(self) -> str:
+        return self.value if isinstance(self.value, str) else f"{self.value:.5g}"
+
     def __format__(self, spec: str) -> str:
         """As a number; `abs.1f` without its sign; `bounds.1f` is VALUE (LOW .. HIGH, n = N)."""
         if spec.startswith("abs"):
