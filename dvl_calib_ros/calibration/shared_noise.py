@@ -1,8 +1,14 @@
 """Whether a reference holds the DVL's own noise: then a filter made it from this DVL, and it cannot judge it.
 
-What a vehicle does is smooth from one sample to the next, noise is not. The fourth differences of both streams are
-their noise, and two instruments share none of it. A filter that has taken the DVL in passes its noise on, in whole or
-in part, whatever is added on top, and however large it claims its own to be.
+What a vehicle does is smooth from one sample to the next, noise is not. A filter that has taken the DVL in passes its
+noise on, in whole or in part, whatever is added on top, and however large it claims its own to be; two instruments
+share none. So fourth differences of both are multiplied. A vehicle's own motion is in both as well: at worst it is
+pushed anew with every sample, and goes like a random walk. Of white noise of variance N and such steps of variance Q
+the differences of the DVL are
+
+    v₂ = 6 N + 2 Q,    v₄ = 70 N + 20 Q,    and with a share κ of its noise in the reference    c₄ = 70 κ N + 20 Q,
+
+of which κ follows. Smoother motion only makes κ look smaller.
 """
 
 from __future__ import annotations
@@ -23,28 +29,28 @@ SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
 EVEN, NEAR = 0.25, 0.6
 # Differences of a smaller noise (m/s) are those of rounding.
 LEAST_NOISE_MPS = 1e-4
-# So many differences tell anything (three axes each).
-ENOUGH = 150
-# Shares of the noise, and of standard deviations, from which it is said; neighbouring differences hold the same noise.
-SHARED_FROM, SURE_FROM, OVERLAP = 0.3, 6.0, 2.0
-# The DVL's differences are noise if those of higher order, of noise of the same size, fall by less than these shares,
-# and if those that have no sample in common correlate by less than this: a shaking vehicle's do.
-SMOOTH_BELOW, WHITE_BELOW, UNCORRELATED_BELOW = 0.2, 0.15, 0.15
-# Orders of differences, and the variance of each for white noise of variance 1: central binomial coefficients.
+# So many stretches, of so many differences each (three axes), tell anything.
+ENOUGH, FEWEST = 12, 30
+# Share of the noise from which it is said, and by how many standard deviations, of the stretches' scatter, it is more.
+SHARED_FROM, SURE_FROM = 0.1, 4.0
+# Noise is so much of the differences at least, or they are the vehicle's own.
+LEAST_SHARE = 0.3
+# Differences that have no sample in common correlate by less: those of a vehicle that shakes do not.
+UNCORRELATED_BELOW = 0.15
 ORDER = 4
 _LATER = range(ORDER + 1, 2 * ORDER + 1)
-_SIZES = {order: math.comb(2 * order, order) for order in (4, 6, 8)}
 
 
 class SharedNoise:
-    """Sums over differences of the DVL and of the reference at each of `SHIFTS_S`; constant memory."""
+    """Sums over stretches of the DVL and of the reference at each of `SHIFTS_S`; constant memory."""
 
     def __init__(self) -> None:
         n = len(SHIFTS_S)
-        self._count, self._both, self._dvl, self._reference = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-        self._squares = dict.fromkeys(_SIZES, 0.0)
-        self._numbers = dict.fromkeys(_SIZES, 0)
+        self._stretches: Array = np.zeros(n)
+        self._sums = np.zeros((n, 3))  # of the stretches' c₄, v₄ and 20 Q
+        self._squares = np.zeros((n, 3))
         self._later: Array = np.zeros(len(_LATER))
+        self._square = 0.0
 
     def add(self, times: Array, velocity: Array, reference_times: Array, reference: Array) -> None:
         """Take a stretch of both, in the same frame.
@@ -57,44 +63,45 @@ class SharedNoise:
         step, reference_step = float(median(np.diff(times))), float(median(np.diff(reference_times)))
         if max(step, reference_step) > SLOWEST_S:
             return
-        even = _even(times, step)
-        for order, size in _SIZES.items():
-            differences = np.diff(velocity, order, axis=0)[_windows(even, order)]
-            self._squares[order] += float((differences**2).sum()) / size
-            self._numbers[order] += differences.size
-            if order == ORDER:
-                self._later += [(differences[lag:] * differences[:-lag]).sum() / size for lag in _LATER]
+        differences = np.diff(velocity, ORDER, axis=0)[_windows(_even(times, step), ORDER)]
+        self._later += [(differences[lag:] * differences[:-lag]).sum() for lag in _LATER]
+        self._square += float((differences**2).sum())
         # at the slower stream's times, of the faster one the samples next to them
         if reference_step < step:
-            own, other = _beside(times, velocity, step, reference_times, reference, SHIFTS_S)
+            dvl, other = _beside(times, velocity, step, reference_times, reference, SHIFTS_S)
         else:
-            other, own = _beside(reference_times, reference, reference_step, times, velocity, -SHIFTS_S)
-        known = np.isfinite(own) & np.isfinite(other)
-        own, other = np.where(known, own, 0.0), np.where(known, other, 0.0)
-        self._count += np.count_nonzero(known, axis=(1, 2))
-        self._both += (own * other).sum(axis=(1, 2))
-        self._dvl += (own * own).sum(axis=(1, 2))
-        self._reference += (other * other).sum(axis=(1, 2))
+            other, dvl = _beside(reference_times, reference, reference_step, times, velocity, -SHIFTS_S)
+        dvl_4, dvl_2, other_4 = (
+            np.diff(dvl, ORDER, axis=1),
+            np.diff(dvl, 2, axis=1)[:, 1:-1],
+            np.diff(other, ORDER, axis=1),
+        )
+        known = np.isfinite(dvl_4) & np.isfinite(other_4)
+        count = np.count_nonzero(known, axis=(1, 2))
+        dvl_4, dvl_2, other_4 = (np.where(known, each, 0.0) for each in (dvl_4, dvl_2, other_4))
+        c_4, v_4, v_2 = np.stack([dvl_4 * other_4, dvl_4 * dvl_4, dvl_2 * dvl_2]).sum(axis=(2, 3)) / np.maximum(
+            count, 1
+        )
+        found = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * (count >= FEWEST)[:, None]
+        self._stretches += count >= FEWEST
+        self._sums += found
+        self._squares += found**2
 
     def share(self) -> float:
         """How much of the DVL's noise the reference holds, 0 to about 1; 0 where that is not sure."""
-        if min(self._numbers.values()) < 3 * ENOUGH or self._count.max() < 3 * ENOUGH:
+        if self._stretches.max() < ENOUGH or np.abs(self._later).max() > UNCORRELATED_BELOW * self._square:
             return 0.0
-        fourth, sixth, eighth = (self._squares[order] / self._numbers[order] for order in _SIZES)
-        if fourth < LEAST_NOISE_MPS**2:
+        n = np.maximum(self._stretches, 2.0)[:, None]
+        mean = self._sums / n
+        std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
+        best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
+        c_4, v_4, steps = mean[best].tolist()
+        steps = max(steps, 0.0) + 2.0 * float(std[best, 2])
+        noise = v_4 - steps
+        if noise < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
             return 0.0
-        smooth = 1.0 - sixth / fourth  # share of the differences that is the vehicle's own motion, which both show
-        if smooth > SMOOTH_BELOW or 1.0 - eighth / sixth > WHITE_BELOW:
-            return 0.0
-        if np.abs(self._later).max() > UNCORRELATED_BELOW * self._squares[ORDER]:
-            return 0.0
-        enough = (self._count >= 3 * ENOUGH) & (self._dvl > 0.0)
-        share = np.divide(self._both, self._dvl, out=np.zeros_like(self._both), where=enough)
-        best = int(np.argmax(share))
-        left = max(float(self._reference[best] - share[best] ** 2 * self._dvl[best]), 0.0)
-        std = OVERLAP * math.sqrt(left / self._count[best] / self._dvl[best])
-        found = float(share[best]) - max(smooth, 0.0)
-        return found if found > max(SHARED_FROM, SURE_FROM * std) else 0.0
+        sure = c_4 - steps - SHARED_FROM * noise > SURE_FROM * float(std[best, 0])
+        return (c_4 - steps) / noise if sure else 0.0
 
     def says(self) -> str:
         """What the data fit, in words, where the reference holds the DVL's noise; else ''."""
@@ -110,17 +117,17 @@ class SharedNoise:
 def _beside(
     times: Array, values: Array, step: float, other_times: Array, other: Array, shifts: Array
 ) -> tuple[Array, Array]:
-    """Differences (S, M, k) of a stream at its times (N,), and of another one beside it, later by each shift (S,).
+    """A stream (S, N, k) at its times (N,), and another one (S, N, k) beside it, later by each shift (S,).
 
-    Nan where the samples are not evenly apart, or there are none beside each other.
+    Nan where samples are not evenly apart, or there are none beside each other.
     """
     wanted = times + shifts[:, None]
     after = np.searchsorted(other_times, wanted).clip(1, len(other_times) - 1)
     near = np.where(wanted - other_times[after - 1] < other_times[after] - wanted, after - 1, after)
     beside = np.where((np.abs(other_times[near] - wanted) <= NEAR * step)[..., None], other[near], np.nan)
-    even = _windows(_even(times, step), ORDER)
-    own = np.where(even[:, None], np.diff(values, ORDER, axis=0), np.nan)
-    return np.broadcast_to(own, (len(shifts), *own.shape)), np.diff(beside, ORDER, axis=1)
+    even = np.append(True, _even(times, step))
+    own = np.where(even[:, None], values, np.nan)
+    return np.broadcast_to(own, (len(shifts), *own.shape)), beside
 
 
 def _even(times: Array, step: float) -> Mask:
