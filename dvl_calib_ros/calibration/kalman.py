@@ -209,6 +209,8 @@ def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None 
     h, _ = data.whitened
     # states that no sample sees change only with those that they are correlated with
     seen = np.flatnonzero([column.any() for column in h.swapaxes(0, 1)])
+    if not len(seen):
+        seen = np.zeros(1, dtype=np.intp)  # any will do
     solved = _solve(x[:, seen], p[:, seen[:, None], seen], data, seen)
     if solved is None:
         return recursion(x, p, data, None, ends)

@@ -137,7 +137,7 @@ def test_what_a_run_publishes_is_what_its_bag_would_hold_bit_by_bit_and_calibrat
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
 def test_what_follows_an_odometry_is_what_a_bag_of_its_motion_would_hold(world, reliability):
-    seconds = 60.0 if reliability is ReliabilityPolicy.RELIABLE else 3.0
+    seconds = 40.0 if reliability is ReliabilityPolicy.RELIABLE else 3.0
     motion, _ = motion_of(scenario(seconds))
     start_ns = 1_790_000_000_000_000_000
     profile = QoSProfile(depth=20_000, reliability=reliability)

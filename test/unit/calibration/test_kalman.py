@@ -65,6 +65,18 @@ def test_the_batch_equals_the_filter_whatever_the_gate_decides(seed, n_samples, 
     np.testing.assert_allclose(one.nis, all_at_once.nis, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.parametrize("unseen", [[1], [0, 2], [0, 1, 2, 3]], ids=str)
+def test_states_that_no_sample_sees_follow_those_that_they_are_correlated_with(rng, unseen):
+    x, p, data = random_problem(rng, outliers=0.05, gate=16.3, weights=True)
+    data.h[..., unseen] = 0.0
+    root = 0.05 * rng.normal(size=p.shape)
+    p = root @ root.swapaxes(1, 2) + 1e-4 * np.eye(4)
+    one, all_at_once = kalman.recursion(x, p, data), kalman.batch(x, p, data)
+    np.testing.assert_array_equal(one.used, all_at_once.used)
+    np.testing.assert_allclose(one.x, all_at_once.x, atol=1e-10)
+    np.testing.assert_allclose(one.p, all_at_once.p, atol=1e-10)
+
+
 @pytest.mark.parametrize("way", [kalman.batch, lambda x, p, data, ends: kalman.recursion(x, p, data, None, ends)])
 @pytest.mark.parametrize("outliers, gate", [(0.0, np.inf), (0.05, 16.3), (0.5, 1.0)])
 def test_the_states_on_the_way_are_those_of_a_filter_stopped_there(rng, outliers, gate, way):
