@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -86,24 +87,26 @@ def screenshot(page: Path, name: str, height: int) -> None:
     save(shot, name)
 
 
-def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns: int, height: int) -> None:
+def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns: int) -> None:
     """What a terminal of this width shows."""
     from rich.console import Console
 
     console = Console(record=True, width=columns, file=io.StringIO(), force_terminal=True, highlight=False)
     console.print(shown)
     page = folder / f"{name}.html"
-    page.write_text(f"<body style='margin:0'>{console.export_svg(title=title)}</body>")
-    screenshot(page, name, height)
+    drawn = console.export_svg(title=title)
+    width, height = map(float, re.findall(r'viewBox="0 0 (\S+) (\S+)"', drawn)[0])
+    page.write_text(f"<body style='margin:0'>{drawn}</body>")
+    screenshot(page, name, round(WIDTH * height / width))
 
 
 def demo(folder: Path) -> None:
     """The end of the demo."""
     from rich.text import Text
 
-    output = dvl_calib("demo", "--speed", 5)  # slow enough for a busy machine
+    output = dvl_calib("demo")
     lines = [line.rstrip() for line in output.splitlines() if not line.startswith("   playing")]
-    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104, 916)
+    terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104)
 
 
 def watch(folder: Path) -> None:
@@ -129,7 +132,7 @@ def watch(folder: Path) -> None:
     found = diagnose(calibrator, feed.decoder.dvl_type, [], Silence(0.0), RecentCounts(), 0.0)
     values = {item.key: item.value for item in found.values}
     shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
-    terminal(shown, folder, "watch", "dvl-calib run --watch", 100, 400)
+    terminal(shown, folder, "watch", "dvl-calib run --watch", 100)
 
 
 def report(folder: Path) -> None:
