@@ -97,7 +97,7 @@ def terminal(shown: RenderableType, folder: Path, name: str, title: str, columns
     drawn = console.export_svg(title=title)
     width, height = map(float, re.findall(r'viewBox="0 0 (\S+) (\S+)"', drawn)[0])
     page.write_text(f"<body style='margin:0'>{drawn}</body>")
-    screenshot(page, name, round(WIDTH * height / width))
+    screenshot(page, name, round(WIDTH * height / width) + 12)  # below the lowest line
 
 
 def demo(folder: Path) -> None:
