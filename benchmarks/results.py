@@ -45,7 +45,8 @@ class Run(NamedTuple):
                 for name, part in self.parts.items()
             },
         }
-        save_bytes(path, (json.dumps(document, indent=2) + "\n").encode(), keep=lambda _: ())
+        text = json.dumps(document, indent=2, default=lambda number: number.item())  # parts compute with numpy
+        save_bytes(path, f"{text}\n".encode(), keep=lambda _: ())
 
 
 class Baseline:

@@ -54,6 +54,13 @@ def test_what_was_measured_is_saved_after_every_part_with_load_commit_and_versio
     assert document["versions"]["numpy"] == np.__version__
 
 
+def test_numbers_of_numpy_are_saved_as_any_other(tmp_path):
+    saved = tmp_path / "measured.json"
+    found = measured(0.5)._replace(met=np.bool_(True), ratio_value=np.float64(0.5))
+    assert main(["--json", str(saved)], {"fine": lambda _: [found]}) == 0
+    assert json.loads(saved.read_text())["parts"]["fine"]["measurements"][0]["met"] is True
+
+
 def test_why_a_part_failed_is_saved(tmp_path):
     saved = tmp_path / "measured.json"
     assert main(["--json", str(saved)], {"broken": broken}) == 1
