@@ -22,7 +22,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 MARINE = "marine_acoustic_msgs/msg/Dvl"
 A50 = "dvl_msgs/msg/DVL"
 IMU = "sensor_msgs/msg/Imu"
-TYPES = (TWIST, TWIST_STAMPED, ODOMETRY, MARINE, A50)
+VECTOR = "geometry_msgs/msg/Vector3Stamped"
+TYPES = (TWIST, TWIST_STAMPED, VECTOR, ODOMETRY, MARINE, A50)
 
 # marine_acoustic_msgs 2.1.0
 MARINE_DEFINITION = """
@@ -92,6 +93,8 @@ class Maker:
             return self._marine(header, sample.velocity * FLIP, covariance * np.outer(FLIP, FLIP))
         if kind == A50:
             return self._a50(header, sample.velocity * FLIP, covariance * np.outer(FLIP, FLIP))
+        if kind == VECTOR:
+            return self._new(kind, header, self.vector(sample.velocity))
         twist = self._new("geometry_msgs/msg/Twist", self.vector(sample.velocity), self.vector())
         if kind == TWIST_STAMPED:
             return self._new(kind, header, twist)

@@ -83,6 +83,15 @@ class BagReader:
         """Whether a recording has a topic of a type that ROS does not bring, without its definition."""
         return any(self.decoder.lacks_definition(channel) for channel in self.channels(topic))
 
+    def fields_of(self, topic: str) -> tuple[str, ...]:
+        """Names of the fields of a topic's messages; none if that is not known."""
+        names: list[str] = []
+        for channel in self.channels(topic):
+            store = self.decoder.typestore(channel)
+            if store is not None and channel.msgtype in store.fielddefs:
+                names += [name for name, _ in store.fielddefs[channel.msgtype][1]]
+        return tuple(dict.fromkeys(names))
+
     @property
     def message_counts(self) -> Counter[str]:
         """Topic -> number of messages, as the recordings' indexes say."""

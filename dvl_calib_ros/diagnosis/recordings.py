@@ -25,7 +25,7 @@ from ..effects.base import Needs
 from ..errors import InputError
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import KNOWN_DEFINITIONS
+from ..messages.opening import open_recordings
 from ..replay.replay import Topics, _check_topics, _of_types
 from .curve import Curve
 from .settings import SETTINGS
@@ -258,7 +258,7 @@ def _load(
     name: str, path: Path, parameters: Parameters, topics: Topics, on_progress: Callable[[float], None]
 ) -> tuple[Recording, list[str]]:
     found: list[Finding] = []
-    with BagReader([path], KNOWN_DEFINITIONS) as bag:
+    with open_recordings([path]) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, [path], chosen, found)
         decoder = MessageDecoder(_of_types(bag, chosen, parameters))

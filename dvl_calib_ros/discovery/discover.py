@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from ..bags.reader import BagReader
 from ..calibration.coarse_mounting import DELAYS_S
 from ..calibration.directions import Directions
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
@@ -22,7 +21,8 @@ from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, Para
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..messages.decode import EARTH_FRAMES
-from ..messages.drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES
+from ..messages.drivers import VELOCITY_TYPES
+from ..messages.opening import open_recordings
 from ..replay.replay import Topics
 from . import choose
 from .fit import (
@@ -97,7 +97,7 @@ class Discovery:
 
 def discover(paths: Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
     """Look into recordings for what is not given. Raises InputError for named topics that are not there."""
-    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+    with open_recordings(paths) as bag:
         seen = survey(bag)
     where = ", ".join(map(str, paths))
     if not seen.topics:

@@ -36,7 +36,6 @@ FASTEST = 1e5
 MOST_STATIC = 200
 # Of an IMU: quaternion, angular velocity and acceleration.
 _IMU_NUMBERS = 10
-MOVING_TYPES = frozenset({*VELOCITY_TYPES, IMU_TYPE})
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ class Survey:
 def survey(bag: BagReader) -> Survey:
     """Look at recordings that are open."""
     types, counts = bag.topics, bag.message_counts
-    moving = {topic for topic, kind in types.items() if kind in MOVING_TYPES}
+    moving = {topic for topic, kind in types.items() if kind in VELOCITY_TYPES or kind == IMU_TYPE}
     static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
     start_ns = bag.span_ns[0] if types else 0
     spans_ns = bag.recorded_spans_ns if types else [(0, 0)]

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..bags.reader import BagReader
 from ..calibration.findings import Finding, Severity
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
 from ..discovery.fit import FITS
-from ..messages.drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES
+from ..messages.drivers import VELOCITY_TYPES
+from ..messages.opening import open_recordings
 from . import checks
 from .columns import Recorded, recorded
 from .kinds import named
@@ -116,7 +116,7 @@ def examine(paths: Sequence[Path], parameters: Parameters, given: Given | None =
     """Look at everything. Raises InputError for what is no recording or has no DVL."""
     discovery = discover(paths, parameters, given)
     topics = discovery.topics
-    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+    with open_recordings(paths) as bag:
         types = bag.topics
         wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
         there = {role: name for role, name in wanted.items() if name in types}

@@ -15,7 +15,7 @@ import yaml
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..errors import InputError
-from ..messages.drivers import TYPES_OF, velocity_type
+from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type
 from .yaml_files import load_yaml, parse_scalar
 
 NODE_NAME = "dvl_calibration"
@@ -48,7 +48,8 @@ def load_parameters(
     except ParameterError as error:
         raise InputError(f"-p {error}") from error
     for name in TYPES_OF:
-        velocity_type(name, getattr(parameters, name))
+        if name != "dvl_type" or not may_be_recognised(parameters.dvl_type):
+            velocity_type(name, getattr(parameters, name))
     return parameters
 
 

@@ -9,9 +9,10 @@ dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.water
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -116,11 +117,30 @@ def _flagged(field: str) -> Rule:
 
 
 _CHECK_LOCK = "check that the bottom is in range and nothing is before the beams"
+
+
+def _has_no_altitude(message: Any) -> Any:
+    return _is_outside(message.altitude, 0.0, _LARGEST)
+
+
+def _has_no_range(message: Any) -> Any:
+    """Whether fewer beams than a velocity takes have a range; Gazebo's bridge never fills in the altitude."""
+    ranges = np.asarray(message.range, dtype=float)
+    with_range = (ranges > 0.0) & (ranges <= _LARGEST)
+    return (message.beam_ranges_valid == 0) | (with_range.sum(axis=-1) < ENOUGH_BEAMS)
+
+
 # the sensor sends altitude -1 without bottom lock; 0 is what a driver leaves that does not fill it
 _NO_BOTTOM = Rule(
     "no_bottom",
     "`altitude` is negative or not finite",
-    lambda message, _: _is_outside(message.altitude, 0.0, _LARGEST),
+    lambda message, _: _has_no_altitude(message),
+    _CHECK_LOCK,
+)
+_NO_BOTTOM_NOR_RANGES = Rule(
+    "no_bottom",
+    f"`altitude` is negative or not finite, and fewer than {ENOUGH_BEAMS} beams have a range",
+    lambda message, _: _has_no_altitude(message) & _has_no_range(message),
     _CHECK_LOCK,
 )
 
@@ -232,7 +252,7 @@ _FEW_BEAMS = Rule(
     _CHECK_LOCK,
 )
 
-VELOCITY_TYPES: Mapping[str, VelocityType] = {
+_TYPES: dict[str, VelocityType] = {
     each.name: each
     for each in (
         VelocityType(
@@ -250,6 +270,15 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
             covariance=lambda _: None,
             covariance_says="none",
             rules=(_zero_velocity(_LINEAR),),
+            is_reference=True,
+        ),
+        VelocityType(
+            name="geometry_msgs/msg/Vector3Stamped",
+            sent_by="simple drivers, Gazebo's GNSS velocity",
+            velocity=attrgetter("vector"),
+            covariance=lambda _: None,
+            covariance_says="none",
+            rules=(_zero_velocity(attrgetter("vector")),),
             is_reference=True,
         ),
         VelocityType(
@@ -281,7 +310,7 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
                 ),
                 _flagged("beam_velocities_valid"),  # where Water Linked's drivers put the sensor's velocity_valid
                 _FEW_BEAMS,
-                _NO_BOTTOM,
+                _NO_BOTTOM_NOR_RANGES,
                 _zero_velocity(_VELOCITY),
             ),
             definitions=(_MARINE_DVL,),
@@ -388,14 +417,34 @@ VELOCITY_TYPES: Mapping[str, VelocityType] = {
         ),
     )
 }
+_WRITTEN = tuple(_TYPES.values())
+VELOCITY_TYPES: Mapping[str, VelocityType] = _TYPES  # grows by those that are recognised (opening.py)
 # for bags that do not say how messages are laid out
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
     name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
 }
-DVL_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_dvl}
-REFERENCE_TYPES: Mapping[str, VelocityType] = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
+_DVLS = {name: each for name, each in _TYPES.items() if each.is_dvl}
+_REFERENCES = {name: each for name, each in _TYPES.items() if each.is_reference}
+DVL_TYPES: Mapping[str, VelocityType] = _DVLS
+REFERENCE_TYPES: Mapping[str, VelocityType] = _REFERENCES
 # what the parameters of these names may name
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
+
+
+def add_type(name: str, like: str) -> VelocityType:
+    """A type of another name that is read as one that is known; known by its name from here on."""
+    package = name.partition("/")[0]
+    same = VELOCITY_TYPES[like]
+    added = replace(same, name=name, sent_by=f"as {like}", definitions=(), install=f"build {package} in your workspace")
+    for types, belongs in ((_TYPES, True), (_DVLS, added.is_dvl), (_REFERENCES, added.is_reference)):
+        if belongs:
+            types[name] = added
+    return added
+
+
+def may_be_recognised(name: str) -> bool:
+    """Whether a type that nobody knows may yet be a DVL's, once its fields are seen."""
+    return re.fullmatch(r"[A-Za-z]\w*/(msg/)?(DVL|Dvl)", name, re.ASCII) is not None
 
 
 def velocity_type(parameter: str, name: str) -> VelocityType:
@@ -411,7 +460,7 @@ def velocity_type(parameter: str, name: str) -> VelocityType:
 def driver_table() -> str:
     """The documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
-    for each in VELOCITY_TYPES.values():
+    for each in _WRITTEN:
         axes = "forward-right-down" if each.points_down else "forward-left-up" if each.is_dvl else "of the reference"
         rules = "; ".join(f"`{rule.counter}`: {rule.says}" for rule in each.rules)
         lines.append(

@@ -46,14 +46,13 @@ from ..files.result_file import (
     result_text,
     save_result,
 )
-from ..messages.drivers import velocity_type
 from ..messages.feed import MessageFeed
 from ..streams import say
 from .answering import AnsweringNode
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
-from .message_types import message_class
+from .message_types import velocity_class
 from .mounting import MountingOutput
 from .parameters import declare_parameters
 from .pauses import Pauses, steady_s
@@ -77,9 +76,8 @@ class CalibrationNode(AnsweringNode):
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
         parameters = declare_parameters(self, parameter_files)
         self._parameter_files = parameter_files
-        dvl_type = velocity_type("dvl_type", parameters.dvl_type)
-        gnss_type = velocity_type("gnss_type", parameters.gnss_type)
-        dvl_class, gnss_class = message_class("dvl_type", dvl_type.name), message_class("gnss_type", gnss_type.name)
+        dvl_class = velocity_class("dvl_type", parameters.dvl_type)
+        gnss_class = velocity_class("gnss_type", parameters.gnss_type)
         self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
         self._check_result_file(parameters.result_file)
         initial = None

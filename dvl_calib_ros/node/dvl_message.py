@@ -15,7 +15,7 @@ from ..messages.drivers import BOTTOM_TRACK, DS_INSTRUMENT, VelocityType
 DVL_FRAME = "dvl_link"
 ALTITUDE_M = 10.0
 # Where types keep velocity and covariance
-_VECTORS = ("twist.twist.linear", "twist.linear", "velocity")
+_VECTORS = ("vector", "twist.twist.linear", "twist.linear", "velocity")
 _COVARIANCES = ("velocity_covar", "velocity_covariance", "covariance")
 # What says that a measurement is good, by name; each type has some of them
 _GOOD: dict[str, Any] = {

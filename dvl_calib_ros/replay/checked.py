@@ -12,7 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from ..bags.reader import BagReader
 from ..calibration.alignment import DROPOUT_NS
 from ..calibration.comparison import Comparison, Difference, compare, moved_in_words, sentences
 from ..calibration.extrinsics import Extrinsics
@@ -22,7 +21,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.verification import Word
 from ..errors import InputError
 from ..files.extrinsics import load_extrinsics
-from ..messages.drivers import KNOWN_DEFINITIONS
+from ..messages.opening import open_recordings
 from .replay import Replayed, Topics, extrinsics_of_replay, replay
 
 # Files of one recording may overlap by what was on its way when the next began.
@@ -169,7 +168,7 @@ def _bags(paths: Sequence[Path], topics: Topics) -> list[_Bag]:
     names = short if len(set(short)) == len(short) else list(map(str, paths))
     bags = []
     for path, name in zip(paths, names, strict=True):
-        with BagReader([path], KNOWN_DEFINITIONS) as bag:
+        with open_recordings([path]) as bag:
             if not bag.topics:
                 continue
             has_dvl = bag.message_counts[topics.found_in(bag.topics).dvl] > 0

@@ -33,7 +33,8 @@ from ..errors import InputError
 from ..files.result_file import days_document, estimate_document, load_initial_calibration
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES, TWIST_TYPE
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
+from ..messages.opening import open_recordings
 from .clocks import StreamClocks
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
@@ -117,7 +118,7 @@ def replay(
     events: list[str] = []
     if parameters.prior_source == "initial_window":
         found.append(finding("PRIOR_HOLDS_ERROR"))
-    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+    with open_recordings(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, found)
         recorder = Recorder(parameters, bag.message_counts[chosen.dvl]) if with_history else None
@@ -280,7 +281,7 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
     velocities: list[Array] = []
     first_ns: int | None = None
     attitude = no_samples(Stream.IMU)
-    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
+    with open_recordings(paths) as bag:
         chosen = topics.found_in(bag.topics)
         _check_topics(bag, paths, chosen, [])
         decoder = MessageDecoder(_of_types(bag, chosen, parameters))

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from ..bags.reader import BagReader
 from ..calibration.frames import ENU_FROM_NED, Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import FRAME_CODES, Codes, Index, SampleBlock, Stamps, Stream, VelocityFrame, no_samples
@@ -19,7 +18,8 @@ from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..errors import InputError
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, REFERENCE_TYPES
+from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES
+from ..messages.opening import open_recordings
 from ..replay.replay import Topics
 from .trajectories import Motion
 
@@ -78,14 +78,14 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
 
 def notes_of(recording: Recording) -> list[str]:
     """What of the recording is damaged or missing, in words."""
-    with BagReader([recording.path]) as bag:
+    with open_recordings([recording.path]) as bag:
         for _ in bag.raw_messages(bag.topics):
             pass
         return list(bag.notes)
 
 
 def _read(recording: Recording) -> _Samples:
-    with BagReader([recording.path], KNOWN_DEFINITIONS) as bag:
+    with open_recordings([recording.path]) as bag:
         topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
         _check_topics(recording, topics, bag.topics)
         parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=bag.topics[topics.gnss])

@@ -17,7 +17,7 @@ from ..calibration.samples import SampleBlock, Stream
 from ..diagnosis.recordings import zeros_while_moving
 from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import KNOWN_DEFINITIONS
+from ..messages.opening import open_recordings
 from ..replay.replay import Topics, _of_types
 
 # Log times further from the stamps belong to another clock (simulated time beside the host's) and say no latency, s
@@ -54,7 +54,7 @@ class StreamFacts:
 
 def stream_facts(path: Path, parameters: Parameters, topics: Topics) -> StreamFacts:
     """Read the DVL's stream of a bag once more, with log times. Raises InputError."""
-    with BagReader([path], KNOWN_DEFINITIONS) as bag:
+    with open_recordings([path]) as bag:
         chosen = topics.found_in(bag.topics)
         decoder = MessageDecoder(_of_types(bag, chosen, parameters))
         log_ns = _log_times(bag, chosen.dvl)

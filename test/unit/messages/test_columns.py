@@ -85,9 +85,12 @@ def test_every_type_gives_the_same_samples_in_columns(tmp_path, kind, reference,
     if kind == MARINE:
         changes |= {
             5: lambda m: setattr(m, "velocity_mode", 2), 6: lambda m: setattr(m, "num_good_beams", 2),
-            7: lambda m: setattr(m, "altitude", float("nan")), 8: lambda m: setattr(m, "beam_velocities_valid", False),
-            9: lambda m: m.velocity_covar.__setitem__(0, -1.0), 10: lambda m: setattr(m, "altitude", -1.0),
-            11: lambda m: setattr(m, "altitude", float("inf")), 12: lambda m: setattr(m, "velocity_mode", 0),
+            7: lambda m: vars(m).update(altitude=float("nan"), beam_ranges_valid=False),
+            8: lambda m: setattr(m, "beam_velocities_valid", False),
+            9: lambda m: m.velocity_covar.__setitem__(0, -1.0),
+            10: lambda m: vars(m).update(altitude=-1.0, range=np.zeros(4)),
+            11: lambda m: vars(m).update(altitude=float("inf"), beam_ranges_valid=False),
+            12: lambda m: setattr(m, "velocity_mode", 0),
         }  # fmt: skip
     samples = [s._replace(velocity=(0.0, 0.0, 0.0)) if i == 77 and hasattr(s, "velocity") else s
                for i, s in enumerate(run(20.0))]  # fmt: skip

@@ -41,6 +41,7 @@ from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.yaml_files import load_yaml
 from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
 from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.opening import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.replay.replay import Topics, replay
 from dvl_calib_ros.simulation.recorded import Recording, recorded_motion
@@ -77,7 +78,7 @@ def without_covariance(samples):
 
 
 def set_velocity(message, velocity) -> None:
-    linear = message.velocity if hasattr(message, "velocity") else message.twist
+    linear = next(getattr(message, name) for name in ("velocity", "vector", "twist") if hasattr(message, name))
     while hasattr(linear, "twist"):
         linear = linear.twist
     linear = getattr(linear, "linear", linear)
@@ -207,8 +208,8 @@ BAD = {
     "marine water": (MARINE, lambda m: setattr(m, "velocity_mode", 2), "water_track"),
     "marine unset mode": (MARINE, lambda m: setattr(m, "velocity_mode", 0), "unknown_mode"),
     "marine other mode": (MARINE, lambda m: setattr(m, "velocity_mode", 7), "unknown_mode"),
-    "marine altitude -1": (MARINE, lambda m: setattr(m, "altitude", -1.0), "no_bottom"),
-    "marine altitude nan": (MARINE, lambda m: setattr(m, "altitude", math.nan), "no_bottom"),
+    "marine altitude -1": (MARINE, lambda m: vars(m).update(altitude=-1.0, beam_ranges_valid=False), "no_bottom"),
+    "marine altitude nan": (MARINE, lambda m: vars(m).update(altitude=math.nan, range=-np.ones(4)), "no_bottom"),
     "marine variance": (MARINE, lambda m: m.velocity_covar.__setitem__(4, -0.5), "invalid"),
     "marine covariance nan": (MARINE, lambda m: m.velocity_covar.__setitem__(1, math.nan), "invalid"),
     "a50 flag": (A50, lambda m: setattr(m, "velocity_valid", False), "flagged_invalid"),
@@ -475,6 +476,36 @@ def vendor_mcap(bag, vendor: str) -> bytes:
     """The same messages, the DVL's under a type of another name."""
     definitions = {"dvl/twist": (vendor, MAKERS["first"].store.generate_msgdef(A50, ros_version=2)[0])}
     return mcap_bytes(raw(bag), definitions=definitions)
+
+
+@pytest.mark.parametrize("package", ["waterlinked_a50_ros_driver", "dvl_a50_msgs"])
+def test_a_drivers_message_is_recognised_by_its_fields_whatever_its_package_is(package, bare, expected, tmp_path):
+    bag, name = write_driver_bag(tmp_path / "bag", bare, A50), f"{package}/msg/DVL"
+    (tmp_path / "fork.mcap").write_bytes(vendor_mcap(bag, name))
+    assert estimates(tmp_path / "fork.mcap") == expected
+    assert velocity_type("dvl_type", f"{package}/DVL").points_down
+
+
+def test_a_dvls_fields_decide_how_a_message_is_read_and_others_are_none():
+    girona = ("header", "velocity", "velocity_covariance", "altitude", "beams")
+    assert not recognised("dave_interfaces/msg/DVL", girona).points_down
+    assert recognised("new_msgs/msg/Twist", ("header", "velocity", "altitude")) is None
+    assert "new_msgs/msg/Twist" not in VELOCITY_TYPES
+
+
+def test_a_saved_result_of_a_recognised_type_is_read_where_nobody_has_seen_its_fields(tmp_path):
+    (tmp_path / "p.yaml").write_text("/**:\n  ros__parameters:\n    dvl_type: unseen_msgs/msg/DVL\n")
+    assert load_parameters(tmp_path / "p.yaml").dvl_type == "unseen_msgs/msg/DVL"
+
+
+@pytest.mark.parametrize(
+    ("ranges", "valid", "used"), [(20.0, True, 1), (20.0, False, 0), (-1.0, True, 0), (math.nan, True, 0)]
+)
+def test_gazebos_bridge_never_fills_the_altitude_and_is_read_by_its_beams(ranges, valid, used):
+    feed, given = Feed(MARINE), message(MARINE)
+    given.altitude, given.range, given.beam_ranges_valid = -1.0, np.full(4, ranges), valid
+    feed.take(given)
+    assert (feed.counts["accepted"], feed.counts.get("no_bottom", 0)) == (used, 1 - used)
 
 
 def test_the_readme_lists_the_drivers_of_the_registry():
