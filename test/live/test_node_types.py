@@ -98,7 +98,7 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
         assert message_type is getattr(stub, kind)
         assert subscribed["gnss/twist"][0] is TwistWithCovarianceStamped
         messages = [as_plain(maker.velocity(dvl_type, sample)) for sample in samples]
-        messages[3].altitude = -1.0
+        messages[3].altitude, messages[3].beam_ranges_valid = -1.0, False
         for message in messages:
             callback(message, {"received_timestamp": 0, "source_timestamp": 0})
         counts = node._calibrator.counts["dvl"]
