@@ -138,9 +138,10 @@ class Parameters:
     )
     gnss_frame: str = _parameter(
         FROM_FRAME_ID,
-        "Frame of the reference velocity. from_frame_id: base_frame is body; enu, map, odom, world are "
-        "ENU; ned is NED; anything else is refused.",
-        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame)),
+        "Frame of the reference velocity; frd: of the body, forward-right-down. from_frame_id: base_frame is body; "
+        "enu, map, odom, world are ENU; ned is NED; a name that ends in _enu, _ned, _flu or _frd says so; anything "
+        "else is refused.",
+        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FRD),
     )
     gnss_axes: str = _parameter(
         AUTO,

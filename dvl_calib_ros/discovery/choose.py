@@ -85,6 +85,28 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
     return min(found, key=lambda look: (order.index(look.msgtype), not look.speed, -look.count, look.topic)).topic
 
 
+def is_another_dvl(look: Look, dvl: Look) -> bool:
+    """Whether a topic is that of a second DVL, by its type or name, and by its frame."""
+    own_frame = any(word in look.frame_id.lower() for word in DVL_WORDS)
+    is_one = look.msgtype in DVL_TYPES and (look.msgtype not in REFERENCE_TYPES or own_frame)
+    moves = look.speed >= MOVES_FROM and not is_derived(look)
+    return is_one and look.topic != dvl.topic and moves and bool(look.frame_id) and look.frame_id != dvl.frame_id
+
+
+def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[str]:
+    """What to say of DVLs beside the one that is calibrated."""
+    look = survey.looks.get(dvl)
+    if look is None:
+        return []
+    others = [each for each in survey.looks.values() if is_another_dvl(each, look)]
+    measured = [each for each in others if (difference(look, each) or 0.0) >= SAME_SHARE]
+    return [
+        f"two DVLs: {each.topic} ({each.frame_id}) is another one than {dvl} ({look.frame_id}), which is calibrated "
+        f"here; the other by itself with --dvl-topic {each.topic}"
+        for each in sorted(measured, key=lambda each: each.topic)
+    ]
+
+
 def choose_reference(survey: Survey, default: str, dvl: str, difference: Difference) -> tuple[str | None, list[str]]:
     """The reference's topic, or None; and what was passed over, in sentences."""
     standard = _spelled(default, survey.topics)
@@ -101,7 +123,8 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
             continue
         share = None if dvl_look is None else difference(dvl_look, look)
         if _has(look, DVL_WORDS) or (share is not None and share < SAME_SHARE):
-            said.append(f"{look.topic} looks as if it were made from the DVL; not taken as a reference")
+            if dvl_look is None or not is_another_dvl(look, dvl_look) or (share is not None and share < SAME_SHARE):
+                said.append(f"{look.topic} looks as if it were made from the DVL; not taken as a reference")
             continue
         if is_derived(look):
             said.append(

@@ -20,7 +20,7 @@ from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_fro
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
-from ..messages.decode import EARTH_FRAMES
+from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.opening import open_recordings
 from ..replay.replay import Topics
@@ -39,6 +39,7 @@ from .fit import (
     nominal_rpy,
     rotation_enu_from_body,
     together,
+    turns_right,
 )
 from .survey import Look, Survey, survey
 from .transforms import FrameTree, Placed
@@ -49,6 +50,8 @@ OTHER_MOUNTING = math.radians(12.0)
 GRAVITY_SHOWS = 5.0
 # Of a vehicle that goes ahead, the mean velocity has at least this share of the speed.
 STRAIGHT_SHARE = 0.7
+# Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
+BETTER = 0.8
 # Reference frames, in the order in which they are taken for one that the data cannot tell.
 USUAL = (VelocityFrame.ENU, VelocityFrame.BODY, VelocityFrame.NED)
 
@@ -154,6 +157,7 @@ class _Search:
     def _topics(self) -> Topics:
         given, default = self._given, Topics()
         dvl = self._named("dvl", given.dvl_topic) or choose.choose_dvl(self._seen, default.dvl, self._where)
+        self._notes += choose.other_dvls(self._seen, dvl, _difference)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
             chosen, said = choose.choose_reference(self._seen, default.gnss, dvl, _difference)
@@ -187,7 +191,7 @@ class _Search:
             if role == "reference" and look is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
                 declared = self._declared_reference(look)
-                shown = chosen if chosen != FROM_FRAME_ID else "" if declared is None else declared.value
+                shown = chosen if chosen != FROM_FRAME_ID else "" if declared is None else declared.name
                 frame = f", {shown}" if shown else ""
             parts.append(f"{role} {name} ({kind.split('/')[-1]}{frame}{rate})")
         return "; ".join(parts)
@@ -216,7 +220,7 @@ class _Search:
             self._take_imu(imu_frames[0], imu)
         if self._parameters.dvl_axes == FROM_MESSAGE and turned != self._turned_by_message(dvl):
             self._values["dvl_axes"] = FRD if turned else FLU
-            which = "forward-right-down" if turned else "as they come, the axes that the transform has"
+            which = "forward-right-down" if turned else "as they come"
             self._found.append(f"the DVL's data are taken {which} (dvl_axes {self._values['dvl_axes']})")
         if known is not None and not self._gives("mounting_rpy"):
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
@@ -268,24 +272,33 @@ class _Search:
         driver_axes = placed is not None and placed.rotation[2, 2] < 0.0 and not self._gives("mounting_rpy")
         return self._turned_by_message(dvl) and not driver_axes
 
-    def _declared_reference(self, reference: Look) -> VelocityFrame | None:
+    def _declared_reference(self, reference: Look) -> DeclaredFrame | None:
         if self._parameters.gnss_frame != FROM_FRAME_ID:
-            return VelocityFrame(self._parameters.gnss_frame)
+            return DECLARED_FRAMES[self._parameters.gnss_frame]
         of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
         if of_type is not None:
-            return of_type
-        name = reference.frame_id.strip("/")
-        base = self._values.get("base_frame", self._parameters.base_frame).strip("/")
-        if name in (base, self._parameters.base_frame.strip("/")):
-            return VelocityFrame.BODY
-        return EARTH_FRAMES.get(name.lower())
+            return DeclaredFrame(of_type)
+        base = self._parameters.base_frame
+        return frame_named(reference.frame_id, (base, self._values.get("base_frame", base)))
+
+    def _points_down(self, reference: Look, imu: Look | None, imu_frame: ImuFrame | None) -> bool:
+        """Whether a reference in the body is forward-right-down: as declared, else by how it says that it turns."""
+        declared = self._declared_reference(reference)
+        if declared is not None and declared.frame is VelocityFrame.BODY:
+            return declared.points_down
+        turns = None if imu is None or imu_frame is None else turns_right(reference, imu, imu_frame)
+        if turns is not None:
+            return turns
+        world = frame_named(reference.world, ())  # of the pose: a body in NED is forward-right-down by custom
+        return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
 
     def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
         """The frame that the reference is taken in; None without one, or if nothing tells."""
         if reference is None:
             return None
         taken = self._values.get("gnss_frame")
-        return self._declared_reference(reference) if taken is None else VelocityFrame(taken)
+        said = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        return None if said is None else said.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
         """Whether it is known how the IMU sits: a transform says so, or DVL and reference agree."""
@@ -333,27 +346,52 @@ class _Search:
             return None
         declared = self._declared_reference(reference)
         fixed = self._parameters.gnss_frame != FROM_FRAME_ID
-        references = [declared] if fixed and declared is not None else list(USUAL)
+        references = [declared.frame] if fixed and declared is not None else list(USUAL)
         said = self._parameters.dvl_axes != FROM_MESSAGE or dvl.frame_id.lower().endswith(("_frd", "_flu"))
         turns = [turned] if said else [turned, not turned]
         imus: list[ImuFrame | None] = [*imu_frames] or [None]
-        hypotheses = [Hypothesis(frame, each, turn) for frame in references for each in imus for turn in turns]
+        down = {each: self._points_down(reference, imu, each) for each in imus}
+        in_body = VelocityFrame.BODY
+        hypotheses = [
+            Hypothesis(frame, each, turn, frame is in_body and down[each])
+            for frame in references
+            for each in imus
+            for turn in turns
+        ]
         position = None if placed is None else placed.position - self._reference_position(reference)
         fits = fit(data, hypotheses, None if known is None else known.T, position)
         if not fits:
             return None
-        wanted = Hypothesis(declared or USUAL[0], imu_frames[0] if imu_frames else None, turned)
+        first = imu_frames[0] if imu_frames else None
+        named = USUAL[0] if declared is None else declared.frame
+        wanted = Hypothesis(named, first, turned, named is in_body and down[first])
         decided = _decided(fits, wanted, declared is not None)
         own = next((each for each in fits if each.hypothesis == wanted), None)
         if decided is None or own is None or decided is own:
-            return decided
-        to_body = decided.hypothesis.reference is VelocityFrame.BODY
-        if to_body and declared not in (None, VelocityFrame.BODY) and not self._is_in_body(data, decided):
+            return decided if decided is None or said else self._upright(decided, fits, known, (dvl, reference, imu))
+        to_body = decided.hypothesis.reference is in_body
+        if to_body and declared is not None and declared.frame is not in_body and not self._is_in_body(data, decided):
             return own
         mounting = None if known is None else known.T
         delayed = at_delays(dvl, reference, imu)
         best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (decided, own))
         return decided if best < CLEARLY * as_declared else own
+
+    def _upright(
+        self, fit: Fit, fits: Sequence[Fit], known: Array | None, looks: tuple[Look, Look, Look | None]
+    ) -> Fit:
+        """The fit, or that with the DVL's axes the other way up if only that leaves little with any lever arm.
+
+        A vehicle that goes ahead hardly shows which way is up; its turns do, by the lever arm that they ask for.
+        """
+        other = next(
+            (each for each in fits if each.hypothesis == replace(fit.hypothesis, turned=not fit.hypothesis.turned)), fit
+        )
+        if other.left >= fit.left:
+            return fit
+        delayed, mounting = at_delays(*looks), np.eye(3) if known is None else known.T
+        best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (other, fit))
+        return other if best < BETTER * as_declared else fit
 
     def _is_in_body(self, data: Together, fit: Fit) -> bool:
         """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
@@ -382,9 +420,9 @@ class _Search:
         """Write what a fit says into the parameters."""
         hypothesis, parameters = chosen.hypothesis, self._parameters
         declared = self._declared_reference(reference)
-        if hypothesis.reference is not declared:
-            self._values["gnss_frame"] = hypothesis.reference.value
-            name = hypothesis.reference.value
+        taken = DeclaredFrame(hypothesis.reference, hypothesis.reference_turned)
+        if taken != declared:
+            name = self._values["gnss_frame"] = taken.name
             if declared is None:
                 self._found.append(
                     f"reference in {name}, which fits best: its frame {reference.frame_id!r} does not say (-p "
@@ -392,11 +430,11 @@ class _Search:
                 )
             else:
                 self._contradictions.append(
-                    f"{reference.topic}: frame {reference.frame_id!r} says {declared.value}, but DVL and reference "
-                    f"agree only as {name}; taken so. To insist: -p gnss_frame:={declared.value}"
+                    f"{reference.topic}: frame {reference.frame_id!r} says {declared.name}, but DVL and reference "
+                    f"agree only as {name}; taken so. To insist: -p gnss_frame:={declared.name}"
                 )
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
-            self._values["gnss_frame"] = declared.value
+            self._values["gnss_frame"] = declared.name
         if hypothesis.imu is not None and imu_frames:
             self._take_imu(hypothesis.imu, None if hypothesis.imu is imu_frames[0] else reference)
         found = chosen.rotation_dvl_from_body.T

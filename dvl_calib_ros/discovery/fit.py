@@ -39,6 +39,8 @@ KEPT_SHARE = 0.9
 CLEARLY = 0.5
 # ... and fits in itself: what it leaves is below this share of the speed (17 degrees of misalignment).
 FITS = 0.3
+# Turn rates below this (rad/s) do not say which way a body's axes point.
+TURNS = 0.01
 # Rounds in which rotation and lever arm are found in turns.
 ROUNDS = 3
 
@@ -54,11 +56,12 @@ class ImuFrame:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One reading of the data. turned: the DVL's data are forward-right-down."""
+    """One reading of the data. turned: the DVL's data are forward-right-down; reference_turned: the reference's."""
 
     reference: VelocityFrame
     imu: ImuFrame | None
     turned: bool
+    reference_turned: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ def together(dvl: Look, reference: Look, imu: Look | None) -> Together | None:
 def body_velocity(data: Together, hypothesis: Hypothesis) -> Array | None:
     """The reference (N, 3) m/s in the body, under a hypothesis; None if that needs an attitude that is not there."""
     if hypothesis.reference is VelocityFrame.BODY:
-        return data.reference
+        return data.reference @ FLU_FROM_FRD if hypothesis.reference_turned else data.reference
     if data.orientation is None or hypothesis.imu is None:
         return None
     enu = data.reference @ ENU_FROM_NED.T if hypothesis.reference is VelocityFrame.NED else data.reference
@@ -132,6 +135,23 @@ def rotation_enu_from_body(orientation: Array, imu: ImuFrame) -> Array:
         world_from_imu = ENU_FROM_NED @ world_from_imu
     rotation: Array = world_from_imu @ imu.rotation_body_from_imu.T
     return rotation
+
+
+def turns_right(reference: Look, imu: Look, frame: ImuFrame) -> bool | None:
+    """Whether a velocity's own turn rates are forward-right-down, by those of an IMU; None if that does not show.
+
+    A vehicle that turns left has a positive rate about an axis up, and a negative one about an axis down.
+    """
+    if reference.rates is None:
+        return None
+    columns, near = comparable(imu, reference.stamps_s)
+    near = near & np.isfinite(columns[:, 4:7]).all(axis=1) & np.isfinite(reference.rates).all(axis=1)
+    rates = columns[near, 4:7] @ frame.rotation_body_from_imu.T
+    own = reference.rates[near]
+    if len(own) < ENOUGH_SAMPLES or _rms(own) < TURNS or _rms(rates) < TURNS:
+        return None
+    left, right = _rms(own - rates), _rms(own @ FLU_FROM_FRD - rates)
+    return None if min(left, right) > CLEARLY * max(left, right) else right < left
 
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:

@@ -35,7 +35,7 @@ FASTEST = 1e5
 # Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
 MOST_STATIC = 200
 # Of an IMU: quaternion, angular velocity and acceleration.
-_IMU_NUMBERS = 10
+_IMU_NUMBERS, _TWIST_NUMBERS = 10, 6
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,8 @@ class Look:
     or of the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the
     log where it is zero. ahead_s: by how much they are ahead of the log, in the median. values: velocity (N, 3) m/s, as
     in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
-    given.
+    given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero where it has none. world:
+    frame_id of the header, which of an odometry is that of its pose.
     """
 
     topic: str
@@ -57,6 +58,8 @@ class Look:
     stamps_s: Array
     ahead_s: float
     values: Array
+    rates: Array | None = None
+    world: str = ""
 
     @property
     def speed(self) -> float:
@@ -177,7 +180,9 @@ def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, p
         for number, at in enumerate((slice(0, 4), slice(4, 7), slice(7, 10))):
             values[values[:, _IMU_NUMBERS + number] == NO_DATA, at] = np.nan
         values = values[:, :_IMU_NUMBERS]
-    else:
+    rates = values[:, 3:] if values.shape[1] == _TWIST_NUMBERS else None
+    if msgtype != IMU_TYPE:
+        values = values[:, :3].copy()
         values[(values == 0.0).all(axis=1)] = np.nan  # what drivers send for want of a measurement
     values[~(np.abs(values) < FASTEST)] = np.nan  # so that their squares are numbers
     whole = (np.abs(values) < FASTEST).all(axis=1) if msgtype != IMU_TYPE else np.ones(len(values), dtype=bool)
@@ -185,7 +190,8 @@ def _look(topic: str, msgtype: str, count: int, rate_hz: float, start_ns: int, p
     order = order[whole[order]]
     frame_id = names[0][1] if names else ""
     stamps_s, ahead_s = 1e-9 * (stamps_ns[order] - start_ns), 1e-9 * float(median(stamps_ns - log_ns))
-    return Look(topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[order])
+    turning = None if rates is None else rates[order]
+    return Look(topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[order], turning, rows[0].world)
 
 
 _Message = tuple[int, int, Any]
@@ -193,13 +199,16 @@ _Message = tuple[int, int, Any]
 
 
 class _Rows(NamedTuple):
-    """N messages. arrival: (N,) their places. log_ns, stamps_ns: (N,). numbers: (N, k). frame_id: of the first."""
+    """N messages. arrival: (N,) their places. log_ns, stamps_ns: (N,). numbers: (N, k). frame_id: of the first; world:
+    the header's.
+    """
 
     arrival: Stamps
     log_ns: Stamps
     stamps_ns: Stamps
     numbers: Array
     frame_id: str
+    world: str
 
 
 def _rows_of_columns(part: Part, msgtype: str) -> _Rows:
@@ -208,9 +217,9 @@ def _rows_of_columns(part: Part, msgtype: str) -> _Rows:
     if columns is None:
         raise ValueError("not laid out alike")
     stamps_ns = columns.header.stamp.sec.astype(np.int64) * 1_000_000_000 + columns.header.stamp.nanosec
-    name = _frame_id(msgtype, columns)[0].tobytes().decode("ascii")
+    name, world = (each[0].tobytes().decode("ascii") for each in (_frame_id(msgtype, columns), columns.header.frame_id))
     numbers = np.column_stack(_numbers(msgtype, columns)).astype(float)
-    return _Rows(part.arrival, part.log_ns, np.where(stamps_ns == 0, part.log_ns, stamps_ns), numbers, name)
+    return _Rows(part.arrival, part.log_ns, np.where(stamps_ns == 0, part.log_ns, stamps_ns), numbers, name, world)
 
 
 def _row_of_message(arrival: int, log_ns: int, message: Any, msgtype: str) -> _Rows:
@@ -218,7 +227,7 @@ def _row_of_message(arrival: int, log_ns: int, message: Any, msgtype: str) -> _R
     numbers = np.array([_numbers(msgtype, message)], dtype=float)
     stamp = stamp_ns(message.header.stamp) or log_ns
     place, logged, stamped = np.array([[arrival], [log_ns], [stamp]])
-    return _Rows(place, logged, stamped, numbers, str(_frame_id(msgtype, message)))
+    return _Rows(place, logged, stamped, numbers, str(_frame_id(msgtype, message)), str(message.header.frame_id))
 
 
 def _differences(messages: list[_Message]) -> list[_Message]:
@@ -255,7 +264,11 @@ def _numbers(msgtype: str, message: Any) -> list[Any]:
         return [q.x, q.y, q.z, q.w, w.x, w.y, w.z, a.x, a.y, a.z, *(each[..., 0] for each in given)]
     kind = VELOCITY_TYPES[msgtype]
     v = message.velocity if kind.is_position else kind.velocity(message)
-    return [v.x, v.y, v.z]
+    twist = getattr(message, "twist", None)
+    if twist is None:
+        return [v.x, v.y, v.z]
+    turn = getattr(twist, "twist", twist).angular
+    return [v.x, v.y, v.z, turn.x, turn.y, turn.z]
 
 
 def comparable(a: Look, at_s: Array, longest_gap_s: float = 1.5) -> tuple[Array, Mask]:

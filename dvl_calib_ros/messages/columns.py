@@ -20,6 +20,7 @@ from ..calibration.samples import (
     DvlSample,
     ImuSample,
     Index,
+    Mask,
     ReferenceSample,
     SampleBlock,
     Stamps,
@@ -183,9 +184,12 @@ class _Velocity(_Columns):
             accepted = np.array([name == decoder.dvl_frame for name in self._frame_names])
         else:
             known = [decoder.reference_frame(name) for name in self._frame_names]
-            accepted = np.array([frame is not None for frame in known])
-            codes = np.array([0 if frame is None else FRAME_CODES[frame] for frame in known], dtype=np.uint8)
+            accepted = np.array([said is not None for said in known])
+            codes = np.array([0 if said is None else FRAME_CODES[said.frame] for said in known], dtype=np.uint8)
             frames = codes[self._frame_index]
+            down = np.array([said is not None and said.points_down for said in known])[self._frame_index]
+            if down.any():
+                values, covariances = _turned(values, covariances, down)
         for reason, is_broken in [(WRONG_FRAME, ~accepted[self._frame_index]), *self._broken]:
             new = np.asarray(is_broken) & (refused == 0)
             if new.any():
@@ -193,12 +197,23 @@ class _Velocity(_Columns):
         if self._stream is Stream.DVL and not refused.all():
             decoder.note_axes()
             if decoder.turns_dvl:
-                values = values * FLU_FROM_FRD.diagonal()
-                covariances = Covariances(covariances.distinct * TURNED_COVARIANCE, covariances.index)
+                values, covariances = _turned(values, covariances, np.ones(n, dtype=bool))
         return sample_block(
             self._stream, self._stamped(decoder, refused), values, covariance=covariances, frames=frames,
             arrival=self._part.arrival, refused=refused, reasons=reasons,
         )  # fmt: skip
+
+
+def _turned(values: Array, covariances: Covariances, which: Mask) -> tuple[Array, Covariances]:
+    """Those of N velocities that are forward-right-down (N,) as forward-left-up, with their covariances."""
+    if which.all():
+        return values * FLU_FROM_FRD.diagonal(), Covariances(
+            covariances.distinct * TURNED_COVARIANCE, covariances.index
+        )
+    n = len(covariances.distinct)
+    both = np.concatenate([covariances.distinct, covariances.distinct * TURNED_COVARIANCE])
+    index = np.where(which & (covariances.index >= 0), covariances.index + n, covariances.index)
+    return np.where(which[:, None], values * FLU_FROM_FRD.diagonal(), values), Covariances(both, index.astype(np.intp))
 
 
 def _covariances(kind: VelocityType, columns: Columns) -> Covariances:

@@ -6,7 +6,7 @@ and the rules of the message types, which are in `drivers`. What becomes of a sa
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +35,38 @@ EARTH_FRAMES = {
     "world": VelocityFrame.ENU,
     "ned": VelocityFrame.NED,
 }
+
+
+class DeclaredFrame(NamedTuple):
+    """What is said of a reference's frame. points_down: of the body, forward-right-down."""
+
+    frame: VelocityFrame
+    points_down: bool = False
+
+    @property
+    def name(self) -> str:
+        """As parameter gnss_frame has it."""
+        return FRD if self.points_down else self.frame.value
+
+
+# by value of parameter gnss_frame
+DECLARED_FRAMES = {
+    each.name: each for each in (*map(DeclaredFrame, VelocityFrame), DeclaredFrame(VelocityFrame.BODY, True))
+}
+# by the end of a frame's name
+_SUFFIXES = {"enu": "enu", "ned": "ned", "flu": "body", "frd": FRD}
+
+
+def frame_named(frame_id: str, base_frames: Collection[str]) -> DeclaredFrame | None:
+    """The frame of velocities whose messages carry this frame_id; None if that says nothing."""
+    name = frame_id.strip("/")
+    link = name.rpartition("/")[2]  # below a namespace
+    if link in {base.strip("/").rpartition("/")[2] for base in base_frames}:
+        return DeclaredFrame(VelocityFrame.BODY)
+    if name.lower() in EARTH_FRAMES:
+        return DeclaredFrame(EARTH_FRAMES[name.lower()])
+    suffix = _SUFFIXES.get(name.lower().rpartition("_")[2]) if "_" in name else None
+    return None if suffix is None else DECLARED_FRAMES[suffix]
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -107,7 +139,7 @@ class MessageDecoder:
         self.dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)
         self.imu_alignment = ImuAlignment(parameters)
-        self._reference_reader = _Reader(self.reference_type)
+        self._reference_readers = [_Reader(self.reference_type, turned) for turned in (False, True)]
         self._on_problem = on_problem
         self.forget()
 
@@ -118,7 +150,7 @@ class MessageDecoder:
         self.dvl_frame: str | None = self.parameters.dvl_frame or None
         self._dvl_reader: _Reader | None = None
         self._imu_frame: str | None = None
-        self._reference_frames: dict[str, VelocityFrame | None] = {}
+        self._reference_frames: dict[str, DeclaredFrame | None] = {}
         self._fixes = FixDifference(self.parameters.position_window)
 
     # ------------------------------------------------------------------ one by one
@@ -150,11 +182,11 @@ class MessageDecoder:
                 return Refusal(WRONG_FRAME)
             stamp = self._stamp_ns(Stream.REFERENCE, message.header, received_ns)
             if kind.is_position:
-                return self._difference(message, stamp, frame)
-            velocity, covariance = self._reference_reader(message)
+                return self._difference(message, stamp, frame.frame)
+            velocity, covariance = self._reference_readers[frame.points_down](message)
         except UNREADABLE as error:
             return self.undecodable(Stream.REFERENCE, f"{kind.name}, {type(error).__name__}: {error}")
-        return ReferenceSample(stamp, velocity, covariance, frame)
+        return ReferenceSample(stamp, velocity, covariance, frame.frame)
 
     def _difference(self, message: Any, stamp_ns: int, frame: VelocityFrame) -> ReferenceSample | Refusal:
         """The velocity between a satellite position and the one a window before."""
@@ -234,14 +266,14 @@ class MessageDecoder:
     @property
     def frame_of_reference(self) -> VelocityFrame | None:
         """Frame of the reference's messages, of the first that were taken; None before."""
-        return next((frame for frame in self._reference_frames.values() if frame is not None), None)
+        return next((said.frame for said in self._reference_frames.values() if said is not None), None)
 
     @property
     def frame_ids(self) -> tuple[str, str, str]:
         """frame_id of the DVL's, the reference's and the IMU's messages, '' where none has come."""
         return self.dvl_frame or "", next(iter(self._reference_frames), ""), self._imu_frame or ""
 
-    def reference_frame(self, frame_id: str) -> VelocityFrame | None:
+    def reference_frame(self, frame_id: str) -> DeclaredFrame | None:
         """The frame of reference messages with this frame_id; None if it says nothing."""
         if frame_id not in self._reference_frames:
             if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
@@ -249,14 +281,13 @@ class MessageDecoder:
             self._reference_frames[frame_id] = self._frame_named(frame_id)
         return self._reference_frames[frame_id]
 
-    def _frame_named(self, frame_id: str) -> VelocityFrame | None:
+    def _frame_named(self, frame_id: str) -> DeclaredFrame | None:
         p = self.parameters
         if p.gnss_frame != FROM_FRAME_ID:
-            return VelocityFrame(p.gnss_frame)
+            return DECLARED_FRAMES[p.gnss_frame]
         if self.reference_type.reference_frame is not None:
-            return self.reference_type.reference_frame
-        name = frame_id.lstrip("/")
-        frame = VelocityFrame.BODY if name == p.base_frame.lstrip("/") else EARTH_FRAMES.get(name.lower())
+            return DeclaredFrame(self.reference_type.reference_frame)
+        frame = frame_named(frame_id, (p.base_frame,))
         if frame is None:
             known = {"base": p.base_frame, "earth": ", ".join(EARTH_FRAMES)}
             self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, **known))
