@@ -9,13 +9,15 @@ well, and no residual shows it. So the attitude is differentiated and held again
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from itertools import permutations
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, permutations
 from itertools import product as all_of
 
 import numpy as np
 
-from .frames import ENU_FROM_NED, Array, cross, product, rotation_from_quaternion
+from .frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
+from .imu_alignment import quaternion_product
+from .samples import Index
 
 # The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
 SPAN_S, LONGEST_S = 0.5, 1.6
@@ -33,6 +35,7 @@ EXCHANGED_FROM = 0.95
 LEVEL_BELOW = 1e-6
 _BODY, _ENU, _NED = range(3)
 _AXES = "xyz"
+_INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
 _KNOWN = {
     (1, 1, -1): "a heading that turns against the angular velocity about z, as a compass counts it (clockwise)",
     (-1, -1, -1): "an angular velocity of the other sign",
@@ -69,31 +72,31 @@ class AttitudeRates:
         self._both = np.zeros((3, 3, 3))
         self._rates = np.zeros((3, 3, 3))
 
-    def add(self, times: Array, orientation: Array, angular_velocity: Array) -> None:
+    def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
         """Take samples in order of time that follow those before.
 
         times: (M,) s. orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``. angular_velocity: (M, 3)
-        rad/s, body. Both nan where not known.
+        rad/s, body. Both nan where not known. begins: numbers of the samples with which stretches begin of which none
+        is looked at together with the next one.
         """
-        known = ~(np.isnan(orientation).any(axis=1) | np.isnan(angular_velocity).any(axis=1))
-        times, orientation, rates = times[known], orientation[known], angular_velocity[known]
-        if len(times) < 2:
+        known = ~(np.isnan(orientation[:, 0]) | np.isnan(angular_velocity).any(axis=1))
+        bounds = [*begins, len(times)]
+        if not known.all():
+            bounds = np.append(0, np.cumsum(known))[bounds].tolist()
+            times, orientation, angular_velocity = times[known], orientation[known], angular_velocity[known]
+        pairs = [_spans(times[start:end]) + start for start, end in pairwise(bounds) if end - start >= 2]
+        if not pairs:
             return
-        wanted = np.searchsorted(times, np.arange(times[0], times[-1] + SPAN_S, SPAN_S)).clip(max=len(times) - 1)
-        at = wanted[np.flatnonzero(np.diff(wanted, prepend=-1))]
-        first, last = at[:-1], at[1:]
+        first, last = np.concatenate(pairs, axis=1)
         seconds = times[last] - times[first]
-        a = _turn(orientation[first], orientation[last]) / seconds[:, None]
-        steps = 0.5 * (rates[1:] + rates[:-1]) * np.diff(times)[:, None]
+        before, after = orientation[first], orientation[last]
+        a = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds[:, None]
+        steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         w = (sums[last] - sums[first]) / seconds[:, None]
         good = (seconds <= LONGEST_S) & ((a**2).sum(axis=1) < FASTEST**2)
-        a, w = a[good], w[good]
-        middle = (
-            orientation[first[good]]
-            + np.copysign(1.0, (orientation[first[good]] * orientation[last[good]]).sum(axis=1))[:, None]
-            * orientation[last[good]]
-        )
+        a, w, before, after = a[good], w[good], before[good], after[good]
+        middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
         self._n += len(a)
@@ -145,13 +148,8 @@ class AttitudeRates:
             yield _BODY, turned, f"an angular velocity whose axes are turned by {angle:.0f}° against the attitude's"
 
 
-def _turn(before: Array, after: Array) -> Array:
-    """Rotation vectors (N, 3), rad, in the body, from one attitude to another: quaternions (N, 4)."""
-    v0, w0, v1, w1 = -before[:, :3], before[:, 3:], after[:, :3], after[:, 3:]
-    vector = w0 * v1 + w1 * v0 + cross(v0, v1)
-    scalar = w0[:, 0] * w1[:, 0] - (v0 * v1).sum(axis=1)
-    vector *= np.copysign(1.0, scalar)[:, None]
-    sine = np.linalg.norm(vector, axis=1)
-    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
-    turn: Array = vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)[:, None]
-    return turn
+def _spans(times: Array) -> Index:
+    """Numbers of the first and the last sample (2, S) of spans of about SPAN_S, of times (M > 1,) s."""
+    wanted = np.searchsorted(times, np.arange(times[0], times[-1] + SPAN_S, SPAN_S)).clip(max=len(times) - 1)
+    at = wanted[np.flatnonzero(np.diff(wanted, prepend=-1))]
+    return np.stack([at[:-1], at[1:]])

@@ -39,6 +39,8 @@ from .verification import Verification, held_out_error, verify
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
+# G2's blocks are gathered like samples: one of 10 s counts for so many of these.
+SAMPLES_OF_A_BLOCK = 128
 
 _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.NOTHING: lambda block: block.usable,
@@ -115,7 +117,7 @@ class Calibrator:
         self._start()
 
     def _start(self) -> None:
-        self.selection = Selection()
+        self._selection = Selection()
         self._n_selected = 0  # rows that the selection knows of
         wanted = {*self._models, *self._extends}
         if self._verified:  # every model is judged by the samples of one with a reference
@@ -134,6 +136,7 @@ class Calibrator:
             self._on_block,
             self._verified,
             self._worker,
+            1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK),
         )
         if self._extends:
             self._delay.attach()
@@ -187,13 +190,23 @@ class Calibrator:
             self._delay.advance()
         self._look_at_headings()
         if aligner.n_paired > self._n_selected:
-            rows = aligner.rows
-            at = slice(self._n_selected - rows.base, aligner.n_paired - rows.base)
-            self.selection.update(rows.stamps_ns[at], rows.pairing[at] == Pairing.PAIRED, self.parameters)
-            self._n_selected = aligner.n_paired
+            self._select()
         for group in self._groups:
             if aligner.given[group.needs] - group.n_given >= self._block_size:
                 self._update(group)
+
+    def _select(self) -> None:
+        """Let the selection know what is paired, but for what may go by blocks that G2 has not solved."""
+        rows, end = self._aligner.rows, self._aligner.n_paired
+        first = self._n_selected - rows.base
+        stamps_ns = rows.stamps_ns[first : end - rows.base]
+        until_ns = self._delay.told_until_ns
+        if until_ns is not None:
+            stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, until_ns))]
+        if len(stamps_ns):
+            paired = rows.pairing[first : first + len(stamps_ns)] == Pairing.PAIRED
+            self._selection.update(stamps_ns, paired, self.parameters)
+            self._n_selected += len(stamps_ns)
 
     def _look_at_headings(self) -> None:
         """Let the selection know once headings show the current: later than the last row could be decided."""
@@ -214,7 +227,7 @@ class Calibrator:
             shown_ns = self._headings.add(stamps_ns, oriented, seen.observations)
             if shown_ns is not None:
                 wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
-                self.selection.headings_show_the_current(shown_ns + wait_ns)
+                self._selection.headings_show_the_current(shown_ns + wait_ns)
 
     def _by_days(self, first: int, end: int) -> Iterator[tuple[int, int, bool]]:
         """Rows first .. end - 1 parted where days begin: the first and the end of each part, and whether a day does."""
@@ -229,7 +242,7 @@ class Calibrator:
 
     def _on_block(self, from_ns: int) -> None:
         """Let the selection, and the trace, know what G2 says after another block."""
-        self.selection.extend(from_ns, self._delay.evidence)
+        self._selection.extend(from_ns, self._delay.evidence)
         if self._trace is not None:
             self._delay.remember(from_ns)
 
@@ -378,15 +391,23 @@ class Calibrator:
         return self._aligner.latest_angular_velocity(stamp_ns)
 
     @property
+    def selection(self) -> Selection:
+        """Which model is the one, over time."""
+        self._delay.settle()
+        self._select()
+        return self._selection
+
+    @property
     def selected(self) -> str:
         """Name of the selected model."""
         return self.selection.model(self.parameters)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Change parameters that can change at run time (`ParameterSpec.read_only` False)."""
+        selection = self.selection  # by what was so far
         self.parameters = self._aligner.parameters = parameters
         if self._n_selected:
-            self.selection.record(self._aligner.decided_ns, parameters)
+            selection.record(self._aligner.decided_ns, parameters)
 
     def n_given(self, name: str) -> int:
         """Number of samples that a model was given so far; it grows when there may be a new estimate."""

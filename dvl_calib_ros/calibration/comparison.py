@@ -30,7 +30,7 @@ from .extrinsics import (
     TURN,
     Extrinsics,
     rotation_of,
-    rotation_vector,
+    turn_between,
 )
 from .frames import Array, rpy_from_rotation
 
@@ -223,7 +223,7 @@ class _Together:
 
 def _values(each: Extrinsics, base: Extrinsics) -> Array:
     """(8,) components, the turn being that from the mounting of `base`."""
-    turn = rotation_vector(each.rotation_body_from_dvl @ base.rotation_body_from_dvl.T)
+    turn = turn_between(base.rotation_body_from_dvl, each.rotation_body_from_dvl)
     return np.array([*turn, *each.lever_arm, each.scale, each.time_offset])
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from .days import day_covariance
 from .error_model import corrected_mounting
-from .frames import Array, skew
+from .frames import Array, quaternion_from_rotation, rotation_vector, skew
 from .kalman import GaussianState
 from .models import Model
 from .observability import OBSERVED_SHARE
@@ -100,7 +100,7 @@ def extrinsics_of(
         step = np.zeros(len(state.x))
         step[index] = _STEP
         up, down = (_components(model, state.x + way * step, parameters) for way in (1.0, -1.0))
-        turn = rotation_vector(up[0] @ found[0].T) - rotation_vector(down[0] @ found[0].T)
+        turn = turn_between(found[0], up[0]) - turn_between(found[0], down[0])
         jacobian[:, index] = np.concatenate([turn, up[1] - down[1]]) / (2.0 * _STEP)
     covariance = jacobian @ state.p @ jacobian.T
     std = np.sqrt(np.diag(covariance))
@@ -141,25 +141,13 @@ def _unknown(p: Parameters) -> Array:
     return np.array([*[angle] * 3, *[p.initial_std_lever_arm] * 3, scale, p.initial_std_time_offset])
 
 
-def rotation_vector(rotation: Array) -> Array:
-    """Axis times angle (3,) rad of a rotation (3, 3); exact for small and for large angles."""
-    axis = 0.5 * np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine = float(np.linalg.norm(axis))
-    cosine = 0.5 * (float(np.trace(rotation)) - 1.0)
-    if sine > 1e-9:
-        return np.asarray(axis * (np.arctan2(sine, cosine) / sine))
-    if cosine > 0.0:
-        return axis
-    # half a turn: the axis is the eigenvector of 1, its sign is free
-    column = int(np.argmax(np.diag(rotation)))
-    along = rotation[:, column] + np.eye(3)[column]
-    return np.asarray(np.pi * along / np.linalg.norm(along))
+def turn_between(before: Array, after: Array) -> Array:
+    """Axis times angle (3,) rad of the turn from one mounting (3, 3) to another, about the body's axes."""
+    return rotation_vector(quaternion_from_rotation(after @ before.T))
 
 
 def rotation_of(vector: Array) -> Array:
-    """Inverse of `rotation_vector`: (3,) rad -> (3, 3) (Rodrigues)."""
+    """Inverse of `turn_between` from no turn at all: (3,) rad -> (3, 3) (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0.0:
         return np.eye(3)

@@ -116,6 +116,16 @@ def rotation_from_quaternion(q: ArrayLike) -> Array:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
+def rotation_vector(q: ArrayLike) -> Array:
+    """Axis times angle (..., 3) rad, at most pi, of unit quaternions (..., 4); exact for small and large angles."""
+    quaternion = np.asarray(q, dtype=float)
+    vector, scalar = quaternion[..., :3], quaternion[..., 3:]
+    sine = np.sqrt((vector * vector).sum(axis=-1, keepdims=True))
+    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+    turn: Array = np.copysign(1.0, scalar) * vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return turn
+
+
 # Cosine of half the angle of a short arc: below 2 mrad the chord is exact to 1e-10 and keeps clear of 0/0.
 _SHORT_ARC = 0.9999995
 

@@ -15,7 +15,7 @@ would not do: what is kept are sums, joined with the filter's state when somebod
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -66,6 +66,7 @@ class HeaveRows:
         size = k, n + 1, n + 1
         self._folds = HeaveSums(np.zeros((FOLDS, *size)), np.zeros((FOLDS, *size)), np.zeros((FOLDS, 1)))
         self._sum = np.zeros((k, n + 1))
+        self._total = HeaveSums(*(np.zeros_like(kept[0]) for kept in self._folds))  # over folds
         self._sums: dict[int | None, HeaveSums] = {}  # as asked for since the last change
         self._start()
         self._last_ns: int | None = None
@@ -86,6 +87,12 @@ class HeaveRows:
 
         Returns the sums after the first `ends` (E ascending numbers) of them.
         """
+        return self.add_sums(stamps_ns, lambda some: np.asarray(rows[some].sum(axis=0)), used, ends)
+
+    def add_sums(
+        self, stamps_ns: Stamps, summed: Callable[[Mask], Array], used: Mask, ends: Sequence[int] = ()
+    ) -> list[HeaveSums]:
+        """`add` where rows need not be known one by one. summed: the sum (K, n+1) of some (N,) of them."""
         if not len(stamps_ns):
             return [self.sums() for _ in ends]
         starts = set(self.starts(stamps_ns).tolist())
@@ -98,11 +105,14 @@ class HeaveRows:
         for start, end in pairwise(cuts):
             if start in starts:
                 self.close()
-            at = slice(start, end)
-            self._count += int(np.count_nonzero(used[at]))
-            self._seconds += float(seconds[at].sum())
+            own = used
+            if end - start < len(used):
+                own = np.zeros_like(used)
+                own[start:end] = used[start:end]
+            self._count += int(np.count_nonzero(own))
+            self._seconds += float(seconds[start:end].sum())
             self._sums.clear()
-            self._sum = self._sum + rows[at][used[at]].sum(axis=0)
+            self._sum = self._sum + summed(own)
             self._last_ns = int(stamps_ns[end - 1])
             if end in ends:
                 found[end] = self.sums()
@@ -111,14 +121,16 @@ class HeaveRows:
     def close(self) -> None:
         """End the block: what comes is another one's."""
         fold, row = self._open()
-        for kept, more in zip(self._folds, row, strict=True):
-            kept[fold] += more
+        if row is not None:
+            for kept, total, more in zip(self._folds, self._total, row, strict=True):
+                kept[fold] += more
+                total += more
         self._start()
 
-    def _open(self) -> tuple[int, HeaveSums]:
-        """The fold and the row of the block that is not ended."""
+    def _open(self) -> tuple[int, HeaveSums | None]:
+        """The fold and the row of the block that is not ended; None where it has no sample."""
         if not self._count:
-            return 0, HeaveSums(*(np.zeros_like(kept[0]) for kept in self._folds))
+            return 0, None
         assert self._last_ns is not None
         mean = self._sum / self._count
         weight = min(self._seconds * 1e9 / BLOCK_NS, 1.0)
@@ -131,10 +143,14 @@ class HeaveRows:
         """The rows so far, the one of the block that is not ended among them; without a fold, if one is named."""
         if without not in self._sums:
             fold, row = self._open()
-            use = np.arange(FOLDS) != (FOLDS if without is None else without)
-            self._sums[without] = HeaveSums(
-                *(kept[use].sum(axis=0) + more * (fold != without) for kept, more in zip(self._folds, row, strict=True))
-            )
+            ended = self._total
+            if without is not None:
+                others = np.arange(FOLDS) != without
+                ended = HeaveSums(*(kept[others].sum(axis=0) for kept in self._folds))
+            if row is None or fold == without:
+                self._sums[without] = HeaveSums(*(each.copy() for each in ended))
+            else:
+                self._sums[without] = HeaveSums(*(each + more for each, more in zip(ended, row, strict=True)))
         return self._sums[without]
 
     def absorb(self) -> tuple[HeaveSums, Array]:
@@ -143,14 +159,16 @@ class HeaveRows:
         Returns the rows, and what they tell by folds (FOLDS, K, n+1, n+1).
         """
         self._sums.clear()
-        sums, told = HeaveSums(*(kept.sum(axis=0) for kept in self._folds)), self._folds.told
+        sums, told = HeaveSums(*(each.copy() for each in self._total)), self._folds.told
         self._folds = self._folds._replace(told=np.zeros_like(told))
+        self._total = self._total._replace(told=np.zeros_like(sums.told))
         return sums, told
 
     def learn_from(self, source: Index) -> None:
         """Take what rows so far scatter by from others. source: (K,) from which of the K each takes it."""
         self._sums.clear()
         self._folds = self._folds._replace(scatter=self._folds.scatter[:, source].copy())
+        self._total = self._total._replace(scatter=self._total.scatter[source].copy())
 
 
 def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tuple[GaussianState, Array]:
@@ -166,15 +184,21 @@ def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tupl
     share, turn = np.linalg.eigh(np.swapaxes(root, -1, -2) @ told[..., :n, :n] @ root)
     share = np.maximum(share, 0.0)
     axes = root @ turn
+    across = np.swapaxes(axes, -1, -2)
     told_more = told[..., :n, n] - product(told[..., :n, :n], x)
-    pull = product(np.swapaxes(axes, -1, -2), told_more)
-    spread = np.einsum("...ij,...ik,...kj->...j", axes, scatter[..., :n, :n], axes)
+    pull = product(across, told_more)
+    # what rows are off by, squared: c - 2 b·t + t·A t, t being how far the state goes along the axes
+    off = product(scatter[..., :n, :n], x)
+    square = across @ scatter[..., :n, :n] @ axes
+    slope = product(across, scatter[..., :n, n] - off)
+    constant = scatter[..., n, n] + (x * (off - 2.0 * scatter[..., :n, n])).sum(axis=-1)
+    spread = np.diagonal(square, axis1=-2, axis2=-1)
     variance = np.full(x.shape[:-1], motion_std**2)
     for _ in range(STEPS):
-        found = x + product(axes, pull / (variance[..., None] + share))
-        missed = np.concatenate([-found, np.ones((*found.shape[:-1], 1))], axis=-1)
-        misfit = np.maximum((missed * product(scatter, missed)).sum(axis=-1), 0.0)
-        unsure = (spread * variance[..., None] / (variance[..., None] + share)).sum(axis=-1)
+        share_left = 1.0 / (variance[..., None] + share)
+        gone = pull * share_left
+        misfit = np.maximum(constant + (gone * (product(square, gone) - 2.0 * slope)).sum(axis=-1), 0.0)
+        unsure = variance * (spread * share_left).sum(axis=-1)
         before = variance
         variance = (PSEUDO_BLOCKS * motion_std**2 + misfit + unsure) / (PSEUDO_BLOCKS + sums.weight)
         variance = np.maximum(variance, motion_std**2)

@@ -63,19 +63,20 @@ class SharedNoise:
         step, reference_step = float(median(np.diff(times))), float(median(np.diff(reference_times)))
         if max(step, reference_step) > SLOWEST_S:
             return
-        differences = np.diff(velocity, ORDER, axis=0)[_windows(_even(times, step), ORDER)]
+        fourth = np.diff(velocity, ORDER, axis=0)
+        differences = fourth[_windows(_even(times, step), ORDER)]
         self._later += [(differences[lag:] * differences[:-lag]).sum() for lag in _LATER]
         self._square += float((differences**2).sum())
         # at the slower stream's times, of the faster one the samples next to them
         if reference_step < step:
-            dvl, other = _beside(times, velocity, step, reference_times, reference, SHIFTS_S)
+            even = _evenly(times, step)
+            dvl_4 = np.where(even, fourth, np.nan)
+            dvl_2 = np.diff(velocity, 2, axis=0)[1:-1]
+            other_4 = np.diff(_beside(times, step, reference_times, reference, SHIFTS_S), ORDER, axis=1)
         else:
-            other, dvl = _beside(reference_times, reference, reference_step, times, velocity, -SHIFTS_S)
-        dvl_4, dvl_2, other_4 = (
-            np.diff(dvl, ORDER, axis=1),
-            np.diff(dvl, 2, axis=1)[:, 1:-1],
-            np.diff(other, ORDER, axis=1),
-        )
+            other_4 = np.where(_evenly(reference_times, reference_step), np.diff(reference, ORDER, axis=0), np.nan)
+            dvl = _beside(reference_times, reference_step, times, velocity, -SHIFTS_S)
+            dvl_4, dvl_2 = np.diff(dvl, ORDER, axis=1), np.diff(dvl, 2, axis=1)[:, 1:-1]
         known = np.isfinite(dvl_4) & np.isfinite(other_4)
         count = np.count_nonzero(known, axis=(1, 2))
         dvl_4, dvl_2, other_4 = (np.where(known, each, 0.0) for each in (dvl_4, dvl_2, other_4))
@@ -114,20 +115,17 @@ class SharedNoise:
         )
 
 
-def _beside(
-    times: Array, values: Array, step: float, other_times: Array, other: Array, shifts: Array
-) -> tuple[Array, Array]:
-    """A stream (S, N, k) at its times (N,), and another one (S, N, k) beside it, later by each shift (S,).
-
-    Nan where samples are not evenly apart, or there are none beside each other.
-    """
+def _beside(times: Array, step: float, other_times: Array, other: Array, shifts: Array) -> Array:
+    """Of another stream the samples (S, N, k) beside times (N,), later by each shift (S,); nan where there are none."""
     wanted = times + shifts[:, None]
     after = np.searchsorted(other_times, wanted).clip(1, len(other_times) - 1)
     near = np.where(wanted - other_times[after - 1] < other_times[after] - wanted, after - 1, after)
-    beside = np.where((np.abs(other_times[near] - wanted) <= NEAR * step)[..., None], other[near], np.nan)
-    even = np.append(True, _even(times, step))
-    own = np.where(even[:, None], values, np.nan)
-    return np.broadcast_to(own, (len(shifts), *own.shape)), beside
+    return np.where((np.abs(other_times[near] - wanted) <= NEAR * step)[..., None], other[near], np.nan)
+
+
+def _evenly(times: Array, step: float) -> Mask:
+    """Whether all samples of a difference (N - ORDER, 1) are evenly apart, the one before the first as well."""
+    return _windows(np.append(True, _even(times, step)), ORDER + 1)[:, None]
 
 
 def _even(times: Array, step: float) -> Mask:

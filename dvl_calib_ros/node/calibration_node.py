@@ -423,6 +423,11 @@ class CalibrationNode(AnsweringNode):
             result = result_text(self._result_document())
             say(f"calibration_node: {error}. The result follows.\n{result}")
 
+    def destroy_node(self) -> None:
+        """Leave ROS, and end what solves G2's blocks."""
+        self._worker.shutdown(cancel_futures=True)
+        super().destroy_node()
+
 
 def _set_stamp(stamp: Any, nanoseconds: int) -> None:
     stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)

@@ -12,6 +12,7 @@ show (time_blocks.py). (Long, because what a hypothesis knows, of heave and over
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -27,7 +28,7 @@ from ..parameters import Parameters
 from ..robust import median
 from ..samples import Index, Mask, Stamps
 from ..time_blocks import TimeBlocks
-from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, DelayedRows
+from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, OF_DELAY, OF_NONE, DelayedRows
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
 CELL_STD_S = 0.2
@@ -42,6 +43,9 @@ WIDER, SHOWN_SHARE = 100.0, 0.5
 
 
 _BEYOND: Index = np.arange(N_STATE)[BEYOND]
+# Columns of what rows hold for each delay, and the states that they say anything of.
+_MOVING: Index = np.append(OF_DELAY, N_STATE)
+_SHOWN_BY_ROWS: Index = np.concatenate([OF_NONE, OF_DELAY])
 
 
 class Hypotheses(NamedTuple):
@@ -57,6 +61,17 @@ class Hypotheses(NamedTuple):
     log_evidence: Array
     information: Array
     vector: Array
+
+
+class Found(NamedTuple):
+    """What is known at some time: the likely hypotheses x (M, n), P (M, n, n), on ψ and κ, the numbers kept (M,) of
+    their delays, and the share (M,) of each; shown and inflation as of `Posterior`."""
+
+    likely: GaussianState
+    kept: Index
+    share: Array
+    shown: Mask
+    inflation: Array
 
 
 @dataclass(frozen=True)
@@ -212,7 +227,7 @@ class DelayBank:
         self._regressor_noise += rows.weight[use] @ rows.regressor_noise[use]
         self._vector += total_vector
         self.blocks.add(total, total_vector, float(rows.weight[use].sum()))
-        self._heave.add(stamps_ns, rows.heave, use)
+        self._heave.add_sums(stamps_ns, rows.heave, use)
         self._learn_heave()
         if self._folds is not None:
             for fold, (information, vector, _) in by_fold:
@@ -278,16 +293,7 @@ class DelayBank:
         A wrong hypothesis must not throw out what contradicts it, so all use the same samples; a lever arm that is not
         known yet is in S.
         """
-        found = self._solve()
-        h, z = rows.white[:, :N_STATE], rows.white[:, N_STATE]
-        flat = h.reshape(*h.shape[:2], -1)
-        innovation = z - (found.x[:, None] @ flat).reshape(z.shape)
-        spread = (np.linalg.cholesky(found.p).swapaxes(1, 2) @ flat).reshape(h.shape)
-        s = [
-            [np.einsum("kaj,kaj->kj", spread[:, :, i], spread[:, :, j]) + float(i == j) for j in range(i + 1)]
-            for i in range(3)
-        ]
-        nis = distance_squared(s, [*innovation.swapaxes(0, 1)]).min(axis=0)
+        nis = _innovation_squared(self._solve(), rows).min(axis=0)
         use = np.ones(len(rows), dtype=bool)
         if len(self._recent) >= ENOUGH:
             level = max(1.0, float(median(np.array(self._recent))) / MEDIAN_NIS)
@@ -322,22 +328,45 @@ class DelayBank:
         freedom = 3.0 * self.blocks.weight - N_STATE
         return max(1.0, float(found.misfit[best]) / freedom) if freedom > 0.0 else 1.0
 
-    def posterior(self) -> Posterior:
-        """The mixture of all hypotheses, as of now."""
+    def found(self) -> Found:
+        """What is known as of now."""
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
-        state = self._mixture(found, log_share)
         inflation = self._inflation(best, found)
-        shown = self._shown(best, inflation)
-        raised = state.raised(inflation)
+        kept, share = _likely(log_share)
+        likely = GaussianState(found.x[kept], found.p[kept])
+        return Found(likely, kept, share, self._shown(best, inflation), inflation)
+
+    def posteriors(self, found: Sequence[Found]) -> list[Posterior]:
+        """The mixture of all hypotheses, as it was found on this day each time.
+
+        Raises numpy.linalg.LinAlgError where one of them is a configuration so wrong that the errors have no small
+        angles.
+        """
+        if not found:
+            return []
+        held = GaussianState(*(np.concatenate(each) for each in zip(*(each.likely for each in found), strict=True)))
+        kept = np.concatenate([each.kept for each in found])
+        errors = self._prior_on_errors.part(kept).to_errors(held)
+        ends = np.cumsum([len(each.kept) for each in found])
+        return [
+            self._posterior(
+                each, GaussianState(errors.x[end - len(each.kept) : end], errors.p[end - len(each.kept) : end])
+            )
+            for each, end in zip(found, ends.tolist(), strict=True)
+        ]
+
+    def _posterior(self, found: Found, errors: GaussianState) -> Posterior:
+        state = _one(errors, found.kept, found.share)
+        raised = state.raised(found.inflation)
         p = state.p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
         by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)
         rest = np.maximum(np.diag(p)[:3] - by_lever_arm, 1e-12)
         turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
-        claimed = with_states_of(raised, self.prior, _without(shown, _BEYOND))
-        return Posterior(claimed, shown, inflation, turned, by_lever_arm / rest)
+        claimed = with_states_of(raised, self.prior, _without(found.shown, _BEYOND))
+        return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest)
 
     def days(self) -> list[DayState]:
         """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""
@@ -443,11 +472,39 @@ def _without(shown: Mask, of: Index) -> Index:
 
 def _told(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:
     """What some rows tell each hypothesis: HᵀWH (K, n, n), HᵀWz (K, n), zᵀWz (K,)."""
-    white = rows.white if use.all() else rows.white[..., use]
-    weighted = white * rows.weight[use]
-    flat = (*white.shape[:2], -1)
-    told = weighted.reshape(flat) @ white.reshape(flat).swapaxes(1, 2)
+    some = rows if use.all() else rows.part(use)
+    k = len(some.moving)
+    moving, standing = some.moving.reshape(k, len(_MOVING), -1), some.standing.reshape(len(OF_NONE), -1)
+    weight = np.concatenate([some.weight] * 3)
+    weighted = moving * weight
+    told = np.zeros((k, N_STATE + 1, N_STATE + 1))
+    across = (weighted.reshape(-1, len(weight)) @ standing.T).reshape(k, len(_MOVING), len(OF_NONE))
+    told[:, _MOVING[:, None], _MOVING] = weighted @ moving.swapaxes(1, 2)
+    told[:, _MOVING[:, None], OF_NONE], told[:, OF_NONE[:, None], _MOVING] = across, across.swapaxes(1, 2)
+    told[:, OF_NONE[:, None], OF_NONE] = (standing * weight) @ standing.T
     return told[:, :N_STATE, :N_STATE], told[:, :N_STATE, N_STATE], told[:, N_STATE, N_STATE]
+
+
+def _innovation_squared(found: Hypotheses, rows: DelayedRows) -> Array:
+    """νᵀS⁻¹ν (K, J) of rows, each by itself, with S = HPHᵀ + 1 and P = LLᵀ: HPHᵀ is the square of LᵀHᵀ."""
+    k, _, _, n = rows.moving.shape
+    h, z = rows.moving[:, :-1].reshape(k, len(OF_DELAY), 3 * n), rows.moving[:, -1]
+    standing = rows.standing.reshape(len(OF_NONE), 3 * n)
+    expected = found.x[:, None, OF_DELAY] @ h
+    expected[:, 0] += found.x[:, OF_NONE] @ standing
+    innovation = z - expected.reshape(z.shape)
+    # what is the same for all delays first: then most of the root is none of its business
+    low = np.linalg.cholesky(found.p[:, _SHOWN_BY_ROWS[:, None], _SHOWN_BY_ROWS]).swapaxes(1, 2)
+    m = len(OF_NONE)
+    spread = np.empty((k, len(_SHOWN_BY_ROWS), 3 * n))
+    np.matmul(low[:, :, m:], h, out=spread)
+    spread[:, :m] += (np.ascontiguousarray(low[:, :m, :m]).reshape(-1, m) @ standing).reshape(k, m, 3 * n)
+    spread = spread.reshape(k, -1, 3, n)
+    s = [
+        [np.einsum("kaj,kaj->kj", spread[:, :, i], spread[:, :, j]) + float(i == j) for j in range(i + 1)]
+        for i in range(3)
+    ]
+    return distance_squared(s, [*innovation.swapaxes(0, 1)])
 
 
 def _likely(log_share: Array) -> tuple[Index, Array]:

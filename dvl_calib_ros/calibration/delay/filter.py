@@ -74,28 +74,35 @@ class DelayFilter:
         on_block: Callable[[int], None],
         verified: bool,
         worker: Worker | None = None,
+        together: int = 1,
     ) -> None:
         """Start from the prior of G2's states.
 
         unknown: a prior without any calibration before it. gate: largest νᵀS⁻¹ν of a good sample. on_block:
         told of each block, when its outcome takes effect, of the stamp from which on DVL samples may go by it.
-        verified: keep what hold-out needs. worker: solves the blocks; None: they are solved at once.
+        verified: keep what hold-out needs. worker: solves the blocks; None: they are solved at once. together: so many
+        blocks are gathered before they are solved, unless somebody asks for what is known: on_block is told of them
+        late then, see `told_until_ns`.
         """
         self._parameters = parameters
         self._aligner = aligner
         self._on_block = on_block
         self._solver = BlockSolver(parameters, prior, unknown, gate, verified)
         self._worker = AtOnce() if worker is None else worker
-        # asked for once a second live, and at the end of a recording
-        self._suggested = worker is not None
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _Dvl()
         self.n_taken = 0  # rows of the aligner that have been looked at
         self._block_ns: int | None = None  # start of the next block
         self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
-        self._told = self._solver.outcome(suggested=self._suggested)
-        self._coming: deque[tuple[int, Solved]] = deque()  # by the stamp from which on they are told
+        self._last_told = self._solver.outcome()
+        self._together = together
+        self._gathered: list[Block] = []
+        # by the stamp from which on they are told: those that are being solved, and the number of each among them
+        self._coming: deque[tuple[int, Solved, int]] = deque()
+        self._gathered_ns: list[int] = []  # the same of those that are not
+        self._is_telling = False
+        self._suggested: tuple[Outcome, str] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
 
     def attach(self) -> None:
@@ -105,6 +112,23 @@ class DelayFilter:
         self._aligner.before_clearing = self.advance
 
     # ------------------------------------------------------------------ what is known
+
+    @property
+    def _told(self) -> Outcome:
+        """The newest outcome whose time has come."""
+        self.settle()
+        return self._last_told
+
+    @property
+    def told_until_ns(self) -> int | None:
+        """Stamp of the first DVL sample that may go by a block that has been gathered only; None for none."""
+        return self._gathered_ns[0] if self._gathered_ns else None
+
+    def settle(self) -> None:
+        """Have blocks solved that are gathered, and let those take effect whose time has come."""
+        if self._gathered and not self._is_telling:
+            self._solve_gathered()
+            self._let_take_effect(self._aligner.reached_ns)
 
     @property
     def counts(self) -> ModelCounts:
@@ -144,9 +168,10 @@ class DelayFilter:
     @property
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
-        if self._told.suggestion is None:
-            self._told = self._told._replace(suggestion=self._idle_solver().suggestion())
-        return self._told.suggestion or ""
+        newest = self._newest()
+        if self._suggested is None or self._suggested[0] is not newest:  # asked for more often than there is a block
+            self._suggested = newest, self._solver.suggestion()
+        return self._suggested[1]
 
     @property
     def evidence(self) -> Evidence:
@@ -210,15 +235,19 @@ class DelayFilter:
     def settled(self) -> Iterator[None]:
         """All blocks that are complete have taken effect, in here: for a result, which no later sample decides on."""
         told = self._told
-        self._told = self._newest()
+        self._last_told = self._newest()
         try:
             yield
         finally:
-            self._told = told
+            self._last_told = told
 
     def _newest(self) -> Outcome:
         """The outcome of the last block that is complete; nothing is being solved then."""
-        return self._coming[-1][1].result() if self._coming else self._told
+        self._solve_gathered()
+        if not self._coming:
+            return self._last_told
+        _, solved, number = self._coming[-1]
+        return solved.result()[number]
 
     # ------------------------------------------------------------------ blocks
 
@@ -247,22 +276,38 @@ class DelayFilter:
 
     def finish(self) -> None:
         """No samples come any more: all blocks that are complete take effect."""
+        self.settle()
         while self._coming:
             self._let_take_effect(self._coming[-1][0])
 
     def _submit(self, block_ns: int) -> None:
-        """Have a block solved."""
+        """Have a block solved, by itself or with some more."""
         block = self._copied(block_ns)
-        solver, suggested = self._solver, self._suggested
-        solved = self._worker.submit(lambda: solver.solve(block, suggested=suggested))
-        self._coming.append((block.end_ns + self._wait_ns + SOLVED_WITHIN_NS, solved))
+        self._gathered.append(block)
+        self._gathered_ns.append(block.end_ns + self._wait_ns + SOLVED_WITHIN_NS)
+        if len(self._gathered) >= self._together:
+            self._solve_gathered()
+
+    def _solve_gathered(self) -> None:
+        if not self._gathered:
+            return
+        solver, blocks = self._solver, self._gathered
+        solved = self._worker.submit(lambda: solver.solve(blocks))
+        self._coming.extend((from_ns, solved, number) for number, from_ns in enumerate(self._gathered_ns))
+        self._gathered, self._gathered_ns = [], []
 
     def _let_take_effect(self, reached_ns: int) -> None:
-        while self._coming and self._coming[0][0] <= reached_ns:
-            from_ns, solved = self._coming.popleft()
-            self._told = solved.result()
-            if self._told.has_rows:
-                self._on_block(from_ns)
+        if not self._coming or self._coming[0][0] > reached_ns:
+            return
+        self._is_telling = True
+        try:
+            while self._coming and self._coming[0][0] <= reached_ns:
+                from_ns, solved, number = self._coming.popleft()
+                self._last_told = solved.result()[number]
+                if self._last_told.has_rows:
+                    self._on_block(from_ns)
+        finally:
+            self._is_telling = False
 
     def _copied(self, block_ns: int) -> Block:
         dvl, reference, imu = self._dvl, self._aligner.reference, self._aligner.imu

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..frames import Array
+from .parts import Near, places
 
 # Samples on each side that a fit needs: with fewer it extrapolates.
 ON_EACH_SIDE = 2
@@ -40,12 +41,15 @@ class LocalFit(NamedTuple):
         return LocalFit(self.value[at], self.slope[at], self.value_gain[at], self.slope_gain[at], self.found[at])
 
 
-def spacing_at(times: Array, at: Array) -> Array:
-    """Mean interval of the six samples of times (N,) s around each time (...); nan near an end."""
+def spacing_at(times: Array, at: Array, place: Near | None = None) -> Array:
+    """Mean interval of the six samples of times (N,) s around each time (...); nan near an end.
+
+    place: of these times, where it is known, or where not all samples may be looked at.
+    """
     if len(times) < 6:
         return np.full(at.shape, np.nan)
-    after = np.searchsorted(times, at)
-    inside = (after >= 3) & (after + 2 < len(times))
+    after, begin, end = places(times, at) if place is None else place
+    inside = (after - begin >= 3) & (after + 2 < end)
     last, first = np.minimum(after + 2, len(times) - 1), np.maximum(after - 3, 0)
     return np.where(inside, (times[last] - times[first]) / 5.0, np.nan)
 
@@ -56,20 +60,20 @@ def reach_at(spacing: Array, least: float, most: float) -> Array:
     return np.where(reach <= most, reach, np.nan)  # nan stays nan
 
 
-def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
+def local_fit(times: Array, values: Array, at: Array, reach: Array, place: Near | None = None) -> LocalFit:
     """Fit a quadratic to the samples within `reach` of each time, weighted by (1 - |u|³)³ with u = distance / reach.
 
-    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit.
+    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit. place: as for `spacing_at`.
     """
     found = ~np.isnan(reach)
     if not found.any():
         nothing = np.full((len(at), values.shape[1]), np.nan)
         return LocalFit(nothing, nothing, nothing[:, 0], nothing[:, 0], found)
-    widest = float(np.nanmax(reach))
-    around = int((np.searchsorted(times, times + widest) - np.arange(len(times))).max())
+    after, begin, end = places(times, at) if place is None else place
+    around = _within(times, float(np.nanmax(reach)))
     # samples of a window first: sums over them are then those of whole rows
-    index = np.searchsorted(times, at) + np.arange(-around, around)[:, None]
-    there = (index >= 0) & (index < len(times))
+    index = after + np.arange(-around, around)[:, None]
+    there = (index >= begin) & (index < end)
     index = np.clip(index, 0, len(times) - 1)
     u = (times.take(index) - at) / np.where(found, reach, 1.0)
     near = np.abs(u)
@@ -96,3 +100,22 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     value, slope = np.einsum("wm,wmc->mc", for_value, near_by), np.einsum("wm,wmc->mc", for_slope, near_by)
     value_gain, slope_gain = (np.einsum("wm,wm->m", each, each) for each in (for_value, for_slope))
     return LocalFit(value, slope, value_gain, slope_gain, found)
+
+
+def _within(times: Array, seconds: float) -> int:
+    """How many samples follow each other within so many seconds at most, and no fewer than one.
+
+    times: (N,) s, which increase but where another block begins.
+    """
+
+    def some(n: int) -> bool:
+        apart = times[n:] - times[:-n]
+        return bool(((apart < seconds) & (apart >= 0.0)).any())
+
+    low, high = 0, 1
+    while some(high):
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if some(middle) else (low, middle)
+    return high

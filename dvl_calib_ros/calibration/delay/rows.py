@@ -8,6 +8,7 @@ at s + τ, where it is 20 times less noisy than GNSS. So hypotheses of τ are to
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,11 +17,11 @@ import numpy as np
 from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
 from ..kalman import whitening
 from ..models import MODELS
-from ..models.own import g1_heave, linearise_g1
-from ..observations import Observations
+from ..models.own import g1_errors, g1_heave_errors
 from ..robust import median
 from ..samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
+from .parts import Near, Parts, places
 
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
 # (0.1 m/s² changing by 0.3 m/s³ bends by 1.5 mm/s).
@@ -43,6 +44,10 @@ MARGIN_S = 7.0
 N_G1, N_STATE = 8, 12
 LEVER_ARM, DELAY = slice(8, 11), 11
 BEYOND = slice(N_G1, N_STATE)  # what G1 has not
+# What rows say of the DVL's errors and of the delay is another thing for every delay; of the reference's constant error
+# and of the lever arm it is the same; of a constant heave they say nothing.
+OF_DELAY: Index = np.array([0, 1, 2, 3, 4, DELAY])
+OF_NONE: Index = np.array([6, 7, 8, 9, 10])
 # What belongs to the day, not to the vehicle: the constant error of the reference, and the delay.
 OF_DAY: Index = MODELS["G2"].of_day
 
@@ -80,37 +85,46 @@ class ImuColumns(NamedTuple):
 
 
 class TurnRates(NamedTuple):
-    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body; variance (3,) of
-    its noise."""
+    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body; variance (B, 3)
+    of its noise in each of the parts that they are of."""
 
     times: Array
     rates: Array
     variance: Array
+    parts: Parts
 
     @staticmethod
     def of(imu: ImuColumns) -> TurnRates:
-        """Those of an IMU."""
+        """Those of an IMU, all of one part."""
         known = ~np.isnan(imu.angular_velocity).any(axis=1)
         times, rates = binned(imu.times[known], imu.angular_velocity[known])
-        return TurnRates(times, rates, _noise_of(times, rates))
+        return TurnRates(times, rates, _noise_of(times, rates)[None], Parts.of([times]))
+
+    @staticmethod
+    def joined(each: Sequence[TurnRates]) -> TurnRates:
+        """Of several blocks."""
+        if len(each) == 1:
+            return each[0]
+        times, rates, variance, _ = zip(*each, strict=True)
+        return TurnRates(np.concatenate(times), np.concatenate(rates), np.concatenate(variance), Parts.of(times))
 
 
 @dataclass(frozen=True)
 class DelayedRows:
-    """J reference samples, each compared at K delays.
+    """J reference samples, each compared at K delays: rows of (H, z), turned and scaled so that their noise is 1.
 
-    index: (J,) of the reference. white: (K, 13, 3, J) (H, z) turned and scaled so that their noise is 1, on G1's
-    states, lever arm (m, body) and what the delay is more (s) than that of its hypothesis. weight: (J,) share of its
-    own information that a sample adds. heave: (J, K, 13) (H, z) of what holds of heave in the mean, see heave.py.
-    regressor_noise: (J, 4) how much of the information on lever arm (3) and
-    delay is that of noise: angular velocity and slope that only seem to change.
+    index: (J,) of the reference. moving: (K, 7, 3, J), columns of `OF_DELAY` and z. standing: (5, 3, J), columns of
+    `OF_NONE`. weight: (J,) share of its own information that a sample adds. regressor_noise: (J, 4) how much of the
+    information on lever arm (3) and delay is that of noise: angular velocity and slope that only seem to change.
     """
 
     index: Index
-    white: Array
+    moving: Array
+    standing: Array
     weight: Array
-    heave: Array
     regressor_noise: Array
+    motion: Motion
+    body_from_dvl: Array
 
     def __len__(self) -> int:
         return len(self.index)
@@ -118,53 +132,140 @@ class DelayedRows:
     def part(self, at: Mask) -> DelayedRows:
         """Those of some references."""
         return DelayedRows(
-            self.index[at], self.white[..., at], self.weight[at], self.heave[at], self.regressor_noise[at]
+            self.index[at],
+            self.moving[..., at],
+            self.standing[..., at],
+            self.weight[at],
+            self.regressor_noise[at],
+            self.motion.part(at),
+            self.body_from_dvl,
+        )
+
+    def heave(self, used: Mask) -> Array:
+        """Sum over those used (J,) of (H, z) (K, 13) of what holds of heave in the mean, see heave.py."""
+        velocity, slope, _, turning, lever, _ = self.motion
+        k, n = velocity.shape[1:]
+        share = used.astype(float)
+        row = np.zeros((len(STEPS), N_STATE + 1))
+        of_errors = g1_heave_errors(self.body_from_dvl, velocity.reshape(3, k * n)).reshape(5, k, n)
+        row[:, :5] = (of_errors @ share).T
+        row[:, 5] = -share.sum()
+        row[:, LEVER_ARM] = -(share @ skew(turning)[:, 2])
+        row[:, DELAY] = self.body_from_dvl[2] @ (slope @ share)
+        row[:, N_STATE] = -(self.body_from_dvl[2] @ (velocity @ share))
+        if lever is not None:
+            row[:, N_STATE] += share @ lever[:, 2]
+        return row
+
+
+class Motion(NamedTuple):
+    """What J references are compared with.
+
+    velocity, slope: (3, K, J) of the DVL at every delay, m/s and m/s², in its own frame. body: (J, 3) m/s, the
+    reference's. turning: (J, 3) rad/s. lever: (J, 3) m/s that a known lever arm makes of it, None without one. earth:
+    (J, 3, 2) as in `Observations.earth_in_body`.
+    """
+
+    velocity: Array
+    slope: Array
+    body: Array
+    turning: Array
+    lever: Array | None
+    earth: Array
+
+    def part(self, at: Mask | slice) -> Motion:
+        """Of some references."""
+        lever = None if self.lever is None else self.lever[at]
+        return Motion(
+            self.velocity[..., at], self.slope[..., at], self.body[at], self.turning[at], lever, self.earth[at]
         )
 
 
-def delayed_rows(
+@dataclass(frozen=True)
+class Matched:
+    """The references (J,) of several blocks that have all that rows need.
+
+    index: (J,) of the reference among those of its block. parts: of which block. motion, weight, regressor_noise: as
+    in `DelayedRows`. white: (J, 3, 3).
+    """
+
+    index: Index
+    parts: Parts
+    motion: Motion
+    white: Array
+    weight: Array
+    regressor_noise: Array
+    body_from_dvl: Array
+
+    def rows(self, block: int) -> DelayedRows:
+        """The rows of one block, which few enough to stay in the processor's caches."""
+        at = slice(*self.parts.bounds[block : block + 2].tolist())
+        motion, white = self.motion.part(at), self.white[at]
+        moving = _moving(motion, white, self.body_from_dvl)
+        standing = np.concatenate([motion.earth, -skew(motion.turning)], axis=2)
+        return DelayedRows(
+            self.index[at],
+            moving,
+            np.ascontiguousarray((white @ standing).transpose(2, 1, 0)),
+            self.weight[at],
+            self.regressor_noise[at],
+            motion,
+            self.body_from_dvl,
+        )
+
+
+def matched(
     dvl: DvlColumns,
+    dvl_parts: Parts,
     reference: ReferenceColumns,
+    reference_parts: Parts,
     seen: InBody,
     turns: TurnRates,
     *,
     noise_dvl: Array,
-    template: Observations,
+    body_from_dvl: Array,
     lever_arm: Vector,
     min_speed: float,
     max_turn_rate: float,
     imu_gap_s: float,
-) -> DelayedRows:
-    """Rows of the references that lie within what is known of the other streams.
+) -> Matched:
+    """References of some blocks that lie within what these know of the other streams.
 
-    seen: the references as in the body. noise_dvl: (3, 3) (m/s)², DVL frame. template: whose mounting and assumptions
-    hold; its samples are not looked at. lever_arm: (3,) m, body, as far as it is known already. min_speed (m/s),
-    max_turn_rate (rad/s, 0 for none): as the parameters. imu_gap_s: longest gap that is interpolated across.
+    dvl_parts, reference_parts: of which block samples are. seen: the references as in the body. noise_dvl: (B, 3, 3)
+    (m/s)², DVL frame. body_from_dvl: (3, 3), nominal mounting. lever_arm: (3,) m, body, as far as it is known already.
+    min_speed (m/s), max_turn_rate (rad/s, 0 for none): as the parameters. imu_gap_s: longest gap that is interpolated
+    across.
     """
-    times = reference.times
-    turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s)
-    body, noise, earth = seen.velocity, seen.noise, seen.earth_in_body
+    times, block = reference.times, reference_parts.number
+    turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s, reference_parts)
+    body, noise = seen.velocity, seen.noise
     moving = (body**2).sum(axis=1) >= min_speed**2
     if max_turn_rate > 0.0:
         moving &= (turning**2).sum(axis=1) <= max_turn_rate**2
-    read = _read(dvl, times)
+    read = _read(dvl, dvl_parts, times, reference_parts)
     use = seen.known & ~np.isnan(turning[:, 0]) & moving & read.known
-    white = whitening(noise + np.where(reference.claimed[:, None, None], noise_dvl, 0.0))
+    white = whitening(noise + np.where(reference.claimed[:, None, None], noise_dvl[block], 0.0))
     use &= np.isfinite(white).all(axis=(1, 2))
     index = np.flatnonzero(use)
-    body, white, turning = body[index], white[index], turning[index]
-    value, slope, spacing = read.velocity[..., index], read.slope[..., index], read.spacing[index]
-    uncertain = _Uncertain(turning_noise, noise_dvl, read.slope_gain[index])
-    interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)[index]
+    white, turning, spacing, block = white[index], turning[index], read.spacing[index], block[index]
+    uncertain = _Uncertain(turning_noise[block], noise_dvl[block], read.slope_gain[index])
+    interval = np.minimum(np.diff(times, prepend=times[:1] - 1.0), 10.0)
+    begins = reference_parts.bounds[:-1]
+    interval[begins[begins < len(times)]] = 1.0
     # references closer together than the DVL's samples share these
-    weight = np.clip(interval / spacing, 0.0, 1.0)
-    earth = earth[index]
-    return _rows(index, value, slope, body, earth, turning, uncertain, white, weight, template, lever_arm)
+    weight = np.clip(interval[index] / spacing, 0.0, 1.0)
+    lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
+    motion = Motion(
+        read.velocity[..., index], read.slope[..., index], body[index], turning, lever, seen.earth_in_body[index]
+    )
+    told = uncertain.information(white.swapaxes(1, 2) @ white)
+    in_block = index - reference_parts.bounds[block]
+    return Matched(in_block, reference_parts.at(index), motion, white, weight, told, body_from_dvl)
 
 
 class _Uncertain(NamedTuple):
-    """Noise of regressors: variance of the angular velocity (3,) (rad/s)² as it is used, covariance (3, 3) (m/s)² of
-    the DVL's velocity, and by what (J,) that is multiplied to be its slope's."""
+    """Noise of J regressors: variance of the angular velocity (J, 3) (rad/s)² as it is used, covariance (J, 3, 3)
+    (m/s)² of the DVL's velocity, and by what (J,) that is multiplied to be its slope's."""
 
     turning: Array
     velocity_dvl: Array
@@ -173,8 +274,8 @@ class _Uncertain(NamedTuple):
     def information(self, told: Array) -> Array:
         """What such noise alone would tell of lever arm and delay (J, 4), where a velocity tells (J, 3, 3)."""
         x, y, z = told[:, 0, 0], told[:, 1, 1], told[:, 2, 2]
-        nx, ny, nz = self.turning
-        delay = np.einsum("nij,ji->n", told, self.velocity_dvl) * self.slope_gain
+        nx, ny, nz = self.turning.T
+        delay = (told * self.velocity_dvl.swapaxes(1, 2)).sum(axis=(1, 2)) * self.slope_gain
         return np.column_stack([nz * y + ny * z, nz * x + nx * z, ny * x + nx * y, delay])
 
 
@@ -189,20 +290,31 @@ class _Reading(NamedTuple):
     slope_gain: Array
 
 
-def _read(dvl: DvlColumns, times: Array) -> _Reading:
-    """Fits are made every STEP_S, and cubics read between them: on so short a step no worse, a tenth of the work."""
-    first, last = (int(np.floor(time / STEP_S)) + step for time, step in ((times[0], STEPS[0]), (times[-1], STEPS[-1])))
-    grid = STEP_S * np.arange(first, last + 2)
-    spacing = spacing_at(dvl.times, grid)
-    reach = reach_at(spacing, LEAST_REACH_S, MOST_REACH_S)
-    # both in one call: so few numbers take as long as twice as many
-    reaches = np.concatenate([reach, np.maximum(reach, LEAST_SLOPE_REACH_S)])
-    both = local_fit(dvl.times, dvl.velocity, np.concatenate([grid, grid]), reaches)
-    fit, wide = both.part(slice(len(grid))), both.part(slice(len(grid), None))
+def _read(dvl: DvlColumns, dvl_parts: Parts, times: Array, parts: Parts) -> _Reading:
+    """Fits are made every STEP_S, and cubics read between them: on so short a step no worse, a tenth of the work.
+
+    times: (J,) s. parts: of which block they are.
+    """
     steps = times / STEP_S
     middle = np.floor(steps).astype(np.intp)
     part = steps - middle  # at every delay, as they are whole steps
-    middle -= first
+    grids: list[Array] = []
+    shift: Index = np.zeros(len(times), dtype=np.intp)
+    n = 0
+    for own in parts:
+        first, last = (middle[own.start], middle[own.stop - 1]) if own.stop > own.start else (0, -2 - STEPS.size)
+        grids.append(STEP_S * np.arange(first + STEPS[0], last + STEPS[-1] + 2))
+        shift[own] = n - (first + STEPS[0])
+        n += len(grids[-1])
+    grid = np.concatenate(grids)
+    place = places(dvl.times, grid, dvl_parts, Parts.of(grids))
+    spacing = spacing_at(dvl.times, grid, place)
+    reach = reach_at(spacing, LEAST_REACH_S, MOST_REACH_S)
+    # both in one call: so few numbers take as long as twice as many
+    reaches = np.concatenate([reach, np.maximum(reach, LEAST_SLOPE_REACH_S)])
+    both = local_fit(dvl.times, dvl.velocity, np.concatenate([grid, grid]), reaches, place.twice())
+    fit, wide = both.part(slice(len(grid))), both.part(slice(len(grid), None))
+    middle += shift
     before = middle + STEPS[:, None]
     after = before + 1
     rest = 1.0 - part
@@ -220,48 +332,23 @@ def _read(dvl: DvlColumns, times: Array) -> _Reading:
     return _Reading(velocity, slope, known, spacing[middle], wide.slope_gain[middle])
 
 
-def _rows(
-    index: Index,
-    velocity_dvl: Array,
-    slope: Array,
-    body: Array,
-    earth: Array,
-    turning: Array,
-    uncertain: _Uncertain,
-    white: Array,
-    weight: Array,
-    template: Observations,
-    lever_arm: Vector,
-) -> DelayedRows:
-    k, n = velocity_dvl.shape[1:]
-    body_from_dvl = template.rotation_dvl_from_body.T
-    lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
-    # the same reference beside the DVL at every delay; in memory the samples of each element follow each other
-    each = Observations(
-        velocity_dvl=velocity_dvl.reshape(3, k * n).T,
-        reference_body=np.tile(body.T, k).T,
-        lever_velocity=None if lever is None else np.tile(lever.T, k).T,
-        rotation_dvl_from_body=template.rotation_dvl_from_body,
-        sway_heave=template.sway_heave,
-        earth_in_body=np.tile(earth.transpose(1, 2, 0), k).transpose(2, 0, 1),
-    )
-    z, h_g1 = linearise_g1(each)
-    rows = np.empty((k, N_STATE + 1, 3, n))
-    rows[:, :N_G1] = h_g1.transpose(2, 1, 0).reshape(N_G1, 3, k, n).transpose(2, 0, 1, 3)
-    rows[:, LEVER_ARM] = -skew(turning).transpose(2, 1, 0)
-    rows[:, DELAY] = np.tensordot(body_from_dvl, slope, 1).swapaxes(0, 1)
-    rows[:, N_STATE] = z.reshape(k, n, 3).swapaxes(1, 2)
-    heave = np.empty((n, k, N_STATE + 1))
-    of_g1 = g1_heave(each).T.reshape(N_G1 + 1, k, n).transpose(2, 1, 0)
-    heave[..., :N_G1], heave[..., N_STATE] = of_g1[..., :N_G1], of_g1[..., N_G1]
-    heave[..., BEYOND] = rows[:, BEYOND, 2].transpose(2, 0, 1)
-    part = np.empty((k, N_STATE + 1, n))
-    for i in (2, 1, 0):  # from the last on, as those before go into it
-        rows[:, :, i] *= white[:, i, i]
+def _moving(motion: Motion, white: Array, body_from_dvl: Array) -> Array:
+    """`DelayedRows.moving`. white: (J, 3, 3) lower triangles."""
+    k, n = motion.velocity.shape[1:]
+    v = motion.velocity.reshape(3, k * n)
+    plain = np.empty((3, 7, k, n))
+    plain[:, :5] = g1_errors(body_from_dvl, v).reshape(3, 5, k, n)
+    plain[:, 5] = (body_from_dvl @ motion.slope.reshape(3, k * n)).reshape(3, k, n)
+    beside = motion.body if motion.lever is None else motion.body + motion.lever
+    np.subtract(beside.T[:, None], (body_from_dvl @ v).reshape(3, k, n), out=plain[:, 6])
+    moving = np.empty((k, 7, 3, n))
+    part = np.empty((7, k, n))
+    for i in range(3):
+        row = plain[i] * white[:, i, i]
         for j in range(i):
-            rows[:, :, i] += np.multiply(white[:, i, j], rows[:, :, j], out=part)
-    told = uncertain.information(white.swapaxes(1, 2) @ white)
-    return DelayedRows(index, rows, weight, heave, told)
+            row += np.multiply(white[:, i, j], plain[j], out=part)
+        moving[:, :, i] = row.swapaxes(0, 1)
+    return moving
 
 
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
@@ -278,21 +365,44 @@ def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     )
 
 
-def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> tuple[Array, Array]:
-    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (3,)."""
-    stamps, rates, variance = turns
+def angular_velocity_at(
+    turns: TurnRates, times: Array, gap_s: float, parts: Parts | None = None
+) -> tuple[Array, Array]:
+    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (B, 3).
+
+    parts: by which block's rates each is to be known; None where all are of one.
+    """
+    stamps, rates, variance, turn_parts = turns
     if len(stamps) < 2:
-        return np.full((len(times), 3), np.nan), np.zeros(3)
-    reach = reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S)
-    smooth = local_fit(stamps, rates, times, reach)
-    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
-    outside = (times < stamps[0]) | (times > stamps[-1]) | (stamps[after] - stamps[after - 1] > gap_s)
+        return np.full((len(times), 3), np.nan), np.zeros_like(variance)
+    parts = Parts.of([times]) if parts is None else parts
+    place = places(stamps, times, turn_parts, parts)
+    reach = reach_at(spacing_at(stamps, times, place), LEAST_REACH_S, MOST_REACH_S)
+    smooth = local_fit(stamps, rates, times, reach, place)
+    after, before, outside = _beside(stamps, times, place)
+    outside |= stamps[after] - stamps[before] > gap_s
     value = smooth.value
     if not smooth.found.all():
-        interpolated = np.column_stack([np.interp(times, stamps, column) for column in rates.T])
-        value = np.where(smooth.found[:, None], value, interpolated)
+        gap = np.maximum(stamps[after] - stamps[before], 1e-12)
+        share = np.clip((times - stamps[before]) / gap, 0.0, 1.0)[:, None]
+        value = np.where(smooth.found[:, None], value, rates[before] + (rates[after] - rates[before]) * share)
     value[outside] = np.nan
-    return value, variance * float(np.nanmean(smooth.value_gain)) if smooth.found.any() else np.zeros(3)
+    noise = [
+        own * gain[found].mean() if found.any() else np.zeros(3)
+        for own, gain, found in (
+            (own, smooth.value_gain[at], smooth.found[at]) for own, at in zip(variance, parts, strict=True)
+        )
+    ]
+    return value, np.array(noise)
+
+
+def _beside(stamps: Array, times: Array, place: Near) -> tuple[Index, Index, Mask]:
+    """Places of the samples after and before each of J times, and where there are none (J,). stamps: (N > 1,) s."""
+    after, first, end = place
+    after = np.minimum(np.maximum(np.minimum(np.maximum(after, first + 1), end - 1), 1), len(stamps) - 1)
+    last = np.maximum(end - 1, 0)
+    outside = (end - first < 2) | (times < stamps[np.minimum(first, len(stamps) - 1)]) | (times > stamps[last])
+    return after, after - 1, outside
 
 
 def _noise_of(times: Array, values: Array) -> Array:
@@ -314,14 +424,17 @@ class InBody(NamedTuple):
     known: Mask
     earth_in_body: Array
 
+    def part(self, at: Index | slice) -> InBody:
+        """Some of them."""
+        return InBody(self.velocity[at], self.noise[at], self.known[at], self.earth_in_body[at])
 
-def in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> InBody:
-    """References as in the body, by an attitude that is interpolated across gaps of this length (s) at most."""
+
+def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody:
+    """References as in the body, by attitudes ``rotation_enu_from_body`` (J, 3, 3) where they are known (J,)."""
     in_body = reference.in_body
     if in_body.all():
         n = len(in_body)
         return InBody(reference.velocity, reference.noise, np.ones(n, dtype=bool), np.zeros((n, 3, 2)))
-    rotation, known = attitude_at(imu, reference.times, gap_s)
     body_from_enu = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
     velocity = np.matmul(body_from_enu, reference.velocity[..., None])[..., 0]
     noise = body_from_enu @ reference.noise @ body_from_enu.swapaxes(1, 2)
@@ -329,16 +442,22 @@ def in_body(reference: ReferenceColumns, imu: ImuColumns, gap_s: float) -> InBod
     return InBody(velocity, noise, known | in_body, earth)
 
 
-def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
-    """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,)."""
+def attitude_at(
+    imu: ImuColumns, times: Array, gap_s: float, imu_parts: Parts | None = None, parts: Parts | None = None
+) -> tuple[Array, Mask]:
+    """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,).
+
+    gap_s: longest gap that is interpolated across. imu_parts, parts: of which block samples and times are.
+    """
     given = ~np.isnan(imu.orientation[:, 0])
-    every = bool(given.all())
-    stamps, quaternions = (imu.times, imu.orientation) if every else (imu.times[given], imu.orientation[given])
+    stamps, quaternions = imu.times, imu.orientation
+    if not given.all():
+        stamps, quaternions = stamps[given], quaternions[given]
+        imu_parts = None if imu_parts is None else imu_parts.where(given)
     if len(stamps) < 2:
         return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
-    after = np.minimum(np.maximum(np.searchsorted(stamps, times), 1), len(stamps) - 1)
-    before = after - 1
-    gap = stamps[after] - stamps[before]
+    after, before, outside = _beside(stamps, times, places(stamps, times, imu_parts, parts))
+    gap = np.maximum(stamps[after] - stamps[before], 1e-12)
     fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
     a, b = quaternions.take(before, axis=0), quaternions.take(after, axis=0)
     dot = np.einsum("nq,nq->n", a, b)
@@ -350,5 +469,4 @@ def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mas
     right = np.where(small, fraction, np.sin(fraction * angle) / divisor) * np.where(dot < 0.0, -1.0, 1.0)
     mixed = left[:, None] * a + right[:, None] * b
     mixed /= np.sqrt(np.einsum("nq,nq->n", mixed, mixed))[:, None]
-    known = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= gap_s)
-    return rotation_from_quaternion(mixed), known
+    return rotation_from_quaternion(mixed), ~outside & (gap <= gap_s)

@@ -6,47 +6,39 @@ beside the thread that feeds the aligner (`filter.DelayFilter` says when its out
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ..attitude_rates import AttitudeRates
 from ..bank import ModelCounts
 from ..coarse_mounting import DELAYS_S, CoarseFits
-from ..frames import ENU_FROM_NED, Array
+from ..frames import Array
 from ..kalman import GaussianState
-from ..observations import Observations
 from ..parameters import Parameters
-from ..robust import median
-from ..samples import FRAME_CODES, FRAMES, Index, Mask, Stamps, VelocityFrame
+from ..samples import FRAMES, Mask, Stamps
 from ..shared_noise import SharedNoise
-from ..spikes import without_spikes
-from .bank import DelayBank, Posterior
-from .blocks import MARGIN_NS, Block, ImuSamples
+from .bank import DelayBank, Found, Posterior
+from .blocks import MARGIN_NS, Block
+from .cleaned import Cleaned, cleaned, is_slow, seconds
 from .contradicted import without_contradicted
-from .hold_out import MEASURED_BELOW, NOT_MEASURED, Kept, thinned
+from .hold_out import MEASURED_BELOW, Kept
+from .parts import Parts
 from .reference_clock import ReferenceClock
 from .rows import (
     DelayedRows,
     DvlColumns,
     ImuColumns,
     InBody,
+    Matched,
     ReferenceColumns,
     TurnRates,
     attitude_at,
-    binned,
-    delayed_rows,
     in_body,
+    matched,
 )
-
-_BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
-# No vehicle with a DVL turns faster, rad/s.
-FASTEST_TURN = 20.0
-_BITS = np.array([1, 2, 4], dtype=np.uint8)
-# A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
-# further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
-LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 
 
 class Outcome(NamedTuple):
@@ -54,8 +46,7 @@ class Outcome(NamedTuple):
 
     prior: of G2's states on the day that it is. posterior: None where nothing was ever found. counts: samples used,
     spikes and those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones. claims: references whose
-    messages say how noisy they are, less the others. has_rows: whether the block had any. suggestion: what
-    configuration the data fit, '' for the one given; None where nobody wanted to know.
+    messages say how noisy they are, less the others. has_rows: whether the block had any.
     """
 
     prior: GaussianState
@@ -63,7 +54,23 @@ class Outcome(NamedTuple):
     counts: ModelCounts
     claims: int
     has_rows: bool
-    suggestion: str | None
+
+
+class _Comparison(NamedTuple):
+    """Of one block its references in the body, its turning, and what makes its rows; None where it has none, or where
+    the DVL is slow."""
+
+    seen: InBody
+    turns: TurnRates
+    rows: Callable[[], DelayedRows] | None = None
+
+
+C = TypeVar("C", DvlColumns, ImuColumns, ReferenceColumns)
+
+
+def _joined(columns: Sequence[C]) -> C:
+    """Columns of several blocks, one after the other."""
+    return columns[0] if len(columns) == 1 else type(columns[0])(*map(np.concatenate, zip(*columns, strict=True)))
 
 
 class BlockSolver:
@@ -79,20 +86,12 @@ class BlockSolver:
         unknown: GaussianState,
         gate: float,
         verified: bool,
-        epoch_ns: int = 0,
     ) -> None:
-        """As `DelayFilter`. epoch_ns: stamp of time 0."""
+        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0."""
         self._parameters = parameters
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
         self.bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified, parameters)
-        self._template = Observations(
-            velocity_dvl=np.zeros((1, 3)),
-            reference_body=None,
-            lever_velocity=None,
-            rotation_dvl_from_body=parameters.rotation_dvl_from_body,
-            sway_heave=np.zeros(2),
-        )
         self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
@@ -103,16 +102,15 @@ class BlockSolver:
         self._spikes = 0  # samples of DVL and reference
         self._contradicted: Stamps = np.zeros(0, dtype=np.int64)  # DVL samples, by the references of an earlier block
         self._posterior: Posterior | None = None
-        self.epoch_ns = epoch_ns
+        self.epoch_ns = 0
         self.kept: list[Kept] | None = [] if verified else None
         self.restarted = 0
 
-    def outcome(self, has_rows: bool = False, *, suggested: bool = False) -> Outcome:
-        """What is known as of now. suggested: with what configuration the data fit."""
+    def outcome(self, has_rows: bool = False) -> Outcome:
+        """What is known as of now."""
         bank = self.bank
         counts = ModelCounts(bank.used, bank.gated + self._spikes, bank.mean_nis, 3.0, self.restarted)
-        suggestion = self.suggestion() if suggested else None
-        return Outcome(bank.prior, self._posterior, counts, self._claims, has_rows, suggestion)
+        return Outcome(bank.prior, self._posterior, counts, self._claims, has_rows)
 
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
@@ -126,84 +124,162 @@ class BlockSolver:
         late = self._reference_clock.found()
         return "" if late is None else late.says(self._parameters)
 
-    def solve(self, block: Block, *, suggested: bool = False) -> Outcome:
-        """Take a block. suggested: as in `outcome`."""
-        for _ in range(block.new_days):
+    def solve(self, blocks: Sequence[Block]) -> list[Outcome]:
+        """Take blocks in order: many at once cost a third of one after the other, and come to the same."""
+        outcomes: list[Outcome] = []
+        at = 0
+        while at < len(blocks):
+            end = at + 1
+            if not self._goes_alone(blocks[at]):
+                while end < len(blocks) and not (blocks[end].new_days or self._goes_alone(blocks[end])):
+                    end += 1
+            outcomes += self._solve_together(blocks[at:end])
+            at = end
+        return outcomes
+
+    def _goes_alone(self, block: Block) -> bool:
+        """Whether what is left out of blocks before matters to this one, or of this one to those behind it."""
+        still_seen = (self._contradicted >= block.from_ns - MARGIN_NS).any()
+        return bool(still_seen) or is_slow(2e-9 * block.dvl.stamps_ns)
+
+    def _solve_together(self, blocks: Sequence[Block]) -> list[Outcome]:
+        """Take blocks of one day."""
+        for _ in range(blocks[0].new_days):
             try:
                 self.bank.end_day()
             except np.linalg.LinAlgError:  # numbers that ran away: as if it were the same day
                 self.restarted += 1
             self._reference_clock.start()
-        has_rows = self._take(block)
-        if has_rows or block.new_days:
-            self._find()
-        return self.outcome(has_rows, suggested=suggested)
+        streams = [cleaned(block, self._parameters, self.epoch_ns, self._contradicted) for block in blocks]
+        compared = self._compared([each for each in streams if each.are_compared])
+        outcomes: list[Outcome] = []
+        found: list[tuple[int, Found | None]] = []
+        for each in streams:
+            has_rows = self._take(each, compared)
+            if has_rows or each.block.new_days:
+                found.append((len(outcomes), self._found()))
+            outcomes.append(self.outcome(has_rows))
+        return self._with_posteriors(outcomes, found)
 
-    def _find(self) -> None:
+    def _found(self) -> Found | None:
         try:
-            found = self.bank.posterior()
-        except np.linalg.LinAlgError:  # a configuration so wrong that the errors have no small angles
-            found = None
-        if found is not None and np.isfinite(found.state.x).all() and np.isfinite(found.state.p).all():
-            self._posterior = found
-        else:
-            self.restarted += 1
+            return self.bank.found()
+        except np.linalg.LinAlgError:
+            return None
+
+    def _with_posteriors(self, outcomes: list[Outcome], found: Sequence[tuple[int, Found | None]]) -> list[Outcome]:
+        """Outcomes with what was found after some of them."""
+        sound = [each for _, each in found if each is not None]
+        try:
+            posteriors: Iterator[Posterior | None] = iter(self.bank.posteriors(sound))
+        except np.linalg.LinAlgError:  # of one of them: each by itself
+            posteriors = iter([self._posterior_of(each) for each in sound])
+        after: dict[int, Posterior | None] = {}
+        for number, each in found:
+            posterior = None if each is None else next(posteriors)
+            finite = posterior is not None and all(np.isfinite(value).all() for value in posterior.state)
+            after[number] = posterior if finite else None
+        told = []
+        for number, outcome in enumerate(outcomes):
+            if number in after:
+                if after[number] is None:  # a configuration so wrong that the errors have no small angles
+                    self.restarted += 1
+                else:
+                    self._posterior = after[number]
+            counts = outcome.counts._replace(restarted=self.restarted)
+            told.append(outcome._replace(posterior=self._posterior, counts=counts))
+        return told
+
+    def _posterior_of(self, found: Found) -> Posterior | None:
+        try:
+            return self.bank.posteriors([found])[0]
+        except np.linalg.LinAlgError:
+            return None
 
     def _seconds(self, stamps_ns: Stamps) -> Array:
-        seconds: Array = (stamps_ns - self.epoch_ns) * 1e-9
-        return seconds
+        return seconds(stamps_ns, self.epoch_ns)
 
-    def _take(self, block: Block) -> bool:
-        """Take a block's samples; whether it has rows."""
-        reference, stamps_ns = self._reference(block)
-        if not len(stamps_ns) or block.silent:
-            return False
-        claimed = int(np.count_nonzero(reference.claimed))
-        self._claims += claimed - (len(stamps_ns) - claimed)
-        dvl, noise_dvl, dvl_ns = self._dvl_columns(block)
-        imu = self._imu(block.imu)
-        self._compare_coarsely(block, dvl, imu)
-        seen = in_body(reference, imu, self._parameters.imu_timeout)
-        self._compare_noise(block, dvl, reference.times, seen)
-        from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
-        first, end = np.searchsorted(imu.times, (from_s, to_s)).tolist()
-        self._attitude_rates.add(*(column[first:end] for column in imu))
-        binned_dvl, turns = DvlColumns(*binned(*dvl)), TurnRates.of(imu)
-        rows = None
-        if len(dvl.times) >= 6 and len(imu.times) >= 2:
-            rows_of = partial(self._rows, reference=reference, seen=seen, turns=turns, noise_dvl=noise_dvl)
-            if _is_slow(dvl.times):
-                good, rows = without_contradicted(dvl, reference.times, rows_of, self.bank.misfits)
-                self._leave_out(dvl_ns[~good], block.from_ns)
-                dvl = binned_dvl = DvlColumns(*(column[good] for column in dvl))
-            else:
-                rows = rows_of(binned_dvl)
-        if self.kept is not None:
-            self.kept.append(Kept.between(from_s, to_s, dvl, noise_dvl, reference, imu))
-        if rows is None:
-            return False
-        used = self.bank.add(rows, stamps_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
-        self._reference_clock.add(
-            binned_dvl, reference.part(rows.index[used]), imu, turns, noise_dvl, self.bank.likeliest_delay
-        )
-        return len(rows) > 0
+    def _compared(self, streams: Sequence[Cleaned]) -> dict[int, _Comparison]:
+        """Of several blocks, by their beginnings, what is compared of their streams before the bank is asked."""
+        if not streams:
+            return {}
+        p, imu = self._parameters, _joined([each.imu for each in streams])
+        imu_parts, own_parts = Parts.of([each.imu.times for each in streams]), Parts.of([each.own for each in streams])
+        times = np.concatenate([self._seconds(each.raw.stamps_ns) for each in streams])
+        rotation, oriented = attitude_at(imu, times, p.imu_timeout, imu_parts, own_parts)
+        self._compare_coarsely(streams, times, rotation, oriented)
+        own_imu = [ImuColumns(*(column[each.own_imu] for column in each.imu)) for each in streams]
+        begins = Parts.of([each.times for each in own_imu]).bounds[:-1].tolist()
+        self._attitude_rates.add(*_joined(own_imu), begins)
+        good = np.concatenate([each.good for each in streams])
+        reference = _joined([each.reference for each in streams])
+        seen = in_body(reference, rotation[good], oriented[good])
+        parts = own_parts.where(good)
+        found = {}
+        for each, at in zip(streams, parts, strict=True):
+            own_seen = seen.part(at)
+            self._compare_noise(each, own_seen)
+            found[each.block.from_ns] = _Comparison(own_seen, TurnRates.of(each.imu))
+        together = [number for number, each in enumerate(streams) if each.has_rows and not each.is_slow]
+        if together:
+            chosen = [streams[number] for number in together]
+            own = np.concatenate([np.arange(*parts.bounds[number : number + 2]) for number in together])
+            turns = TurnRates.joined([found[each.block.from_ns].turns for each in chosen])
+            rows = self._compare(chosen, [each.binned_dvl for each in chosen], seen.part(own), turns)
+            for place, each in enumerate(chosen):
+                comparison = found[each.block.from_ns]
+                found[each.block.from_ns] = comparison._replace(rows=partial(rows.rows, place))
+        return found
 
-    def _rows(
-        self, dvl: DvlColumns, *, reference: ReferenceColumns, seen: InBody, turns: TurnRates, noise_dvl: Array
-    ) -> DelayedRows:
+    def _compare(
+        self, streams: Sequence[Cleaned], dvl: Sequence[DvlColumns], seen: InBody, turns: TurnRates
+    ) -> Matched:
+        """References of some blocks beside their DVL samples."""
         p = self._parameters
-        return delayed_rows(
-            dvl,
-            reference,
+        return matched(
+            _joined(dvl),
+            Parts.of([each.times for each in dvl]),
+            _joined([each.reference for each in streams]),
+            Parts.of([each.reference.times for each in streams]),
             seen,
             turns,
-            noise_dvl=noise_dvl,
-            template=self._template,
+            noise_dvl=np.stack([each.noise_dvl for each in streams]),
+            body_from_dvl=p.rotation_dvl_from_body.T,
             lever_arm=self._lever_arm,
             min_speed=p.min_speed,
             max_turn_rate=p.max_turn_rate,
             imu_gap_s=p.imu_timeout,
         )
+
+    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison]) -> bool:
+        """Take a block's samples; whether it has rows."""
+        block, reference, dvl = streams.block, streams.reference, streams.dvl
+        self._spikes += streams.reference_spikes
+        if not streams.are_compared:
+            return False
+        self._spikes += streams.dvl_spikes
+        claimed = int(np.count_nonzero(reference.claimed))
+        self._claims += claimed - (len(reference.times) - claimed)
+        seen, turns, rows_of = compared[block.from_ns]
+        rows, binned_dvl = None if rows_of is None else rows_of(), streams.binned_dvl
+        if streams.has_rows and streams.is_slow:
+            good, rows = without_contradicted(
+                dvl, reference.times, lambda some: self._compare([streams], [some], seen, turns).rows(0),
+                self.bank.misfits,
+            )  # fmt: skip
+            self._leave_out(streams.dvl_ns[~good], block.from_ns)
+            dvl = binned_dvl = DvlColumns(*(column[good] for column in dvl))
+        if self.kept is not None:
+            from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
+            self.kept.append(Kept.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu))
+        if rows is None:
+            return False
+        used = self.bank.add(rows, streams.reference_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
+        self._reference_clock.add(
+            binned_dvl, reference.part(rows.index[used]), streams.imu, turns, streams.noise_dvl,
+            self.bank.likeliest_delay,
+        )  # fmt: skip
+        return len(rows) > 0
 
     def _leave_out(self, stamps_ns: Stamps, block_ns: int) -> None:
         """Leave some DVL samples out from now on, and where they are kept for verification already."""
@@ -217,97 +293,39 @@ class BlockSolver:
             good = ~np.isin(last.dvl.times, self._seconds(stamps_ns), assume_unique=True)
             self.kept[-1] = last._replace(dvl=DvlColumns(*(column[good] for column in last.dvl)))
 
-    def _compare_coarsely(self, block: Block, dvl: DvlColumns, imu: ImuColumns) -> None:
-        """Give the block's references, as their messages had them, to `_coarse`."""
-        if len(dvl.times) < 2:
-            return
-        stamps_ns, values, frames, unmeasured_axes = block.reference.part(_own(block))
-        times, raw = self._seconds(stamps_ns), values[:, :3]
+    def _compare_coarsely(self, streams: Sequence[Cleaned], times: Array, rotation: Array, oriented: Mask) -> None:
+        """Give references, as their messages had them, to `_coarse`.
+
+        times: (J,) s of all, rotation (J, 3, 3) and oriented (J,) the attitudes at these times.
+        """
         late = times[:, None] + DELAYS_S
-        velocity = np.stack([np.interp(late, dvl.times, column) for column in dvl.velocity.T], axis=2)
-        rotation, oriented = attitude_at(imu, times, self._parameters.imu_timeout)
-        rates = None
-        if len(imu.times) > 1:
-            rates = np.column_stack([np.interp(times, imu.times, column) for column in imu.angular_velocity.T])
-        inside = (late[:, 0] >= dvl.times[0]) & (late[:, -1] <= dvl.times[-1])
-        moving = inside & ((raw**2).sum(axis=1) >= self._parameters.min_speed**2)
-        unmeasured = unmeasured_axes != 0
+        velocity, rates = np.zeros((*late.shape, 3)), np.full((len(times), 3), np.nan)
+        inside = np.zeros(len(times), dtype=bool)
+        for each, at in zip(streams, Parts.of([each.own for each in streams]), strict=True):
+            dvl, imu = each.dvl, each.imu
+            if len(dvl.times) < 2:
+                continue
+            inside[at] = (late[at, 0] >= dvl.times[0]) & (late[at, -1] <= dvl.times[-1])
+            for axis in range(3):
+                velocity[at, :, axis] = np.interp(late[at], dvl.times, dvl.velocity[:, axis])
+                if len(imu.times) > 1:
+                    rates[at, axis] = np.interp(times[at], imu.times, imu.angular_velocity[:, axis])
+        raw = np.concatenate([each.raw.values[:, :3] for each in streams])
+        frames = np.concatenate([each.raw.frames for each in streams])
+        unmeasured = np.concatenate([each.raw.unmeasured for each in streams]) != 0
+        moving = inside & ((raw**2).sum(axis=1) >= self._parameters.min_speed**2) & ~unmeasured
         for code in set(frames.tolist()):
             for has_attitude in (True, False):
-                use = moving & (frames == code) & (oriented == has_attitude) & ~unmeasured
+                use = moving & (frames == code) & (oriented == has_attitude)
                 if use.any():
                     attitude = rotation[use] if has_attitude else None
-                    self._coarse.add(
-                        FRAMES[code], raw[use], attitude, velocity[use], None if rates is None else rates[use]
-                    )
+                    self._coarse.add(FRAMES[code], raw[use], attitude, velocity[use], rates[use])
 
-    def _compare_noise(self, block: Block, dvl: DvlColumns, times: Array, reference: InBody) -> None:
-        """Give a block's streams to `_shared_noise`. times: (J,) s, of the references."""
-        variance = np.diagonal(reference.noise, axis1=1, axis2=2)
-        known = reference.known[:, None] & (variance < MEASURED_BELOW)
-        first, end = np.searchsorted(dvl.times, self._seconds(np.array([block.from_ns, block.end_ns]))).tolist()
-        in_the_body = dvl.velocity[first:end] @ self._parameters.rotation_dvl_from_body
-        self._shared_noise.add(dvl.times[first:end], in_the_body, times, np.where(known, reference.velocity, np.nan))
-
-    def _dvl_columns(self, block: Block) -> tuple[DvlColumns, Array, Stamps]:
-        """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), and their stamps (N,)."""
-        stamps_ns, velocity, covariance = block.dvl
-        if len(self._contradicted):
-            known = ~np.isin(stamps_ns, self._contradicted, assume_unique=True)
-            stamps_ns, velocity, covariance = stamps_ns[known], velocity[known], covariance[known]
-        # one bends the curve that is read between samples for all references about it, and no gate would see that
-        good = _good(stamps_ns, velocity)
-        spikes = stamps_ns[~good]
-        stamps_ns, velocity, covariance = stamps_ns[good], velocity[good], covariance[good]
-        self._spikes += int(np.count_nonzero((spikes >= block.from_ns) & (spikes < block.end_ns)))
-        given = ~np.isnan(covariance[:, 0, 0])
-        noise: Array = np.eye(3) * self._parameters.gnss_free_std**2
-        if given.any() and self._parameters.use_message_covariance:
-            noise = covariance[given].mean(axis=0)
-        return DvlColumns(self._seconds(stamps_ns), velocity), noise, stamps_ns
-
-    def _imu(self, samples: ImuSamples) -> ImuColumns:
-        values = samples.values
-        rates = np.where(np.abs(values[:, 4:7]) < FASTEST_TURN, values[:, 4:7], np.nan)
-        return ImuColumns(self._seconds(samples.stamps_ns), values[:, :4], rates)
-
-    def _reference(self, block: Block) -> tuple[ReferenceColumns, Stamps]:
-        """A block's references, thinned and without outliers, and their stamps."""
-        around = block.reference
-        measured = (around.unmeasured[:, None] & _BITS) == 0
-        own = _own(block)
-        good = _good(around.stamps_ns, np.where(measured, around.values[:, :3], 0.0))[own]
-        self._spikes += int(np.count_nonzero(~good))
-        stamps_ns, values, frames, unmeasured = around.part(own[good])
-        noise = values[:, 3:12].reshape(-1, 3, 3)
-        given = ~np.isnan(noise[:, 0, 0]) & self._parameters.use_message_covariance
-        noise = np.where(given[:, None, None], noise, np.eye(3) * self._parameters.gnss_aided_std**2)
-        velocity, ned = values[:, :3], frames == _NED
-        if unmeasured.any():
-            axes = (unmeasured[:, None] & _BITS) != 0
-            velocity = np.where(axes, 0.0, velocity)
-            noise = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise) + np.eye(3) * np.where(
-                axes[:, :, None], NOT_MEASURED, 0.0
-            )
-        if ned.any():
-            velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
-            noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
-        return ReferenceColumns(self._seconds(stamps_ns), velocity, noise, frames == _BODY, given), stamps_ns
-
-
-def _own(block: Block) -> Index:
-    """Which of a block's references are its own and no margin's, thinned."""
-    stamps_ns = block.reference.stamps_ns
-    start, end = np.searchsorted(stamps_ns, (block.from_ns, block.end_ns)).tolist()
-    return start + thinned(stamps_ns[start:end])
-
-
-def _is_slow(times: Array) -> bool:
-    """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
-    return len(times) > 1 and float(median(np.diff(times))) > SLOW_S
-
-
-def _good(stamps_ns: Stamps, velocity: Array) -> Mask:
-    """Which samples of a stream are no spikes, (N,) of (N,) ns and (N, 3) m/s."""
-    smallest = LEAST_SCATTER_SLOW_MPS if _is_slow(1e-9 * stamps_ns) else LEAST_SCATTER_MPS
-    return without_spikes(velocity, smallest=smallest, also_at_ends=True)
+    def _compare_noise(self, streams: Cleaned, seen: InBody) -> None:
+        """Give a block's streams to `_shared_noise`. seen: its references."""
+        variance = np.diagonal(seen.noise, axis1=1, axis2=2)
+        known = seen.known[:, None] & (variance < MEASURED_BELOW)
+        at = streams.own_dvl
+        in_the_body = streams.dvl.velocity[at] @ self._parameters.rotation_dvl_from_body
+        reference = np.where(known, seen.velocity, np.nan)
+        self._shared_noise.add(streams.dvl.times[at], in_the_body, streams.reference.times, reference)

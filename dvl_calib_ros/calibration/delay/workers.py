@@ -11,31 +11,31 @@ from .solver import Outcome
 class Solved(Protocol):
     """What a worker was given to do, as `concurrent.futures.Future`."""
 
-    def result(self) -> Outcome:
-        """The outcome, waited for; raises what the solving raised."""
+    def result(self) -> list[Outcome]:
+        """The outcomes, waited for; raises what the solving raised."""
 
 
 class Worker(Protocol):
     """Does one thing after the other, as a `concurrent.futures.ThreadPoolExecutor` with one thread."""
 
-    def submit(self, work: Callable[[], Outcome], /) -> Solved:
+    def submit(self, work: Callable[[], list[Outcome]], /) -> Solved:
         """Do this after all that was submitted before."""
 
 
 class _Now:
     """What was done at once."""
 
-    def __init__(self, outcome: Outcome) -> None:
-        self._outcome = outcome
+    def __init__(self, outcomes: list[Outcome]) -> None:
+        self._outcomes = outcomes
 
-    def result(self) -> Outcome:
-        """The outcome."""
-        return self._outcome
+    def result(self) -> list[Outcome]:
+        """The outcomes."""
+        return self._outcomes
 
 
 class AtOnce:
     """A worker that has done what it is given before anything else goes on."""
 
-    def submit(self, work: Callable[[], Outcome], /) -> Solved:
+    def submit(self, work: Callable[[], list[Outcome]], /) -> Solved:
         """Do it."""
         return _Now(work())

@@ -39,11 +39,18 @@ def linearise_g1(seen: Observations) -> Linearised:
     v = seen.velocity_dvl.T
     # in memory the samples of each element follow each other, as those work on them who are given it
     h = np.zeros((3, 8, v.shape[1]))
-    h[:, :3] = turned_skew(body_from_dvl, v)
-    h[:, 3:5] = -body_from_dvl[:, :2, None] * _shown(v)[:2]
+    h[:, :5] = g1_errors(body_from_dvl, v)
     if seen.earth_in_body is not None:
         h[:, 6:] = seen.earth_in_body.transpose(1, 2, 0)
     return seen.reference_body - seen.velocity_in_body, h.transpose(2, 0, 1)
+
+
+def g1_errors(body_from_dvl: Array, v: Array) -> Array:
+    """[Tᵀ[v×], -Tᵀdiag(v)] (3, 5, N) of velocities v (3, N) m/s in the DVL's frame, as in `linearise_g1`."""
+    h = np.empty((3, 5, v.shape[1]))
+    h[:, :3] = turned_skew(body_from_dvl, v)
+    h[:, 3:] = -body_from_dvl[:, :2, None] * _shown(v)[:2]
+    return h
 
 
 def g1_heave(seen: Observations) -> Array:
@@ -51,15 +58,20 @@ def g1_heave(seen: Observations) -> Array:
 
     κ acts on level motion only: what is assumed to be near zero must not be read as a scale that makes it so.
     """
-    body_from_dvl = seen.rotation_dvl_from_body.T
-    v = seen.velocity_dvl.T
-    level = body_from_dvl.T[:, :2] @ (body_from_dvl[:2] @ v)
-    row = np.zeros((9, v.shape[1]))
-    row[:3] = turned_skew(body_from_dvl[2:], v)[0]
-    row[3:5] = -body_from_dvl[2, :2, None] * np.where(np.abs(v[:2]) > SCALE_SHOWN_FROM, level[:2], 0.0)
+    row = np.zeros((9, len(seen.velocity_dvl)))
+    row[:5] = g1_heave_errors(seen.rotation_dvl_from_body.T, seen.velocity_dvl.T)
     row[5] = -1.0
     row[8] = -seen.velocity_in_body[:, 2]
     return row.T
+
+
+def g1_heave_errors(body_from_dvl: Array, v: Array) -> Array:
+    """What ψ and κ are to `g1_heave` (5, N), of velocities v (3, N) m/s in the DVL's frame."""
+    level = body_from_dvl.T[:2, :2] @ (body_from_dvl[:2] @ v)
+    row = np.empty((5, v.shape[1]))
+    row[:3] = turned_skew(body_from_dvl[2:], v)[0]
+    row[3:] = -body_from_dvl[2, :2, None] * np.where(np.abs(v[:2]) > SCALE_SHOWN_FROM, level, 0.0)
+    return row
 
 
 def _shown(v: Array) -> Array:

@@ -9,7 +9,7 @@ import pytest
 
 from dvl_calib_ros.calibration.comparison import MOUNTING, Difference, compare, fused, remarks, sentences
 from dvl_calib_ros.calibration.error_model import corrected_mounting
-from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of, rotation_of, rotation_vector
+from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of, rotation_of, turn_between
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
@@ -40,10 +40,10 @@ def test_a_rotation_vector_and_its_rotation_are_inverse_for_small_and_for_large_
     for angle in (0.0, 1e-12, 1e-5, 0.1, 2.0, 3.1, math.pi):
         axis = rng.normal(size=3)
         vector = angle * axis / np.linalg.norm(axis)
-        again = rotation_of(rotation_vector(rotation_of(vector)))
+        again = rotation_of(turn_between(np.eye(3), rotation_of(vector)))
         assert np.allclose(again, rotation_of(vector), atol=1e-9)
         if angle < 3.1:
-            assert np.allclose(rotation_vector(rotation_of(vector)), vector, atol=1e-9)
+            assert np.allclose(turn_between(np.eye(3), rotation_of(vector)), vector, atol=1e-9)
 
 
 def test_a_mounting_that_moved_is_said_with_its_size_sigma_axis_and_dates():
@@ -104,9 +104,7 @@ def test_the_turn_sigma_is_worth_what_simulated_states_scatter_by():
     draws = x + rng.normal(size=(3000, 8)) @ root.T
     turns = np.array(
         [
-            rotation_vector(
-                corrected_mounting(draw[:3], parameters.rotation_dvl_from_body) @ made.rotation_body_from_dvl.T
-            )
+            turn_between(made.rotation_body_from_dvl, corrected_mounting(draw[:3], parameters.rotation_dvl_from_body))
             for draw in draws
         ]
     )
@@ -134,7 +132,7 @@ def test_totals_are_compared_so_the_same_dvl_under_another_nominal_mounting_is_t
     total = rotation_from_rpy((0.0, 0.0, math.radians(2.0)))
     states = []
     for parameters in (flat, turned):
-        phi = -np.tan(rotation_vector(parameters.rotation_dvl_from_body @ total))
+        phi = -np.tan(turn_between(np.eye(3), parameters.rotation_dvl_from_body @ total))
         states.append(GaussianState(np.array([*phi, *np.zeros(5)]), p))
     a, b = (
         extrinsics_of(name, model, state, parameters, (0, 1), 10)
@@ -176,7 +174,7 @@ def test_nothing_shown_by_two_is_one_line():
 def test_several_together_are_their_weighted_mean():
     tight = extrinsics(1, (0.0, 0.0, 0.3), covariance=np.diag(STD**2) / 4.0)
     both = fused([extrinsics(0), tight])
-    assert math.degrees(rotation_vector(both.rotation_body_from_dvl)[2]) == pytest.approx(0.8 * 0.3)
+    assert math.degrees(turn_between(np.eye(3), both.rotation_body_from_dvl)[2]) == pytest.approx(0.8 * 0.3)
     assert both.std[2] == pytest.approx(STD[2] / math.sqrt(5.0))
 
 

@@ -267,7 +267,7 @@ def test_a_result_has_the_last_block_though_its_time_of_effect_has_not_come():
 
 
 def test_what_raises_in_a_worker_is_raised_where_its_outcome_is_to_take_effect(monkeypatch):
-    monkeypatch.setattr(delay_solver, "delayed_rows", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(delay_solver, "matched", lambda *_, **__: 1 / 0)
     calibrator = Calibrator(NOISE, worker=ThreadPoolExecutor(1))
     with pytest.raises(ZeroDivisionError):
         feed(calibrator, late(-1.4, duration=80.0))

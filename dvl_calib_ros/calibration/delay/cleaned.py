@@ -1,0 +1,174 @@
+"""A block's streams as they are compared: thinned, in seconds, without samples that are far off.
+
+One bends the curve that is read between the DVL's samples for all references about it, and no gate would see that.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..frames import ENU_FROM_NED, Array
+from ..parameters import Parameters
+from ..robust import median
+from ..samples import FRAME_CODES, Index, Mask, Stamps, VelocityFrame
+from ..spikes import without_spikes
+from .blocks import Block, ImuSamples, ReferenceSamples
+from .hold_out import NOT_MEASURED, thinned
+from .rows import DvlColumns, ImuColumns, ReferenceColumns, binned
+
+_BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
+# No vehicle with a DVL turns faster, rad/s.
+FASTEST_TURN = 20.0
+_BITS = np.array([1, 2, 4], dtype=np.uint8)
+# A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
+# further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
+LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
+
+
+class Cleaned(NamedTuple):
+    """A block's samples.
+
+    raw: its own references (J,) as the messages had them, thinned; own: places of them in the block. good: (J,) those
+    that are no outliers, which are in reference. dvl: without outliers; binned_dvl: as a curve is read from it.
+    dvl_ns, reference_ns: stamps. noise_dvl: (3, 3) (m/s)², the DVL's mean covariance. own_dvl, own_imu: places of the
+    block's own samples. are_compared: whether it has references, and the others there are for them. is_slow: the DVL.
+    """
+
+    block: Block
+    raw: ReferenceSamples
+    own: Index
+    good: Mask
+    reference: ReferenceColumns
+    reference_ns: Stamps
+    reference_spikes: int
+    dvl: DvlColumns
+    binned_dvl: DvlColumns
+    dvl_ns: Stamps
+    dvl_spikes: int
+    noise_dvl: Array
+    imu: ImuColumns
+    own_dvl: slice
+    own_imu: slice
+    are_compared: bool
+    is_slow: bool
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether DVL and IMU are enough for curves."""
+        return len(self.dvl.times) >= 6 and len(self.imu.times) >= 2
+
+
+def cleaned(block: Block, parameters: Parameters, epoch_ns: int, contradicted: Stamps) -> Cleaned:
+    """A block's samples. epoch_ns: stamp of time 0. contradicted: stamps of DVL samples that are left out already."""
+    own = _own(block)
+    raw = block.reference.part(own)
+    reference, good = _reference(block, own, raw, parameters, epoch_ns)
+    noise_dvl: Array = np.eye(3)
+    dvl, dvl_ns, dvl_spikes = DvlColumns(np.zeros(0), np.zeros((0, 3))), block.dvl.stamps_ns[:0], 0
+    imu = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
+    are_compared = len(reference.times) > 0 and not block.silent
+    if are_compared:
+        dvl, noise_dvl, dvl_ns, dvl_spikes = _dvl_columns(block, parameters, epoch_ns, contradicted)
+        imu = _imu(block.imu, epoch_ns)
+    from_s, to_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
+    return Cleaned(
+        block=block,
+        raw=raw,
+        own=own,
+        good=good,
+        reference=reference,
+        reference_ns=raw.stamps_ns[good],
+        reference_spikes=int(np.count_nonzero(~good)),
+        dvl=dvl,
+        binned_dvl=dvl if is_slow(dvl.times) else DvlColumns(*binned(*dvl)),
+        dvl_ns=dvl_ns,
+        dvl_spikes=dvl_spikes,
+        noise_dvl=noise_dvl,
+        imu=imu,
+        own_dvl=slice(*np.searchsorted(dvl.times, (from_s, to_s)).tolist()),
+        own_imu=slice(*np.searchsorted(imu.times, (from_s, to_s)).tolist()),
+        are_compared=are_compared,
+        is_slow=is_slow(dvl.times),
+    )
+
+
+def _dvl_columns(
+    block: Block, p: Parameters, epoch_ns: int, contradicted: Stamps
+) -> tuple[DvlColumns, Array, Stamps, int]:
+    """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), their stamps (N,), and how many
+    outliers it has."""
+    stamps_ns, velocity, covariance = block.dvl
+    if len(contradicted):
+        known = ~np.isin(stamps_ns, contradicted, assume_unique=True)
+        stamps_ns, velocity, covariance = stamps_ns[known], velocity[known], covariance[known]
+    # one bends the curve that is read between samples for all references about it, and no gate would see that
+    good = _good(stamps_ns, velocity)
+    n_spikes = 0
+    if not good.all():
+        spikes = stamps_ns[~good]
+        stamps_ns, velocity, covariance = stamps_ns[good], velocity[good], covariance[good]
+        n_spikes = int(np.count_nonzero((spikes >= block.from_ns) & (spikes < block.end_ns)))
+    given = ~np.isnan(covariance[:, 0, 0])
+    noise: Array = np.eye(3) * p.gnss_free_std**2
+    if given.any() and p.use_message_covariance:
+        noise = covariance[given].mean(axis=0)
+    return DvlColumns(seconds(stamps_ns, epoch_ns), velocity), noise, stamps_ns, n_spikes
+
+
+def _imu(samples: ImuSamples, epoch_ns: int) -> ImuColumns:
+    values = samples.values
+    rates = np.where(np.abs(values[:, 4:7]) < FASTEST_TURN, values[:, 4:7], np.nan)
+    return ImuColumns(seconds(samples.stamps_ns, epoch_ns), values[:, :4], rates)
+
+
+def _reference(
+    block: Block, own: Index, raw: ReferenceSamples, p: Parameters, epoch_ns: int
+) -> tuple[ReferenceColumns, Mask]:
+    """A block's references without outliers, and which of its own, as thinned, these are.
+
+    own: places of them in the block. raw: themselves.
+    """
+    around = block.reference
+    measured = (around.unmeasured[:, None] & _BITS) == 0
+    good = _good(around.stamps_ns, np.where(measured, around.values[:, :3], 0.0))[own]
+    stamps_ns, values, frames, unmeasured = raw if good.all() else raw.part(np.flatnonzero(good))
+    noise = values[:, 3:12].reshape(-1, 3, 3)
+    given = ~np.isnan(noise[:, 0, 0]) & p.use_message_covariance
+    noise = np.where(given[:, None, None], noise, np.eye(3) * p.gnss_aided_std**2)
+    velocity, ned = values[:, :3], frames == _NED
+    if unmeasured.any():
+        axes = (unmeasured[:, None] & _BITS) != 0
+        velocity = np.where(axes, 0.0, velocity)
+        noise = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise) + np.eye(3) * np.where(
+            axes[:, :, None], NOT_MEASURED, 0.0
+        )
+    if ned.any():
+        velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
+        noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
+    return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given), good
+
+
+def _own(block: Block) -> Index:
+    """Which of a block's references are its own and no margin's, thinned."""
+    stamps_ns = block.reference.stamps_ns
+    start, end = np.searchsorted(stamps_ns, (block.from_ns, block.end_ns)).tolist()
+    return start + thinned(stamps_ns[start:end])
+
+
+def is_slow(times: Array) -> bool:
+    """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
+    return len(times) > 1 and float(median(np.diff(times))) > SLOW_S
+
+
+def _good(stamps_ns: Stamps, velocity: Array) -> Mask:
+    """Which samples of a stream are no spikes, (N,) of (N,) ns and (N, 3) m/s."""
+    smallest = LEAST_SCATTER_SLOW_MPS if is_slow(1e-9 * stamps_ns) else LEAST_SCATTER_MPS
+    return without_spikes(velocity, smallest=smallest, also_at_ends=True)
+
+
+def seconds(stamps_ns: Stamps, epoch_ns: int) -> Array:
+    """Times (N,) s since the epoch."""
+    since: Array = (stamps_ns - epoch_ns) * 1e-9
+    return since
