@@ -9,6 +9,7 @@ only, so nothing is assumed of heave.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from ..frames import Array, cross, skew
 from ..parameters import Parameters
 from ..time_blocks import FEWEST, TimeBlocks
 from .local_motion import local_fit, reach_at, spacing_at
+from .parts import Parts, places
 from .rows import (
     LEAST_SLOPE_REACH_S,
     MOST_REACH_S,
@@ -26,6 +28,7 @@ from .rows import (
     TurnRates,
     angular_velocity_at,
     attitude_at,
+    joined,
 )
 
 # Evidence over ρ is a parabola as long as that is short beside a turn's beginning.
@@ -90,6 +93,20 @@ def _late(seconds: float, digits: int = 2) -> str:
     return f"{abs(seconds):.{digits}f} s {'late' if seconds > 0.0 else 'early'}"
 
 
+class ClockBlock(NamedTuple):
+    """Of a block of time the references that are no outliers, and what the other streams hold about it.
+
+    noise_dvl: (3, 3) (m/s)². delay: s, that G2 finds likeliest.
+    """
+
+    dvl: DvlColumns
+    reference: ReferenceColumns
+    imu: ImuColumns
+    turns: TurnRates
+    noise_dvl: Array
+    delay: float
+
+
 class ReferenceClock:
     """Sums of least squares at each ρ and δ, from the blocks since G2's delay last changed; constant memory."""
 
@@ -112,54 +129,62 @@ class ReferenceClock:
         self._square = np.zeros(shape)
         self._blocks = TimeBlocks()
 
-    def add(
-        self,
-        dvl: DvlColumns,
-        reference: ReferenceColumns,
-        imu: ImuColumns,
-        turns: TurnRates,
-        noise_dvl: Array,
-        delay: float,
-    ) -> None:
-        """Take a block's references that are no outliers.
+    def add(self, blocks: Sequence[ClockBlock]) -> None:
+        """Take the references of some blocks, in order, that are no outliers."""
+        together: list[ClockBlock] = []
+        for block in blocks:
+            if self._around is None or abs(block.delay - self._around) > MOVED_S:
+                self._add(together)
+                together = []
+                self.start()
+                self._around = block.delay
+            if len(block.reference.times) >= 2:
+                together.append(block)
+        self._add(together)
 
-        noise_dvl: (3, 3) (m/s)². delay: s, that G2 finds likeliest.
-        """
-        if self._around is None or abs(delay - self._around) > MOVED_S:
-            self.start()
-            self._around = delay
-        times = reference.times
-        if len(times) < 2:
+    def _add(self, blocks: Sequence[ClockBlock]) -> None:
+        """Take blocks with G2's delay about the same."""
+        if not blocks:
             return
-        first = np.flatnonzero(np.diff(np.floor(times / EVERY_S), prepend=-np.inf))
-        reference = reference.part(first)
-        times = reference.times
-        at = (self._around + ABOUT_S)[:, None] + times
-        spacing = spacing_at(dvl.times, times)
+        assert self._around is not None
+        thinned = [_thinned(block.reference) for block in blocks]
+        reference, parts = joined(thinned), Parts.of([each.times for each in thinned])
+        times, block, n = reference.times, parts.number, len(reference.times)
+        dvl, dvl_parts = joined([each.dvl for each in blocks]), Parts.of([each.dvl.times for each in blocks])
+        imu, imu_parts = joined([each.imu for each in blocks]), Parts.of([each.imu.times for each in blocks])
+        spacing = spacing_at(dvl.times, times, places(dvl.times, times, dvl_parts, parts))
         reach = np.clip(reach_at(spacing, LEAST_SLOPE_REACH_S, MOST_REACH_S), LEAST_SLOPE_REACH_S, None)
-        fit = local_fit(dvl.times, dvl.velocity, at.ravel(), np.tile(reach, len(at)))
+        at = (times[:, None] + (self._around + ABOUT_S)).ravel()
+        place = places(dvl.times, at, dvl_parts, Parts(len(ABOUT_S) * parts.bounds))
+        fit = local_fit(dvl.times, dvl.velocity, at, np.repeat(reach, len(ABOUT_S)), place)
         body_from_dvl = self._p.rotation_dvl_from_body.T
-        measured = (fit.value @ body_from_dvl.T).reshape(*at.shape, 3)
-        slope = (fit.slope @ body_from_dvl.T).reshape(*at.shape, 3)
-        own = (times - LATE_S[:, None]).ravel()
-        shape = len(LATE_S), len(times)
-        rotation, oriented = attitude_at(imu, own, self._p.imu_timeout)
-        rates = angular_velocity_at(turns, own, self._p.imu_timeout)[0].reshape(*shape, 3)
-        to_body = rotation.swapaxes(1, 2).reshape(*shape, 3, 3)
+        measured, slope = (
+            (each @ body_from_dvl.T).reshape(n, len(ABOUT_S), 3).swapaxes(0, 1) for each in (fit.value, fit.slope)
+        )
+        own, own_parts = (times[:, None] - LATE_S).ravel(), Parts(len(LATE_S) * parts.bounds)
+        rotation, oriented = attitude_at(imu, own, self._p.imu_timeout, imu_parts, own_parts)
+        turns = TurnRates.joined([each.turns for each in blocks])
+        rates = angular_velocity_at(turns, own, self._p.imu_timeout, own_parts)[0].reshape(n, -1, 3).swapaxes(0, 1)
+        to_body = rotation.reshape(n, -1, 3, 3).transpose(1, 0, 3, 2)
         to_body = np.where(reference.in_body[:, None, None], np.eye(3), to_body)
         body = np.matmul(to_body, reference.velocity[..., None])[..., 0] + cross(rates, np.array(self._p.lever_arm))
-        known = fit.found.reshape(at.shape).all(axis=0)
-        known &= (oriented.reshape(shape) | reference.in_body).all(axis=0) & ~np.isnan(rates).any(axis=(0, 2))
-        known &= (measured[1] ** 2).sum(axis=1) >= self._p.min_speed**2
-        if not known.any():
-            return
-        added = np.where(reference.claimed, np.trace(noise_dvl) / 3.0, 0.0)
+        known = fit.found.reshape(n, -1).all(axis=1)
+        known &= oriented.reshape(n, -1).all(axis=1) | reference.in_body
+        known &= ~np.isnan(rates).any(axis=(0, 2)) & ((measured[1] ** 2).sum(axis=1) >= self._p.min_speed**2)
+        noise_dvl = np.array([np.trace(each.noise_dvl) for each in blocks])
+        added = np.where(reference.claimed, noise_dvl[block] / 3.0, 0.0)
         # the vertical may not be measured
         horizontal = np.sort(np.diagonal(reference.noise, axis1=1, axis2=2), axis=1)[:, :2]
         interval = np.minimum(np.diff(times, prepend=times[:1] - EVERY_S), spacing)
-        weight = (interval / spacing / (horizontal.mean(axis=1) + added))[known]
-        self._sum(measured[:, known], slope[:, known], body[:, known], rates[:, known],
-                  (to_body * ~reference.in_body[:, None, None])[:, known], weight)  # fmt: skip
+        begins = parts.bounds[:-1]
+        interval[begins] = np.minimum(EVERY_S, spacing[begins])
+        weight = interval / spacing / (horizontal.mean(axis=1) + added)
+        of_earth = to_body * ~reference.in_body[:, None, None]
+        for own_at in parts:
+            use = own_at.start + np.flatnonzero(known[own_at])
+            if len(use):
+                some = [each[:, use] for each in (measured, slope, body, rates, of_earth)]
+                self._sum(some[0], some[1], some[2], some[3], some[4], weight[use])
 
     def _sum(self, measured: Array, slope: Array, body: Array, rates: Array, to_body: Array, weight: Array) -> None:
         """measured, slope: (D, J, 3). body, rates: (R, J, 3). to_body: (R, J, 3, 3). weight: (J,)."""
@@ -227,3 +252,7 @@ class ReferenceClock:
             return None
         apart = float(delay[best]) + beyond * float(delay[best + 1] - delay[best - 1]) / 2.0
         return LateClocks(late, apart + late, float(std[best]), at_least=False)
+
+
+def _thinned(reference: ReferenceColumns) -> ReferenceColumns:
+    return reference.part(np.flatnonzero(np.diff(np.floor(reference.times / EVERY_S), prepend=-np.inf)))

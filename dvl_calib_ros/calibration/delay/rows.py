@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -82,6 +82,14 @@ class ImuColumns(NamedTuple):
     times: Array
     orientation: Array
     angular_velocity: Array
+
+
+C = TypeVar("C", DvlColumns, ImuColumns, ReferenceColumns)
+
+
+def joined(columns: Sequence[C]) -> C:
+    """Columns of several blocks, one after the other."""
+    return columns[0] if len(columns) == 1 else type(columns[0])(*map(np.concatenate, zip(*columns, strict=True)))
 
 
 class TurnRates(NamedTuple):

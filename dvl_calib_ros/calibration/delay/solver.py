@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,17 +26,17 @@ from .cleaned import Cleaned, cleaned, is_slow, seconds
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, Kept
 from .parts import Parts
-from .reference_clock import ReferenceClock
+from .reference_clock import ClockBlock, ReferenceClock
 from .rows import (
     DelayedRows,
     DvlColumns,
     ImuColumns,
     InBody,
     Matched,
-    ReferenceColumns,
     TurnRates,
     attitude_at,
     in_body,
+    joined,
     matched,
 )
 
@@ -63,14 +63,6 @@ class _Comparison(NamedTuple):
     seen: InBody
     turns: TurnRates
     rows: Callable[[], DelayedRows] | None = None
-
-
-C = TypeVar("C", DvlColumns, ImuColumns, ReferenceColumns)
-
-
-def _joined(columns: Sequence[C]) -> C:
-    """Columns of several blocks, one after the other."""
-    return columns[0] if len(columns) == 1 else type(columns[0])(*map(np.concatenate, zip(*columns, strict=True)))
 
 
 class BlockSolver:
@@ -154,11 +146,13 @@ class BlockSolver:
         compared = self._compared([each for each in streams if each.are_compared])
         outcomes: list[Outcome] = []
         found: list[tuple[int, Found | None]] = []
+        clocked: list[ClockBlock] = []
         for each in streams:
-            has_rows = self._take(each, compared)
+            has_rows = self._take(each, compared, clocked)
             if has_rows or each.block.new_days:
                 found.append((len(outcomes), self._found()))
             outcomes.append(self.outcome(has_rows))
+        self._reference_clock.add(clocked)
         return self._with_posteriors(outcomes, found)
 
     def _found(self) -> Found | None:
@@ -203,16 +197,16 @@ class BlockSolver:
         """Of several blocks, by their beginnings, what is compared of their streams before the bank is asked."""
         if not streams:
             return {}
-        p, imu = self._parameters, _joined([each.imu for each in streams])
+        p, imu = self._parameters, joined([each.imu for each in streams])
         imu_parts, own_parts = Parts.of([each.imu.times for each in streams]), Parts.of([each.own for each in streams])
         times = np.concatenate([self._seconds(each.raw.stamps_ns) for each in streams])
         rotation, oriented = attitude_at(imu, times, p.imu_timeout, imu_parts, own_parts)
         self._compare_coarsely(streams, times, rotation, oriented)
         own_imu = [ImuColumns(*(column[each.own_imu] for column in each.imu)) for each in streams]
         begins = Parts.of([each.times for each in own_imu]).bounds[:-1].tolist()
-        self._attitude_rates.add(*_joined(own_imu), begins)
+        self._attitude_rates.add(*joined(own_imu), begins)
         good = np.concatenate([each.good for each in streams])
-        reference = _joined([each.reference for each in streams])
+        reference = joined([each.reference for each in streams])
         seen = in_body(reference, rotation[good], oriented[good])
         parts = own_parts.where(good)
         found = {}
@@ -237,9 +231,9 @@ class BlockSolver:
         """References of some blocks beside their DVL samples."""
         p = self._parameters
         return matched(
-            _joined(dvl),
+            joined(dvl),
             Parts.of([each.times for each in dvl]),
-            _joined([each.reference for each in streams]),
+            joined([each.reference for each in streams]),
             Parts.of([each.reference.times for each in streams]),
             seen,
             turns,
@@ -251,8 +245,8 @@ class BlockSolver:
             imu_gap_s=p.imu_timeout,
         )
 
-    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison]) -> bool:
-        """Take a block's samples; whether it has rows."""
+    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison], clocked: list[ClockBlock]) -> bool:
+        """Take a block's samples; whether it has rows. clocked: is given what `_reference_clock` is to know of it."""
         block, reference, dvl = streams.block, streams.reference, streams.dvl
         self._spikes += streams.reference_spikes
         if not streams.are_compared:
@@ -275,10 +269,8 @@ class BlockSolver:
         if rows is None:
             return False
         used = self.bank.add(rows, streams.reference_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
-        self._reference_clock.add(
-            binned_dvl, reference.part(rows.index[used]), streams.imu, turns, streams.noise_dvl,
-            self.bank.likeliest_delay,
-        )  # fmt: skip
+        own, delay = reference.part(rows.index[used]), self.bank.likeliest_delay
+        clocked.append(ClockBlock(binned_dvl, own, streams.imu, turns, streams.noise_dvl, delay))
         return len(rows) > 0
 
     def _leave_out(self, stamps_ns: Stamps, block_ns: int) -> None:
