@@ -17,6 +17,8 @@ from . import DifferentWorkError, Measurement
 
 SECONDS = 3600.0
 TARGET = 0.4
+# The columns of a recording are kept: 60 MB for this hour
+MEGABYTES = 200.0
 ROUNDS = 3
 
 # Each runs in a process of its own, so that CPU time and peak memory are its alone.
@@ -49,7 +51,7 @@ print(json.dumps([time.process_time() - started, peak, read]))
 
 
 def measure(quick: bool = False) -> list[Measurement]:
-    """An hour of DVL and GNSS (in ENU) at 10 Hz and IMU at 100 Hz; memory also over a sixth of it. quick: one round."""
+    """An hour of DVL and GNSS (in ENU) at 10 Hz and IMU at 100 Hz; memory beside a sixth of it. quick: one round."""
     with tempfile.TemporaryDirectory() as folder:
         long, short = Path(folder) / "hour", Path(folder) / "sixth"
         for path, seconds in ((long, SECONDS), (short, SECONDS / 6)):
@@ -80,8 +82,8 @@ def measure(quick: bool = False) -> list[Measurement]:
             f"{memory:.0f} MB",
             f"{short_run.megabytes:.0f} MB",
             f"{memory / short_run.megabytes:.2f}",
-            "does not grow",
-            memory < 1.05 * short_run.megabytes,
+            f"<= {MEGABYTES:g} MB",
+            memory <= MEGABYTES,
             memory / short_run.megabytes,
         ),
     ]

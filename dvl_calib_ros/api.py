@@ -30,6 +30,7 @@ from .diagnosis.results import Diagnosis
 from .discovery.discover import Discovery, Given, discover
 from .errors import InputError
 from .examination.examine import Examination
+from .recordings.recording import Recording, open_recording
 from .replay.replay import Replayed
 from .simulation.scenario import Scenario
 
@@ -265,8 +266,8 @@ def replay(
     from .replay.checked import checked_replay
 
     paths = _paths(bags)
-    discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
-    replayed = checked_replay(paths, discovery.parameters, discovery.topics, merge=merge, with_history=history)
+    recording, discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
+    replayed = checked_replay(recording, discovery.parameters, discovery.topics, merge=merge, with_history=history)
     return Calibration(replayed, discovery, tuple(paths))
 
 
@@ -335,9 +336,9 @@ def diagnose(
     """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``; as `replay`."""
     from .diagnosis.diagnose import diagnose as run
 
-    paths = _paths(bags)
-    discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, {"min_speed": 0.0} | parameters)
-    return run(paths, discovery.parameters, discovery.topics)
+    topics = (dvl_topic, gnss_topic, imu_topic)
+    recording, discovery = _discovered(_paths(bags), topics, params, {"min_speed": 0.0} | parameters)
+    return run(recording, discovery.parameters, discovery.topics)
 
 
 def simulate(bag: StrPath, scenario: Scenario | None = None, **scenario_fields: Any) -> Path:
@@ -386,7 +387,7 @@ def evaluate(
     from .evaluation.evaluate import DEFAULTS, EVALUATED
     from .evaluation.evaluate import evaluate as run
     from .parallel import Workers
-    from .replay.replay import Topics
+    from .recordings.topics import Topics
 
     found = [] if paths is None else _paths(paths)
     known = tuple(MODELS) if len(found) > 1 else EVALUATED
@@ -416,10 +417,11 @@ def _discovered(
     topics: tuple[str | None, str | None, str | None],
     params: StrPath | None,
     given: Mapping[str, Any],
-) -> Discovery:
+) -> tuple[Recording, Discovery]:
     parameters, names = _parameters(params, given)
     dvl, gnss, imu = topics
-    return discover(paths, parameters, Given(dvl, gnss, imu, names))
+    recording = open_recording(paths, None, parameters)
+    return recording, discover(recording, parameters, Given(dvl, gnss, imu, names))
 
 
 def _triple(values: Array) -> tuple[float, float, float]:

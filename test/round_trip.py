@@ -27,7 +27,8 @@ from dvl_calib_ros.diagnosis.results import diagnosis_document
 from dvl_calib_ros.export.description import load_description
 from dvl_calib_ros.export.simulator import export
 from dvl_calib_ros.export.simulators import SIMULATORS
-from dvl_calib_ros.replay.replay import Topics
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -112,7 +113,7 @@ def run(simulator: str, seed: int, folder: Path) -> Outcome:
 
 
 def diagnosed(bag: Path, parameters: Parameters) -> tuple[Log, dict]:
-    log = read_log(Source((bag,), parameters, Topics()))
+    log = read_log(Source(open_recording([bag]), parameters, Topics()))
     write_json(bag.with_suffix(".json"), diagnosis_document(log.diagnosis))
     return log, json.loads(bag.with_suffix(".json").read_text())
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .batches import Batch, Index
 from .channels import Channel, Decoder, DecodingError
 from .layout import Columns, Layout, NoLayoutError, Rows, layout_of
-from .reader import BagReader, Wanted
+from .reader import BagReader
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
 WINDOW_MESSAGES, WINDOW_BYTES = 4096, 4 << 20
@@ -40,9 +40,13 @@ class Part:
     def __len__(self) -> int:
         return len(self.arrival)
 
+    def data(self) -> Iterable[bytes]:
+        """The bytes of each message."""
+        return self._data if self.columns is None else self.columns.messages()
+
     def messages(self) -> Iterator[tuple[Any, str]]:
         """One by one: the decoded message, None if it cannot be decoded, and then why."""
-        for data in self._data if self.columns is None else self.columns.messages():
+        for data in self.data():
             try:
                 yield self._decoder(self.channel, data), ""
             except DecodingError as error:
@@ -57,13 +61,11 @@ class Window:
     log_ns: int
 
 
-def windows(
-    bag: BagReader, topics: Collection[str], one_by_one: Collection[str] = (), wanted: Wanted | None = None
-) -> Iterator[Window]:
-    """Messages of these topics that are wanted, None for all. one_by_one: topics of which no columns are asked for."""
+def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str] = ()) -> Iterator[Window]:
+    """Messages of these topics. one_by_one: topics of which no columns are asked for."""
     layouts = _Layouts(bag.decoder)
     arrived = 0
-    for batches in _windows(bag.batches(topics, wanted)):
+    for batches in _windows(bag.batches(topics)):
         places = np.cumsum([0, *(batch.size for batch in batches)])
         log_ns = np.concatenate([np.minimum(batch.log_ns, _LATEST_NS).astype(np.int64) for batch in batches])
         by_kind: dict[tuple[int, int], list[tuple[Batch, Index, Index]]] = {}

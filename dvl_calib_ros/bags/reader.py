@@ -6,7 +6,7 @@ import heapq
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from operator import itemgetter
 from pathlib import Path
@@ -29,8 +29,6 @@ else:
 # Plain tuples: there is one per message, and a named one would cost as much as a third of its decoding.
 DecodedMessage = tuple[str, int, Any, str]
 """Topic, log time (ns), decoded message (None if it cannot be decoded), and then why."""
-Wanted = Callable[[str, int], bool]
-"""Topic and log time (ns) of a message -> whether it is."""
 # Where a recording begins
 _MARKER = Channel("", "")
 
@@ -107,15 +105,9 @@ class BagReader:
         return min(s.span_ns[0] for s in self._sources), max(s.span_ns[1] for s in self._sources)
 
     @property
-    def recorded_spans_ns(self) -> list[tuple[int, int]]:
-        """First and last log time of each stretch that was recorded, in order; of those that overlap as one."""
-        spans: list[tuple[int, int]] = []
-        for start_ns, end_ns in sorted(source.span_ns for source in self._sources):
-            if spans and start_ns <= spans[-1][1]:
-                spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
-            else:
-                spans.append((start_ns, end_ns))
-        return spans
+    def file_spans_ns(self) -> list[tuple[int, int]]:
+        """First and last log time of each file."""
+        return [source.span_ns for source in self._sources]
 
     @property
     def span_of_each_ns(self) -> list[tuple[int, int] | None]:
@@ -145,14 +137,12 @@ class BagReader:
         streams = [self._singly(source, chosen) for source in self._sources]
         return (message for message in heapq.merge(*streams, key=itemgetter(0)) if message[1] is not _MARKER)
 
-    def batches(self, topics: Iterable[str], wanted: Wanted | None = None) -> Iterator[Batch]:
-        """Messages of these topics that are wanted, None for all, by the thousand."""
+    def batches(self, topics: Iterable[str]) -> Iterator[Batch]:
+        """Messages of these topics, by the thousand."""
         chosen = frozenset(topics)
         if len(self._sources) == 1:
-            found = self._of_source(self._sources[0], chosen)
-        else:
-            found = batched(self.raw_messages(chosen))
-        return found if wanted is None else _wanted(found, wanted)
+            return self._of_source(self._sources[0], chosen)
+        return batched(self.raw_messages(chosen))
 
     def _singly(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
         # a marker where it begins: merging opens a recording only when its time has come
@@ -218,15 +208,6 @@ class BagReader:
 
 def _unreadable(path: Path, error: OSError) -> InputError:
     return InputError(f"{path}: cannot be read ({error.strerror}); check name, permissions and disk")
-
-
-def _wanted(batches: Iterator[Batch], wanted: Wanted) -> Iterator[Batch]:
-    for batch in batches:
-        topics = {number: channel.topic for number, channel in batch.channels.items()}
-        each = zip(batch.number.tolist(), batch.log_ns.tolist(), strict=True)
-        at = [place for place, (number, log_ns) in enumerate(each) if wanted(topics[number], log_ns)]
-        if at:
-            yield batch.part(at)
 
 
 def _unpacked(batch: Batch) -> Batch:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..calibration.parameters import Parameters
     from ..calibration.results import Estimate, Result
     from ..discovery.discover import Discovery, Given
+    from ..recordings.recording import Recording
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
@@ -53,14 +54,22 @@ def add_discovery_options(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{role}-topic", metavar="TOPIC", help=help_)
 
 
-def discovered(arguments: argparse.Namespace, bags: Sequence[Path], parameters: Parameters) -> Discovery:
-    """What recordings say of topics, mounting and frames, under what the options of a command give. Raises InputError.
+def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:
+    """Recordings, read once. Raises InputError."""
+    from ..recordings.recording import open_recording
+
+    with progress("reading") as on_progress:
+        return open_recording(bags, None, parameters, on_progress)
+
+
+def discovered(arguments: argparse.Namespace, recording: Recording, parameters: Parameters) -> Discovery:
+    """What a recording says of topics, mounting and frames, under what options give. Raises InputError.
 
     parameters: as `load` made them of the same options.
     """
     from ..discovery.discover import discover
 
-    return discover(bags, parameters, given(arguments))
+    return discover(recording, parameters, given(arguments))
 
 
 def given(arguments: argparse.Namespace) -> Given:

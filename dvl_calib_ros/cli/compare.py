@@ -83,9 +83,11 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
     from ..errors import InputError
     from ..replay.replay import extrinsics_of_replay, replay
 
-    discovery = common.discovered(arguments, [path], common.load(arguments))
+    parameters = common.load(arguments)
+    recording = common.opened([path], parameters)
+    discovery = common.discovered(arguments, recording, parameters)
     with common.progress(f"replaying {name}") as on_progress:
-        replayed = replay([path], discovery.parameters, discovery.topics, on_progress, judged=False)
+        replayed = replay(recording, discovery.parameters, discovery.topics, on_progress, judged=False)
     known = {str(each) for each in replayed.findings}
     common.print_warnings([note for note in replayed.notes if note not in known])  # what is damaged or missing
     found = extrinsics_of_replay(replayed, name)

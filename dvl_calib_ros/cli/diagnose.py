@@ -81,12 +81,13 @@ def run(arguments: argparse.Namespace) -> None:
     )
     _check_twins(arguments.twin, names)
     write_report = report_writer(arguments, "write_diagnosis_report")
-    discovery = common.discovered(arguments, arguments.bags, parameters)
+    recording = common.opened(arguments.bags, parameters)
+    discovery = common.discovered(arguments, recording, parameters)
     parameters = discovery.parameters
     common.print_warnings(discovery.doubts)
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(
-            arguments.bags,
+            recording,
             common.load(arguments, DEFAULTS).replace(**discovery.values),
             discovery.topics,
             on_progress,

@@ -38,7 +38,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..examination.examine import examine
 
     common.check_outputs(arguments, "json")
-    examination = examine(arguments.bags, common.load(arguments), common.given(arguments))
+    parameters = common.load(arguments)
+    examination = examine(common.opened(arguments.bags, parameters), parameters, common.given(arguments))
     common.deliver(
         lambda: _print(examination), (arguments.json, lambda path: common.write_json(path, examination.document()))
     )

@@ -272,7 +272,7 @@ def _noise_table(study: ErrorsInVariables) -> Table:
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     from ..errors import InputError
     from ..evaluation.bags import cross_check, cross_check_document
-    from ..replay.replay import Topics
+    from ..recordings.topics import Topics
 
     if arguments.csv is not None:
         raise InputError("--csv: only for a folder of trajectories; for bags there is --json")

@@ -48,10 +48,11 @@ def run(arguments: argparse.Namespace) -> None:
     parameters = common.load(arguments)
     common.check_outputs(arguments, "json", "save", "report")
     write_report = report_writer(arguments, "write_replay_report")
-    discovery = common.discovered(arguments, arguments.bags, parameters)
+    recording = common.opened(arguments.bags, parameters)
+    discovery = common.discovered(arguments, recording, parameters)
     with common.progress("replaying") as on_progress:
         replayed = checked_replay(
-            arguments.bags,
+            recording,
             discovery.parameters,
             discovery.topics,
             on_progress,

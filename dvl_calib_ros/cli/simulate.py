@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.writer import Compression, Storage
     from ..calibration.samples import VelocityFrame
     from ..simulation.injection import injection
-    from ..simulation.recorded import Recording, notes_of
+    from ..simulation.recorded import Recording
     from ..simulation.scenario import Scenario, write_bag
     from ..simulation.sensors import DvlErrors, ImuErrors
     from ..simulation.waves import Waves
@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.motion_of, gnss_topic, imu_topic, arguments.motion_frame, arguments.motion_smoothing
     )
     if recording:
-        common.print_warnings(notes_of(recording))
+        common.print_warnings(recording.opened.notes)
     scenario = Scenario(
         trajectory=arguments.trajectory,
         seconds=arguments.duration,

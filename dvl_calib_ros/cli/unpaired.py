@@ -70,10 +70,11 @@ def _source(
     from ..unpaired.logs import Source
 
     own = argparse.Namespace(**{**vars(arguments), "params": params})
-    discovery = common.discovered(own, bags, common.load(own))
+    recording = common.opened(bags, common.load(own))
+    discovery = common.discovered(own, recording, common.load(own))
     common.print_warnings(discovery.doubts)
     parameters = common.load(own, defaults).replace(**discovery.values)
-    return Source(tuple(bags), parameters, discovery.topics), discovery
+    return Source(recording, parameters, discovery.topics), discovery
 
 
 def _print(comparison: UnpairedComparison) -> None:

@@ -14,7 +14,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from ..bags.reader import BagReader
 from ..errors import InputError
 from ..node.message_types import message_class
-from ..replay.replay import Topics
+from ..recordings.topics import Topics
 
 PATIENCE = Duration(seconds=30)
 

@@ -17,7 +17,8 @@ from ..calibration.samples import VelocityFrame
 from ..effects.base import ClockEffect, Effect, Needs
 from ..effects.registry import EFFECTS
 from ..errors import InputError
-from ..replay.replay import Topics
+from ..recordings.recording import Recording as Opened
+from ..recordings.topics import Topics
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
@@ -48,7 +49,7 @@ Triple = tuple[float, float, float]
 
 
 def diagnose(
-    paths: Sequence[Path],
+    source: Opened | Sequence[Path],
     parameters: Parameters,
     topics: Topics | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
@@ -56,7 +57,8 @@ def diagnose(
     with_series: bool = False,
 ) -> Diagnosis:
     """Diagnose bags of one vehicle. Raises InputError for what cannot be compared at all."""
-    loaded = load_recordings(paths, parameters, topics or Topics(), lambda share: on_progress(0.5 * share))
+    loaded = load_recordings(source, parameters, topics or Topics())
+    on_progress(0.5)
     diagnosis = diagnose_recordings(loaded.recordings, parameters, loaded.notes, effects, with_series)
     on_progress(1.0)
     return diagnosis

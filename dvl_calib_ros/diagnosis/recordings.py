@@ -6,15 +6,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bags.reader import BagReader
 from ..calibration.clocks import Clocks
 from ..calibration.findings import Finding
 from ..calibration.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
@@ -23,10 +21,13 @@ from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Stre
 from ..calibration.screening import SMALLEST_VARIANCE
 from ..effects.base import Needs
 from ..errors import InputError
-from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.opening import open_recordings
-from ..replay.replay import Topics, _check_topics, _of_types
+from ..recordings.check import check_topics
+from ..recordings.recorded import Recorded
+from ..recordings.recording import Recording as Opened
+from ..recordings.recording import open_recording
+from ..recordings.same import hold_the_same
+from ..recordings.topics import Topics
 from .curve import Curve
 from .settings import SETTINGS
 
@@ -209,35 +210,25 @@ class Loaded:
     notes: tuple[str, ...]
 
 
-def load_recordings(
-    paths: Sequence[Path], parameters: Parameters, topics: Topics, on_progress: Callable[[float], None] = lambda _: None
-) -> Loaded:
-    """Read every bag. Raises InputError, also for a bag without a reference velocity."""
+def load_recordings(source: Opened | Sequence[Path], parameters: Parameters, topics: Topics) -> Loaded:
+    """The recordings of every bag. Raises InputError, also for a bag without a reference velocity."""
+    paths = source.paths if isinstance(source, Opened) else source
     if len(set(paths)) < len(paths):
         raise InputError(f"{', '.join(map(str, paths))}: a bag is named twice")
+    opened = source if isinstance(source, Opened) else open_recording(source, topics, parameters)
     recordings: list[Recording] = []
     notes: list[str] = []
-    for index, (name, path) in enumerate(zip(recording_names(paths), paths, strict=True)):
-
-        def progress(share: float, index: int = index) -> None:
-            on_progress((index + share) / len(paths))
-
-        recording, own = _load(name, path, parameters, topics, progress)
-        for other, its_path in zip(recordings, paths, strict=False):
-            if _holds_much_of(recording, other):
+    known: list[Recorded] = []
+    for name, path, one in zip(recording_names(paths), paths, opened.each, strict=True):
+        streams, own = _read(path, one, parameters, topics)
+        recordings.append(_recording(name, streams, parameters, own))
+        dvl = one.recorded(topics.found_in(one.types).dvl, parameters)
+        for other, its_path in zip(known, paths, strict=False):
+            if hold_the_same(dvl, other):
                 raise InputError(f"{its_path}, {path}: hold the same samples, so neither is held out; name one of them")
-        recordings.append(recording)
+        known.append(dvl)
         notes += own if len(paths) == 1 else [f"{path}: {note}" for note in own]
     return Loaded(tuple(recordings), tuple(notes))
-
-
-def _holds_much_of(one: Recording, other: Recording) -> bool:
-    """Whether half of the DVL's samples of one of them are in the other, too."""
-    if one.first_ns != other.first_ns:
-        return False
-    _, own, its = np.intersect1d(one.dvl.time, other.dvl.time, assume_unique=True, return_indices=True)
-    shared = np.count_nonzero((one.dvl.values[own] == other.dvl.values[its]).all(axis=1))
-    return bool(2 * shared > min(len(one.dvl.time), len(other.dvl.time)))
 
 
 def recording_names(paths: Sequence[Path]) -> list[str]:
@@ -254,32 +245,18 @@ def _without_suffix(name: str) -> str:
     return next((name.removesuffix(end) for end in SUFFIXES if name.endswith(end)), name)
 
 
-def _load(
-    name: str, path: Path, parameters: Parameters, topics: Topics, on_progress: Callable[[float], None]
-) -> tuple[Recording, list[str]]:
+def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) -> tuple[Streams, list[str]]:
+    """All samples of a recording, and what the user should know of them."""
     found: list[Finding] = []
-    with open_recordings([path]) as bag:
-        chosen = topics.found_in(bag.topics)
-        _check_topics(bag, [path], chosen, found)
-        decoder = MessageDecoder(_of_types(bag, chosen, parameters))
-        streams = _read(bag, chosen, decoder, on_progress)
-        notes = [*bag.notes, *map(str, found), *map(str, decoder.problems.values())]
+    chosen = topics.found_in(opened.types)
+    check_topics(opened, chosen, found)
+    decoder = MessageDecoder(opened.of_types(chosen, parameters))
+    streams = opened.streams(chosen, decoder)
     if not len(streams.reference):
         raise InputError(
             f"{path}: no reference velocity to compare the DVL with: no messages on {topics.gnss}; set --gnss-topic"
         )
-    return _recording(name, streams, parameters, notes), notes
-
-
-def _read(bag: BagReader, topics: Topics, decoder: MessageDecoder, on_progress: Callable[[float], None]) -> Streams:
-    start_ns, end_ns = bag.span_ns
-    parts: list[Streams] = []
-    named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
-    for stretch in sample_streams(bag, named, decoder):
-        parts.append(stretch.streams)
-        on_progress((stretch.log_ns - start_ns) / max(end_ns - start_ns, 1))
-    blocks = [reduce(lambda one, other: one.joined(other), each) for each in zip(*parts, strict=True)]
-    return Streams(*blocks)
+    return streams, [*opened.notes, *map(str, found), *map(str, decoder.problems.values())]
 
 
 def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[str]) -> Recording:

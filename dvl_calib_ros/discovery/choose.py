@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
-from .survey import Look, Survey
+from ..recordings.look import Look, Survey
+from ..recordings.topics import spelled
 
 NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
@@ -50,24 +51,24 @@ def is_derived(look: Look) -> bool:
 def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, where: str) -> str:
     """A topic that was named, as the recording spells it. Raises InputError if it is not there or of another type."""
     present = survey.topics
-    spelled = next((each for each in (name, f"/{name}", name.lstrip("/")) if each in present), None)
+    there = spelled(name, present)
     wanted = set(kinds)
-    if spelled is not None and present[spelled] not in wanted:
+    if there is not None and present[there] not in wanted:
         expected = " or ".join(kinds)
-        raise InputError(f"{where}: topic {spelled} holds {present[spelled]}, expected {expected}; set {option}")
-    if spelled is None:
+        raise InputError(f"{where}: topic {there} holds {present[there]}, expected {expected}; set {option}")
+    if there is None:
         fitting = sorted(topic for topic, kind in present.items() if kind in wanted)
         near = difflib.get_close_matches(name, fitting, n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]}?" if near else f"; set {option}."
         listing = ", ".join(fitting) or "none"
         raise InputError(f"{where}: no topic {name!r}{hint} Of types that fit, the bag has: {listing}")
-    return spelled
+    return there
 
 
 def choose_dvl(survey: Survey, default: str, where: str) -> str:
     """The DVL's topic. Raises InputError if nothing in the recording is one."""
     present = survey.topics
-    standard = _spelled(default, present)
+    standard = spelled(default, present)
     if standard is not None and present[standard] in DVL_TYPES:
         return standard
     looks = [look for look in survey.looks.values() if look.msgtype in DVL_TYPES]
@@ -109,7 +110,7 @@ def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[str]:
 
 def choose_reference(survey: Survey, default: str, dvl: str, difference: Difference) -> tuple[str | None, list[str]]:
     """The reference's topic, or None; and what was passed over, in sentences."""
-    standard = _spelled(default, survey.topics)
+    standard = spelled(default, survey.topics)
     if standard is not None and survey.topics[standard] in REFERENCE_TYPES:
         return standard, []
     dvl_look = survey.looks.get(dvl)
@@ -154,7 +155,7 @@ def _rank(look: Look) -> float:
 
 def choose_imu(survey: Survey, default: str) -> str | None:
     """The IMU's topic, or None."""
-    standard = _spelled(default, survey.topics)
+    standard = spelled(default, survey.topics)
     if standard is not None and survey.topics[standard] == IMU_TYPE:
         return standard
     looks = [look for look in survey.looks.values() if look.msgtype == IMU_TYPE]
@@ -166,10 +167,6 @@ def choose_imu(survey: Survey, default: str) -> str | None:
         return (not look.has_orientation, _has(look, DVL_WORDS), "raw" in name, "filtered" in name, -look.count, name)
 
     return min(looks, key=order).topic
-
-
-def _spelled(name: str, present: Mapping[str, str]) -> str | None:
-    return next((each for each in (name, f"/{name}", name.lstrip("/")) if each in present), None)
 
 
 def _listing(survey: Survey) -> str:

@@ -22,8 +22,9 @@ from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
-from ..messages.opening import open_recordings
-from ..replay.replay import Topics
+from ..recordings.look import Look, Survey
+from ..recordings.recording import Recording, open_recording
+from ..recordings.topics import Topics
 from . import choose
 from .fit import (
     CLEARLY,
@@ -41,7 +42,6 @@ from .fit import (
     together,
     turns_right,
 )
-from .survey import Look, Survey, survey
 from .transforms import FrameTree, Placed
 
 # A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
@@ -85,7 +85,6 @@ class Discovery:
     fit: Fit | None = None
     reference_frame: VelocityFrame | None = None
     knows_imu: bool = False
-    survey: Survey | None = field(default=None, repr=False)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -98,14 +97,13 @@ class Discovery:
         return {"topics": topics, "found": list(self.found), "doubts": list(self.doubts)}
 
 
-def discover(paths: Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
-    """Look into recordings for what is not given. Raises InputError for named topics that are not there."""
-    with open_recordings(paths) as bag:
-        seen = survey(bag)
-    where = ", ".join(map(str, paths))
-    if not seen.topics:
-        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
-    return _Search(seen, parameters, given or Given(), where).run()
+def discover(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
+    """Look into a recording for what is not given. Raises InputError for named topics that are not there."""
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, parameters=parameters)
+    if not recording.types:
+        raise InputError(f"{recording.where}: the bag is empty, it has no topics; record it again")
+    return _Search(recording.survey, parameters, given or Given(), recording.where).run()
 
 
 def _in_time_of(dvl: Look, other: Look | None) -> Look | None:
@@ -149,7 +147,6 @@ class _Search:
             self._chosen,
             self._reference_frame(reference),
             self._knows_imu(imu),
-            self._seen,
         )
 
     # ------------------------------------------------------------------ topics

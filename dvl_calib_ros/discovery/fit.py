@@ -26,7 +26,7 @@ from ..calibration.frames import (
     skew,
 )
 from ..calibration.samples import VelocityFrame
-from .survey import Look, comparable
+from ..recordings.look import Look, comparable
 
 # Fewer samples, or a slower vehicle (m/s), say nothing about frames.
 ENOUGH_SAMPLES, SLOW = 12, 0.1

@@ -23,8 +23,12 @@ from ..calibration.results import Estimate
 from ..calibration.samples import AlignedBlock
 from ..errors import InputError
 from ..parallel import Workers, run_all
+from ..recordings.recorded import Recorded
+from ..recordings.recording import open_recording
+from ..recordings.same import hold_the_same
+from ..recordings.topics import Topics
 from ..replay.navigation import Navigation, dead_reckoned, navigation_document
-from ..replay.replay import Topics, replay
+from ..replay.replay import replay
 from .metrics import Moments, vrmse
 from .results import Failure
 
@@ -56,7 +60,8 @@ class _Replayed:
     """corrections: (M, 3, 3), nan where a model had no sample. moments: of the paired samples, None without.
 
     delayed: by model with a lever arm and delay, if it claims any, what it corrects. recording: all streams, thinned.
-    selected: model that was selected, and what it corrects; None if it used nothing. failed: why there is none of this.
+    selected: model that was selected, and what it corrects; None if it used nothing. dvl: its messages. failed: why
+    there is none of this.
     """
 
     corrections: Array
@@ -66,6 +71,7 @@ class _Replayed:
     delayed: Mapping[str, Terms]
     recording: Recording | None
     selected: tuple[str, Terms | None]
+    dvl: Recorded | None = None
     failed: tuple[str, ...] = ()
 
 
@@ -97,9 +103,9 @@ def cross_check(
                 for name in set(other.delayed) & set(models):
                     terms = other.delayed[name]
                     corrected[calibrated, models.index(name), verified] = _delayed_rmse(each, terms, parameters)
-    for first, second in combinations(range(len(bags)), 2):
-        if found[first].n_paired == found[second].n_paired and 0.0 < uncorrected[first] == uncorrected[second]:
-            raise InputError(f"{bags[first]}, {bags[second]}: are one bag by two names; name others to check it on")
+    for (first, one), (second, other) in combinations(zip(bags, found, strict=True), 2):
+        if one.dvl is not None and other.dvl is not None and hold_the_same(one.dvl, other.dvl):
+            raise InputError(f"{first}, {second}: are one bag by two names; name others to check it on")
     return CrossCheck(
         bags=tuple(map(str, bags)),
         models=tuple(models),
@@ -156,7 +162,7 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], topics: To
         raise
     except Exception as error:
         failed = f"failed, and is in none of the figures: {Failure.of(error, 'replay')}"
-        return _Replayed(np.full((len(models), 3, 3), np.nan), None, 0, (), {}, None, ("-", None), (failed,))
+        return _Replayed(np.full((len(models), 3, 3), np.nan), None, 0, (), {}, None, ("-", None), failed=(failed,))
 
 
 def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:
@@ -180,7 +186,8 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
         if calibrator.recording is not None:
             kept.append(calibrator.recording[0])
 
-    replayed = replay([bag], parameters, topics, on_rows=keep_paired, on_restart=forget, on_finished=keep_recording)
+    opened = open_recording([bag], topics, parameters)
+    replayed = replay(opened, parameters, topics, on_rows=keep_paired, on_restart=forget, on_finished=keep_recording)
     corrections = np.full((len(models), 3, 3), np.nan)
     for index, name in enumerate(models):
         estimate = replayed.result.estimates[name]
@@ -196,7 +203,8 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
         if (found := result.estimates[name]).used and any(found.state_of(beyond) for beyond in BEYOND)
     }
     selected = result.selected, _terms(result.estimate) if result.estimate.used else None
-    return _Replayed(corrections, moments, n_paired, replayed.notes, delayed, kept[0] if kept else None, selected)
+    dvl = opened.recorded(topics.found_in(opened.types).dvl, parameters)
+    return _Replayed(corrections, moments, n_paired, replayed.notes, delayed, kept[0] if kept else None, selected, dvl)
 
 
 # States of a lever arm and a delay

@@ -10,7 +10,7 @@ from ..calibration.findings import Finding
 from ..calibration.frames import Array
 from ..calibration.parameters import SCHEMA
 from ..messages.drivers import VELOCITY_TYPES
-from .columns import Recorded
+from ..recordings.recorded import Recorded
 from .kinds import named
 
 SECOND_NS = 1_000_000_000

@@ -17,9 +17,10 @@ from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
 from ..discovery.fit import FITS
 from ..messages.drivers import VELOCITY_TYPES
-from ..messages.opening import open_recordings
+from ..recordings.look import Look
+from ..recordings.recorded import Recorded
+from ..recordings.recording import Recording, open_recording
 from . import checks
-from .columns import Recorded, recorded
 from .kinds import named
 
 # A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
@@ -112,40 +113,37 @@ class Examination:
         }
 
 
-def examine(paths: Sequence[Path], parameters: Parameters, given: Given | None = None) -> Examination:
+def examine(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Examination:
     """Look at everything. Raises InputError for what is no recording or has no DVL."""
-    discovery = discover(paths, parameters, given)
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, parameters=parameters)
+    discovery = discover(recording, parameters, given)
     topics = discovery.topics
-    with open_recordings(paths) as bag:
-        types = bag.topics
-        wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
-        there = {role: name for role, name in wanted.items() if name in types}
-        columns = recorded(bag, sorted(there.values()), discovery.parameters)
-        start_ns, end_ns = bag.span_ns
-        counts = bag.message_counts
-        notes = tuple(bag.notes)
-    streams = {role: columns[name] for role, name in there.items()}
+    wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
+    there = {role: name for role, name in wanted.items() if name in recording.types}
+    looks = {role: recording.survey.looks.get(name) for role, name in there.items()}
+    start_ns, end_ns = recording.span_ns
+    streams = {role: recording.recorded(name, discovery.parameters) for role, name in there.items()}
     seconds = 1e-9 * (end_ns - start_ns)
-    velocity = _body_velocity(streams["dvl"], discovery)
+    velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
     usable = not any(found.code == "DOCTOR_NO_ORIENTATION" for found in findings)
     return Examination(
-        tuple(paths),
+        recording.paths,
         seconds,
         tuple(
-            _content(role, topic, discovery, counts[topic.topic] / seconds if seconds else 0.0)
+            _content(role, topic, looks[role], recording.counts[topic.topic] / seconds if seconds else 0.0)
             for role, topic in streams.items()
         ),
         discovery,
         tuple(findings),
         float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
         tuple(_shown(velocity, streams, discovery.parameters)) if usable else (),
-        notes,
+        recording.notes,
     )
 
 
-def _content(role: str, topic: Recorded, discovery: Discovery, rate_hz: float) -> Content:
-    look = discovery.survey.looks.get(topic.topic) if discovery.survey else None
+def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:
     variances = topic.variances[np.isfinite(topic.variances).all(axis=1)]
     if role == "imu":
         covariance = ""
@@ -159,12 +157,10 @@ def _content(role: str, topic: Recorded, discovery: Discovery, rate_hz: float) -
     return Content(name, topic.topic, topic.msgtype, len(topic), rate_hz, frame_id, covariance)
 
 
-def _body_velocity(dvl: Recorded, discovery: Discovery) -> Array:
+def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> Array:
     """The DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
-    parameters = discovery.parameters
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
-    look = discovery.survey.looks.get(dvl.topic) if discovery.survey else None
     suffix = "" if look is None else look.frame_id.lower().rpartition("_")[2]
     by_message = suffix == "frd" or (VELOCITY_TYPES[dvl.msgtype].points_down and suffix != "flu")
     turned = by_message if parameters.dvl_axes == FROM_MESSAGE else parameters.dvl_axes == FRD

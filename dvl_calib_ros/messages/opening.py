@@ -48,7 +48,7 @@ def recognised(name: str, fields: Collection[str]) -> VelocityType | None:
     return None if like is None else add_type(name, like)
 
 
-def open_recordings(paths: Sequence[Path]) -> BagReader:
+def open_bags(paths: Sequence[Path]) -> BagReader:
     """A reader of recordings whose types are recognised. Raises InputError for what is no bag."""
     bag = BagReader(paths, KNOWN_DEFINITIONS)
     for topic, name in bag.topics.items():

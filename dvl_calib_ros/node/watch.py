@@ -23,7 +23,7 @@ from rich.table import Table
 from ..calibration.correction import NOT_ESTIMATED
 from ..demo.player import BagPlayer
 from ..files.parameter_files import NODE_NAME
-from ..replay.replay import Topics
+from ..recordings.topics import Topics
 from .answering import AnsweringNode
 from .calibration_node import QUEUE
 

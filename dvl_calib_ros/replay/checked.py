@@ -21,8 +21,9 @@ from ..calibration.parameters import Parameters
 from ..calibration.verification import Word
 from ..errors import InputError
 from ..files.extrinsics import load_extrinsics
-from ..messages.opening import open_recordings
-from .replay import Replayed, Topics, extrinsics_of_replay, replay
+from ..recordings.recording import Recording, open_recording, together
+from ..recordings.topics import Topics
+from .replay import Replayed, extrinsics_of_replay, replay
 
 # Files of one recording may overlap by what was on its way when the next began.
 OVERLAP_NS = 10_000_000_000
@@ -86,7 +87,7 @@ def _decapitalised(sentence: str) -> str:
 
 
 def checked_replay(
-    paths: Sequence[Path],
+    recording: Recording | Sequence[Path],
     parameters: Parameters,
     topics: Topics | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
@@ -99,16 +100,19 @@ def checked_replay(
     merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
     What `initial_calibration` says is left out, and said to be, if the data contradict it. Raises InputError.
     """
+    topics = topics or Topics()
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, topics, parameters)
     recordings = None
-    parts = max(1, len(paths)) if len(paths) > 1 else 0
+    parts = len(recording.each) if len(recording.each) > 1 else 0
     total = parts + 1 + bool(parameters.initial_calibration)
 
     def progress_of(index: int) -> Callable[[float], None]:
         return lambda share: on_progress((index + share) / total)
 
-    if len(paths) > 1:
-        recordings = _each_by_itself(paths, parameters, topics or Topics(), progress_of)
-    replayed = _with_fitting_start(paths, parameters, topics, progress_of, parts, with_history)
+    if parts:
+        recordings = _each_by_itself(recording, parameters, topics, progress_of)
+    replayed = _with_fitting_start(recording, parameters, topics, progress_of, parts, with_history)
     return replayed if recordings is None else _judged(replayed, recordings, merge)
 
 
@@ -116,7 +120,7 @@ def checked_replay(
 
 
 class _Bag(NamedTuple):
-    path: Path
+    recording: Recording
     name: str
     from_ns: int
     to_ns: int
@@ -124,10 +128,10 @@ class _Bag(NamedTuple):
 
 
 def _each_by_itself(
-    paths: Sequence[Path], parameters: Parameters, topics: Topics, progress_of: Callable[[int], Callable[[float], None]]
+    recording: Recording, parameters: Parameters, topics: Topics, progress_of: Callable[[int], Callable[[float], None]]
 ) -> Recordings:
     """Calibrate with each recording alone, without any initial calibration."""
-    bags = _bags(paths, topics)
+    bags = _bags(recording, topics)
     alone = parameters.replace(initial_calibration="")
     found: list[Extrinsics] = []
     unchecked: list[str] = []
@@ -140,7 +144,9 @@ def _each_by_itself(
         if len(groups) == 1 or not any(bag.has_dvl for bag in group):
             continue
         try:
-            replayed = replay([bag.path for bag in group], alone, topics, progress_of(index), judged=False)
+            replayed = replay(
+                together([bag.recording for bag in group]), alone, topics, progress_of(index), judged=False
+            )
         except InputError:  # too little of the DVL to be a calibration; all together will say what is wrong with it
             unchecked.append(name)
             continue
@@ -162,17 +168,15 @@ def _each_by_itself(
     return Recordings(comparison, tuple(unchecked), overlapping, pauses_ns, number)
 
 
-def _bags(paths: Sequence[Path], topics: Topics) -> list[_Bag]:
+def _bags(recording: Recording, topics: Topics) -> list[_Bag]:
     """In order of time; those without any message are left out."""
-    short = [path.name or str(path) for path in paths]
-    names = short if len(set(short)) == len(short) else list(map(str, paths))
+    short = [path.name or str(path) for path in recording.paths]
+    names = short if len(set(short)) == len(short) else list(map(str, recording.paths))
     bags = []
-    for path, name in zip(paths, names, strict=True):
-        with open_recordings([path]) as bag:
-            if not bag.topics:
-                continue
-            has_dvl = bag.message_counts[topics.found_in(bag.topics).dvl] > 0
-            bags.append(_Bag(path, name, *bag.span_ns, has_dvl))
+    for own, name in zip(recording.each, names, strict=True):
+        if own.types:
+            has_dvl = own.counts[topics.found_in(own.types).dvl] > 0
+            bags.append(_Bag(own, name, *own.span_ns, has_dvl))
     return sorted(bags, key=lambda bag: bag.from_ns)
 
 
@@ -245,20 +249,20 @@ def _without_pauses(
 
 
 def _with_fitting_start(
-    paths: Sequence[Path],
+    recording: Recording,
     parameters: Parameters,
-    topics: Topics | None,
+    topics: Topics,
     progress_of: Callable[[int], Callable[[float], None]],
     first: int,
     with_history: bool,
 ) -> Replayed:
     """Replay from `initial_calibration`, unless the data alone contradict it; then from nothing, with a finding."""
     saved = parameters.initial_calibration
-    replayed = replay(paths, parameters, topics, progress_of(first), with_history=with_history)
+    replayed = replay(recording, parameters, topics, progress_of(first), with_history=with_history)
     if not saved:
         return replayed
     alone = replay(
-        paths, parameters.replace(initial_calibration=""), topics, progress_of(first + 1), with_history=with_history
+        recording, parameters.replace(initial_calibration=""), topics, progress_of(first + 1), with_history=with_history
     )
     found = extrinsics_of_replay(alone, "these data")
     contradiction = None if found is None else _contradiction(load_extrinsics(Path(saved), saved), found)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..bags.reader import BagReader
 from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
@@ -31,33 +30,17 @@ from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..calibration.verification import verification_document
 from ..errors import InputError
 from ..files.result_file import days_document, estimate_document, load_initial_calibration
-from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
-from ..messages.opening import open_recordings
+from ..messages.drivers import TWIST_TYPE
+from ..recordings.check import check_topics
+from ..recordings.recording import Recording, open_recording
+from ..recordings.topics import Topics
 from .clocks import StreamClocks
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
 BLOCK_SIZE = 2048
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Topic names; the node's by default."""
-
-    dvl: str = "dvl/twist"
-    gnss: str = "gnss/twist"
-    imu: str = "imu/data"
-
-    def found_in(self, present: dict[str, str]) -> Topics:
-        """These topics as the bag spells them: with or without a leading slash."""
-        return Topics(*(_spelled(name, present) for name in (self.dvl, self.gnss, self.imu)))
-
-
-def _spelled(name: str, present: dict[str, str]) -> str:
-    return next((spelling for spelling in (name, f"/{name}", name.lstrip("/")) if spelling in present), name)
 
 
 @dataclass(frozen=True)
@@ -92,7 +75,7 @@ class Replayed:
 
 
 def replay(
-    paths: Sequence[Path],
+    recording: Recording | Sequence[Path],
     parameters: Parameters,
     topics: Topics | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
@@ -103,7 +86,7 @@ def replay(
     on_restart: Callable[[], None] = lambda: None,
     on_finished: Callable[[Calibrator], None] = lambda _: None,
 ) -> Replayed:
-    """Calibrate with the bags at `paths`, read as one in order of log time.
+    """Calibrate with a recording, or with bags, read as one in order of log time.
 
     on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way, else on_rows is
     given the aligned rows, and on_restart told, as by `Calibrator`. judged: say what it is worth on data held out, its
@@ -113,34 +96,35 @@ def replay(
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
     topics = topics or Topics()
-    prior = reference_prior(paths, parameters, topics) if parameters.prior_source == "reference" else None
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, topics, parameters)
+    chosen = topics.found_in(recording.types)
     found: list[Finding] = []
     events: list[str] = []
     if parameters.prior_source == "initial_window":
         found.append(finding("PRIOR_HOLDS_ERROR"))
-    with open_recordings(paths) as bag:
-        chosen = topics.found_in(bag.topics)
-        _check_topics(bag, paths, chosen, found)
-        recorder = Recorder(parameters, bag.message_counts[chosen.dvl]) if with_history else None
-        calibrator = Calibrator(
-            _of_types(bag, chosen, parameters),
-            prior_sway_heave=prior,
-            initial=initial,
-            block_size=BLOCK_SIZE,
-            on_event=events.append,
-            on_rows=recorder.take if recorder else on_rows,
-            on_restart=recorder.start if recorder else on_restart,
-            verified=judged,
-            trace=recorder.trace if recorder else None,
-            recordings_ns=_between(bag),
-        )
-        decoder = MessageDecoder(calibrator.parameters)
-        clocks = _feed_all(bag, chosen, decoder, calibrator, on_progress)
-        calibrator.finish()
-        on_finished(calibrator)
-        found += decoder.problems.values()
-        result = calibrator.result()
-        result = replace(result, days=_named(result.days, paths, bag))
+    check_topics(recording, chosen, found)
+    of_types = recording.of_types(chosen, parameters)
+    recorder = Recorder(parameters, recording.counts[chosen.dvl]) if with_history else None
+    calibrator = Calibrator(
+        of_types,
+        prior_sway_heave=reference_prior(recording, of_types, chosen) if of_types.prior_source == "reference" else None,
+        initial=initial,
+        block_size=BLOCK_SIZE,
+        on_event=events.append,
+        on_rows=recorder.take if recorder else on_rows,
+        on_restart=recorder.start if recorder else on_restart,
+        verified=judged,
+        trace=recorder.trace if recorder else None,
+        recordings_ns=_between(recording),
+    )
+    decoder = MessageDecoder(calibrator.parameters)
+    clocks = _feed_all(recording, chosen, decoder, calibrator, on_progress)
+    calibrator.finish()
+    on_finished(calibrator)
+    found += decoder.problems.values()
+    result = calibrator.result()
+    result = replace(result, days=_named(result.days, recording))
     found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
@@ -153,7 +137,7 @@ def replay(
                 for name, verification in result.verifications.items()
             },
         ),
-        (*bag.notes, *events, *map(str, found)),
+        (*recording.notes, *events, *map(str, found)),
         tuple(found),
         decoder.dvl_frame or "dvl_link",
         history,
@@ -164,24 +148,24 @@ def replay(
     )
 
 
-def _between(bag: BagReader) -> list[int]:
+def _between(recording: Recording) -> list[int]:
     """Log times between one recording and the next."""
     between = []
     until_ns: int | None = None
-    for start_ns, end_ns in sorted(span for span in bag.span_of_each_ns if span is not None):
+    for start_ns, end_ns in sorted(span for span in recording.path_spans_ns if span is not None):
         if until_ns is not None and start_ns > until_ns:
             between.append((until_ns + start_ns) // 2)
         until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
     return between
 
 
-def _named(days: Sequence[Day], paths: Sequence[Path], bag: BagReader) -> tuple[Day, ...]:
+def _named(days: Sequence[Day], recording: Recording) -> tuple[Day, ...]:
     """Days by the recording that each began with, where there is one for each; else by their dates."""
     names = []
     for day in days:
         own = [
             path.name
-            for path, span_ns in zip(paths, bag.span_of_each_ns, strict=True)
+            for path, span_ns in zip(recording.paths, recording.path_spans_ns, strict=True)
             if span_ns is not None and span_ns[0] - SHORTEST_PAUSE_NS <= day.first_ns <= span_ns[1]
         ]
         names.append(own[0] if own else "")
@@ -206,66 +190,17 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
     )
 
 
-def _of_types(bag: BagReader, topics: Topics, parameters: Parameters) -> Parameters:
-    """The parameters with the message types that the bag has on these (checked) topics."""
-    types = bag.topics
-    return parameters.replace(dvl_type=types[topics.dvl], gnss_type=types.get(topics.gnss, parameters.gnss_type))
-
-
-def _check_topics(bag: BagReader, paths: Sequence[Path], topics: Topics, found: list[Finding]) -> None:
-    present = bag.topics
-    where = ", ".join(map(str, paths))
-    if not present:
-        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
-    if len({topics.dvl, topics.gnss, topics.imu}) < 3:
-        raise InputError("--dvl-topic, --gnss-topic and --imu-topic must be different topics")
-    if topics.dvl not in present:
-        listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
-        option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
-        raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
-    _check_types(bag, where, topics, found)
-    if not bag.message_counts[topics.dvl]:
-        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
-    if topics.gnss not in present:
-        found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
-
-
-def _check_types(bag: BagReader, where: str, topics: Topics, found: list[Finding]) -> None:
-    for role, wanted in _WANTED.items():
-        name = getattr(topics, role)
-        types = bag.types_of(name)
-        if types - wanted:
-            held, expected = " and ".join(sorted(types)), " or ".join(wanted)
-            raise InputError(f"{where}: topic {name} holds {held}, expected {expected}; set --{role}-topic")
-        if len(types) > 1:
-            raise InputError(
-                f"{where}: topic {name} holds {' and '.join(sorted(types))}; replay bags of one type together"
-            )
-        if bag.lacks_definition(name):
-            found.append(finding("BAG_NO_DEFINITION", type=types.pop()))
-
-
-_WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
-
-
-def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
-    """Topics that may be the DVL's: of a type that only DVLs have, else with dvl in the name, else of any fitting."""
-    fitting = sorted(name for name, kind in present.items() if kind in DVL_TYPES and name != topics.gnss)
-    only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
-    return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
-
-
 def _feed_all(
-    bag: BagReader,
+    recording: Recording,
     topics: Topics,
     decoder: MessageDecoder,
     calibrator: Calibrator,
     on_progress: Callable[[float], None],
 ) -> StreamClocks:
-    start_ns, end_ns = bag.span_ns
+    start_ns, end_ns = recording.span_ns
     clocks = StreamClocks()
     streams = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
-    for stretch in sample_streams(bag, streams, decoder):
+    for stretch in recording.stretches(streams, decoder):
         calibrator.feed(stretch.streams)
         clocks.add(stretch.streams)
         on_progress((stretch.log_ns - start_ns) / max(end_ns - start_ns, 1))
@@ -273,7 +208,7 @@ def _feed_all(
     return clocks
 
 
-def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topics) -> tuple[float, float]:
+def reference_prior(recording: Recording, parameters: Parameters, topics: Topics) -> tuple[float, float]:
     """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError.
 
     A velocity in an earth frame is turned by the attitude that came last before it.
@@ -281,28 +216,23 @@ def reference_prior(paths: Sequence[Path], parameters: Parameters, topics: Topic
     velocities: list[Array] = []
     first_ns: int | None = None
     attitude = no_samples(Stream.IMU)
-    with open_recordings(paths) as bag:
-        chosen = topics.found_in(bag.topics)
-        _check_topics(bag, paths, chosen, [])
-        decoder = MessageDecoder(_of_types(bag, chosen, parameters))
-        for stretch in sample_streams(bag, {chosen.gnss: Stream.REFERENCE, chosen.imu: Stream.IMU}, decoder):
-            _, reference, imu = stretch.streams
-            given = (imu.refused == 0) & ~np.isnan(unit_quaternions(imu.orientation)[:, 0])
-            attitude = attitude.joined(imu.part(given))
-            reference = reference.part(
-                (reference.refused == 0) & are_valid_velocities(reference.values, parameters.max_speed)
-            )
-            if not len(reference):
-                continue
-            first_ns = int(reference.stamps_ns[0]) if first_ns is None else first_ns
-            over = reference.stamps_ns - first_ns >= parameters.prior_window * 1e9
-            is_over = bool(over.any())
-            velocities.append(
-                _in_body(reference.part(slice(int(np.argmax(over))) if is_over else slice(None)), attitude)
-            )
-            if is_over:
-                break
-            attitude = attitude.part(slice(-1, None))
+    decoder = MessageDecoder(parameters)
+    for stretch in recording.stretches({topics.gnss: Stream.REFERENCE, topics.imu: Stream.IMU}, decoder):
+        _, reference, imu = stretch.streams
+        given = (imu.refused == 0) & ~np.isnan(unit_quaternions(imu.orientation)[:, 0])
+        attitude = attitude.joined(imu.part(given))
+        reference = reference.part(
+            (reference.refused == 0) & are_valid_velocities(reference.values, parameters.max_speed)
+        )
+        if not len(reference):
+            continue
+        first_ns = int(reference.stamps_ns[0]) if first_ns is None else first_ns
+        over = reference.stamps_ns - first_ns >= parameters.prior_window * 1e9
+        is_over = bool(over.any())
+        velocities.append(_in_body(reference.part(slice(int(np.argmax(over))) if is_over else slice(None)), attitude))
+        if is_over:
+            break
+        attitude = attitude.part(slice(-1, None))
     mean = np.concatenate([*velocities, np.zeros((0, 3))])
     if not len(mean):
         raise InputError(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -16,11 +17,11 @@ from ..calibration.parameters import Parameters
 from ..calibration.samples import FRAME_CODES, Codes, Index, SampleBlock, Stamps, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..errors import InputError
-from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES
-from ..messages.opening import open_recordings
-from ..replay.replay import Topics
+from ..recordings.recording import Recording as Opened
+from ..recordings.recording import open_recording
+from ..recordings.topics import Topics
 from .trajectories import Motion
 
 # Across longer gaps nothing is known of the motion
@@ -43,6 +44,16 @@ class Recording:
     imu_topic: str = "imu/data"
     gnss_frame: str = "from_frame_id"
     smoothing: float = 1.0
+
+    @property
+    def topics(self) -> Topics:
+        """Where reference and IMU are."""
+        return Topics(gnss=self.gnss_topic, imu=self.imu_topic)
+
+    @cached_property
+    def opened(self) -> Opened:
+        """What is recorded. Raises InputError."""
+        return open_recording([self.path], self.topics)
 
 
 @dataclass(frozen=True)
@@ -76,26 +87,18 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
     return Motion(time, on_grid, rotation.as_matrix(), spline(at, 1))
 
 
-def notes_of(recording: Recording) -> list[str]:
-    """What of the recording is damaged or missing, in words."""
-    with open_recordings([recording.path]) as bag:
-        for _ in bag.raw_messages(bag.topics):
-            pass
-        return list(bag.notes)
-
-
 def _read(recording: Recording) -> _Samples:
-    with open_recordings([recording.path]) as bag:
-        topics = Topics(gnss=recording.gnss_topic, imu=recording.imu_topic).found_in(bag.topics)
-        _check_topics(recording, topics, bag.topics)
-        parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=bag.topics[topics.gnss])
-        decoder = MessageDecoder(parameters)
-        references, attitudes = [no_samples(Stream.REFERENCE)], [no_samples(Stream.IMU)]
-        for stretch in sample_streams(bag, {topics.gnss: Stream.REFERENCE, topics.imu: Stream.IMU}, decoder):
-            _, reference, imu = stretch.streams
-            valid = are_valid_velocities(reference.values, parameters.max_speed)
-            references.append(reference.part((reference.refused == 0) & valid))
-            attitudes.append(imu.part((imu.refused == 0) & ~np.isnan(unit_quaternions(imu.orientation)[:, 0])))
+    opened = recording.opened
+    topics = recording.topics.found_in(opened.types)
+    _check_topics(recording, topics, opened.types)
+    parameters = Parameters(gnss_frame=recording.gnss_frame, gnss_type=opened.types[topics.gnss])
+    decoder = MessageDecoder(parameters)
+    references, attitudes = [no_samples(Stream.REFERENCE)], [no_samples(Stream.IMU)]
+    for stretch in opened.stretches({topics.gnss: Stream.REFERENCE, topics.imu: Stream.IMU}, decoder):
+        _, reference, imu = stretch.streams
+        valid = are_valid_velocities(reference.values, parameters.max_speed)
+        references.append(reference.part((reference.refused == 0) & valid))
+        attitudes.append(imu.part((imu.refused == 0) & ~np.isnan(unit_quaternions(imu.orientation)[:, 0])))
     velocity_ns, at = _last_of_each(references)
     attitude_ns, attitude_at = _last_of_each(attitudes)
     for what, stamps_ns in ((recording.gnss_topic, velocity_ns), (recording.imu_topic, attitude_ns)):
@@ -121,7 +124,7 @@ def _last_of_each(blocks: Sequence[SampleBlock]) -> tuple[Stamps, Index]:
     return found, len(stamps_ns) - 1 - from_the_end
 
 
-def _check_topics(recording: Recording, topics: Topics, present: dict[str, str]) -> None:
+def _check_topics(recording: Recording, topics: Topics, present: Mapping[str, str]) -> None:
     for name, types in ((topics.gnss, tuple(REFERENCE_TYPES)), (topics.imu, (IMU_TYPE,))):
         if present.get(name) not in types:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(present.items())) or "none"

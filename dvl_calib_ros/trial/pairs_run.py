@@ -22,7 +22,8 @@ from scipy.stats import binomtest
 from ..calibration.parameters import Parameters
 from ..errors import InputError
 from ..files.atomic import save_text
-from ..replay.replay import Topics
+from ..recordings.recording import open_recording
+from ..recordings.topics import Topics
 from .pairs import make_pair, pair_id
 from .run import read_answers
 from .scored import NOT_SCORED_PARAMETERS
@@ -41,7 +42,7 @@ def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[flo
 
     def source(side: str, path: Path) -> Source:
         roll, pitch, yaw = mounting[side]
-        return Source((path,), Parameters(min_speed=0.0, mounting_rpy=(roll, pitch, yaw)), Topics())
+        return Source(open_recording([path]), Parameters(min_speed=0.0, mounting_rpy=(roll, pitch, yaw)), Topics())
 
     return unpaired_document(compare(source("vehicle", vehicle), source("simulator", simulator)))
 

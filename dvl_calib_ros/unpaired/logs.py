@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +17,8 @@ from ..diagnosis.selection import Selection
 from ..diagnosis.twin import simulated, with_quiet_reference
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
-from ..replay.replay import Topics
+from ..recordings.recording import Recording as Opened
+from ..recordings.topics import Topics
 from .stream_facts import StreamFacts, stream_facts
 
 # No DVL is so quiet (m/s): its resolution is 1 mm/s. One that is, is the simulator's truth
@@ -31,9 +31,9 @@ COPIED = 0.3
 
 @dataclass(frozen=True)
 class Source:
-    """Bags of one side, and how to read them."""
+    """What was recorded on one side, and how to read it."""
 
-    paths: tuple[Path, ...]
+    opened: Opened
     parameters: Parameters
     topics: Topics
 
@@ -66,8 +66,8 @@ def read_log(
     with_series: bool = False,
 ) -> Log:
     """Read and diagnose one side. Raises InputError for what cannot be compared at all."""
-    loaded = load_recordings(source.paths, source.parameters, source.topics, lambda share: on_progress(0.4 * share))
-    facts = tuple(stream_facts(path, source.parameters, source.topics) for path in source.paths)
+    loaded = load_recordings(source.opened, source.parameters, source.topics)
+    facts = tuple(stream_facts(each, source.parameters, source.topics) for each in source.opened.each)
     on_progress(0.5)
     exact = all(float(np.linalg.norm(one.dvl.roughness)) < NOISE_FREE_MPS for one in loaded.recordings)
     recordings = tuple(dithered(one) for one in loaded.recordings) if exact else loaded.recordings

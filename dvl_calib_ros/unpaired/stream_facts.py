@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bags.columns import windows
-from ..bags.reader import BagReader
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
-from ..calibration.samples import SampleBlock, Stream
+from ..calibration.samples import SampleBlock, Stamps
 from ..diagnosis.recordings import zeros_while_moving
-from ..messages.columns import sample_streams
 from ..messages.decode import MessageDecoder
-from ..messages.opening import open_recordings
-from ..replay.replay import Topics, _of_types
+from ..recordings.recording import Recording
+from ..recordings.topics import Topics
 
 # Log times further from the stamps belong to another clock (simulated time beside the host's) and say no latency, s
 OTHER_CLOCK_S = 60.0
@@ -52,26 +47,15 @@ class StreamFacts:
         return float(np.median(self.steps)) if len(self.steps) else np.nan
 
 
-def stream_facts(path: Path, parameters: Parameters, topics: Topics) -> StreamFacts:
-    """Read the DVL's stream of a bag once more, with log times. Raises InputError."""
-    with open_recordings([path]) as bag:
-        chosen = topics.found_in(bag.topics)
-        decoder = MessageDecoder(_of_types(bag, chosen, parameters))
-        log_ns = _log_times(bag, chosen.dvl)
-        named = {chosen.dvl: Stream.DVL, chosen.gnss: Stream.REFERENCE}
-        streams = [stretch.streams for stretch in sample_streams(bag, named, decoder)]
-    dvl = reduce(SampleBlock.joined, [each.dvl for each in streams])
-    reference = reduce(SampleBlock.joined, [each.reference for each in streams])
-    return facts_of(dvl, reference, log_ns)
+def stream_facts(recording: Recording, parameters: Parameters, topics: Topics) -> StreamFacts:
+    """Of the DVL's stream of one recording, with log times."""
+    chosen = topics.found_in(recording.types)
+    streams = recording.streams(chosen, MessageDecoder(recording.of_types(chosen, parameters)))
+    (columns,) = recording.columns[chosen.dvl]
+    return facts_of(streams.dvl, streams.reference, columns.arrivals[1])
 
 
-def _log_times(bag: BagReader, topic: str) -> Array:
-    parts = [part for window in windows(bag, [topic], [topic]) for part in window.parts]
-    arrival, log_ns = (np.concatenate([getattr(p, name) for p in parts]) for name in ("arrival", "log_ns"))
-    return np.asarray(log_ns[np.argsort(arrival, kind="stable")])
-
-
-def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Array) -> StreamFacts:
+def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> StreamFacts:
     """From all messages of a DVL and of its reference, each in order of arrival; log_ns: (N,) of the DVL's."""
     refused = dvl.refused > 0
     order = np.argsort(reference.stamps_ns, kind="stable")

@@ -35,10 +35,10 @@ from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.trajectories import read_columns
 from dvl_calib_ros.files.urdf import read_urdf
 from dvl_calib_ros.files.yaml_files import parse_scalar
-from dvl_calib_ros.messages.columns import sample_streams
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.recordings.recording import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
@@ -124,9 +124,8 @@ def run_columns(data: bytes) -> None:
     path = _file("columns.mcap", mcap_bytes(messages))
     found, singly = [], []
     decoder = MessageDecoder(Parameters())
-    with BagReader([path]) as bag:
-        for stretch in sample_streams(bag, topics, decoder):
-            found += [(stream, isinstance(each, str)) for stream, each in stretch.streams.in_order()]
+    for stretch in open_recording([path]).stretches(topics, decoder):
+        found += [(stream, isinstance(each, str)) for stream, each in stretch.streams.in_order()]
     decoder = MessageDecoder(Parameters())
     take = {"dvl/twist": decoder.dvl, "gnss/twist": decoder.reference, "imu/data": decoder.imu}
     with BagReader([path]) as bag:

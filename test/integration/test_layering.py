@@ -19,10 +19,11 @@ MAY_IMPORT = {
     "effects": {"calibration", "errors"},
     "bags": {"files", "errors"},
     "messages": {"bags", "calibration", "errors"},
+    "recordings": {"bags", "messages", "calibration", "errors"},
     "files": {"bags", "messages", "calibration", "errors"},
-    "diagnosis": {"bags", "messages", "replay", "effects", "calibration", "errors"},
+    "diagnosis": {"recordings", "messages", "effects", "calibration", "errors"},
     "export": {"files", "effects", "calibration", "errors"},
-    "unpaired": {"diagnosis", "bags", "messages", "replay", "effects", "calibration", "errors"},
+    "unpaired": {"diagnosis", "recordings", "messages", "effects", "calibration", "errors"},
     "report": {"unpaired", "diagnosis", "evaluation", "replay", "files", "effects", "calibration", "errors"},
 }
 WIRING = {"cli", "node", "demo"}

@@ -35,8 +35,8 @@ def words(text: str) -> Counter[str]:
 def folder(tmp_path_factory):
     """Two bags, and the result of the first."""
     folder = tmp_path_factory.mktemp("narrow")
-    for name, seconds in (("one", 15.0), ("two", 16.0)):
-        write_bag(folder / name, run(seconds))
+    for name, seconds, later_ns in (("one", 15.0, 0), ("two", 16.0, 10**12)):
+        write_bag(folder / name, [each._replace(stamp_ns=each.stamp_ns + later_ns) for each in run(seconds)])
     document = result_document(replayed(folder / "one").result)
     (folder / "result.yaml").write_text(result_text(document))
     return folder

@@ -329,19 +329,3 @@ def test_the_topics_of_a_bag_are_listed_with_their_types_and_counts(plain):
     with BagReader([plain, plain]) as bag:
         assert bag.topics == TOPICS
         assert sum(bag.message_counts.values()) == 2 * len(run())
-
-
-def test_messages_that_are_not_wanted_are_left_out(tmp_path):
-    bag = write_bag(tmp_path / "bag", run())
-    asked: list[str] = []
-
-    def every_tenth(topic: str, log_ns: int) -> bool:
-        asked.append(topic)
-        return asked.count(topic) % 10 == 1
-
-    with BagReader([bag]) as reader:
-        batches = reader.batches(["dvl/twist", "imu/data"], every_tenth)
-        wanted = [channel.topic for batch in batches for _, channel, _ in batch.messages()]
-        counts = reader.message_counts
-    assert wanted.count("dvl/twist") == -(-counts["dvl/twist"] // 10)
-    assert asked.count("imu/data") == counts["imu/data"]

@@ -27,7 +27,7 @@ from dvl_calib_ros.diagnosis.results import FoundEffect, Verdict, diagnosis_docu
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.replay.replay import Topics
+from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Run, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

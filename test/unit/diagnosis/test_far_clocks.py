@@ -14,7 +14,7 @@ from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.far_clocks import STEP_S, check_clocks, lag
 from dvl_calib_ros.diagnosis.recordings import Recording, load_recordings, make_recording
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.replay.replay import Topics
+from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

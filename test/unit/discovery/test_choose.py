@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.discovery.choose import choose_dvl, choose_imu, choose_reference
-from dvl_calib_ros.discovery.survey import Look, Survey
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
+from dvl_calib_ros.recordings.look import Look, Survey
 
 
 def survey(*topics: str, msgtype: str = TWIST_TYPE) -> Survey:

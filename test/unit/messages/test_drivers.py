@@ -43,7 +43,8 @@ from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_tab
 from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.messages.opening import recognised
 from dvl_calib_ros.parallel import Workers
-from dvl_calib_ros.replay.replay import Topics, replay
+from dvl_calib_ros.recordings.topics import Topics
+from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.recorded import Recording, recorded_motion
 
 SECOND = 10**9
@@ -431,7 +432,8 @@ def test_stamps_that_never_meet_the_references_are_explained(tmp_path):
 
 def test_evaluation_and_diagnosis_read_the_same_from_a_drivers_bag(bare, tmp_path):
     bags = {kind: write_driver_bag(tmp_path / f"{kind[:5]}_0", bare, kind) for kind in (TWIST, MARINE)}
-    other = {kind: write_driver_bag(tmp_path / f"{kind[:5]}_1", bare[:-30], kind) for kind in (TWIST, MARINE)}
+    later = [each._replace(stamp_ns=each.stamp_ns + 1000 * 10**9) for each in bare[:-30]]
+    other = {kind: write_driver_bag(tmp_path / f"{kind[:5]}_1", later, kind) for kind in (TWIST, MARINE)}
     checks = [
         cross_check([bags[kind], other[kind]], Parameters(), ["M3"], Topics(), Workers(1)) for kind in (TWIST, MARINE)
     ]

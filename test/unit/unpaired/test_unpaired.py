@@ -16,7 +16,8 @@ from dvl_calib_ros.calibration.samples import Stream, sample_block
 from dvl_calib_ros.diagnosis.recordings import make_recording, zeros_while_moving
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
-from dvl_calib_ros.replay.replay import Topics
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -32,7 +33,7 @@ SECOND_NS = 1_000_000_000
 
 
 def source(*paths: Path) -> Source:
-    return Source(paths, Parameters(min_speed=0.0), Topics())
+    return Source(open_recording(paths), Parameters(min_speed=0.0), Topics())
 
 
 def bag(path: Path, effects: tuple[str, ...] = (), **fields) -> Path:

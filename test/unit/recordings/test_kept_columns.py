@@ -16,9 +16,11 @@ from dvl_calib_ros.bags import columns as bag_columns
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import Stream
-from dvl_calib_ros.messages.columns import sample_streams
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
+from dvl_calib_ros.recordings import columns as kept_columns
+from dvl_calib_ros.recordings import streams as kept_streams
+from dvl_calib_ros.recordings.recording import open_recording
 
 TOPICS = {"dvl/twist": Stream.DVL, "gnss/twist": Stream.REFERENCE, "imu/data": Stream.IMU}
 
@@ -43,12 +45,11 @@ def bits(values) -> list[str]:
 
 def as_columns(paths, parameters, on_problem=print):
     decoder = MessageDecoder(parameters, on_problem)
-    with BagReader(paths, KNOWN_DEFINITIONS) as bag:
-        found = [
-            (stream, plain(sample))
-            for stretch in sample_streams(bag, TOPICS, decoder)
-            for stream, sample in stretch.streams.in_order()
-        ]
+    found = [
+        (stream, plain(sample))
+        for stretch in open_recording(paths, parameters=parameters).stretches(TOPICS, decoder)
+        for stream, sample in stretch.streams.in_order()
+    ]
     return found, decoder
 
 
@@ -141,13 +142,21 @@ def recordings(draw: st.DrawFn):
 
 
 @searched(120)
-@given(recordings(), st.sampled_from([1, 7, 4096]), st.sampled_from(["", "dvl_link", "base_link"]), st.booleans())
-def test_whatever_is_recorded_gives_the_same_in_columns(tmp_path_factory, messages, window, dvl_frame, is_turned):
+@given(
+    recordings(), st.sampled_from([1, 7, 4096]), st.sampled_from(["", "dvl_link", "base_link"]), st.booleans(),
+    st.sampled_from([100, kept_columns.IN_MEMORY]),
+)  # fmt: skip
+def test_whatever_is_recorded_gives_the_same_in_columns(
+    tmp_path_factory, messages, window, dvl_frame, is_turned, in_memory
+):
+    """Also where what is kept goes to the disk."""
     path = tmp_path_factory.mktemp("bag") / "bag.mcap"
     path.write_bytes(mcap_bytes(messages))
     parameters = Parameters(dvl_frame=dvl_frame, imu_rpy=(0.1, 0.0, 0.5) if is_turned else (0.0, 0.0, 0.0))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bag_columns, "WINDOW_MESSAGES", window)
+        patch.setattr(kept_streams, "STRETCH_MESSAGES", window)
+        patch.setattr(kept_columns, "IN_MEMORY", in_memory)
         assert_same([path], parameters)
 
 

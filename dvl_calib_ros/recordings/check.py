@@ -1,0 +1,55 @@
+"""Whether a recording has what a command needs of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+
+from ..calibration.findings import Finding, finding
+from ..errors import InputError
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES
+from .recording import Recording
+from .topics import Topics
+
+
+def check_topics(recording: Recording, topics: Topics, found: list[Finding]) -> None:
+    """Raise InputError unless there is a DVL to be read; what else is missing is added to `found`."""
+    present, where = recording.types, recording.where
+    if not present:
+        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
+    if len({topics.dvl, topics.gnss, topics.imu}) < 3:
+        raise InputError("--dvl-topic, --gnss-topic and --imu-topic must be different topics")
+    if topics.dvl not in present:
+        listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
+        option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
+        raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
+    _check_types(recording, topics, found)
+    if not recording.counts[topics.dvl]:
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
+    if topics.gnss not in present:
+        found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
+
+
+def _check_types(recording: Recording, topics: Topics, found: list[Finding]) -> None:
+    for role, wanted in _WANTED.items():
+        name = getattr(topics, role)
+        held = recording.held.get(name)
+        if held is None:
+            continue
+        said = " and ".join(sorted(held.types))
+        if held.types - wanted:
+            expected = " or ".join(wanted)
+            raise InputError(f"{recording.where}: topic {name} holds {said}, expected {expected}; set --{role}-topic")
+        if len(held.types) > 1:
+            raise InputError(f"{recording.where}: topic {name} holds {said}; replay bags of one type together")
+        if held.lacks_definition:
+            found.append(finding("BAG_NO_DEFINITION", type=said))
+
+
+_WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
+
+
+def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
+    """Topics that may be the DVL's: of a type that only DVLs have, else with dvl in the name, else of any fitting."""
+    fitting = sorted(name for name, kind in present.items() if kind in DVL_TYPES and name != topics.gnss)
+    only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
+    return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting

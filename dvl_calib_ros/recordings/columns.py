@@ -1,0 +1,347 @@
+"""What is kept of a topic's messages: of those of a fixed layout the columns, of all others their bytes.
+
+Nothing is judged yet, for frames and parameters are known only later: values and stamps are as the messages have them.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bags.channels import Channel, Decoder, DecodingError
+from ..bags.columns import Part
+from ..bags.layout import Columns
+from ..calibration.frames import Array
+from ..calibration.parameters import Parameters
+from ..calibration.samples import Codes, Covariances, Index, Stamps
+from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
+from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
+
+# A column that is larger than this (bytes) is kept on disk: an ordinary recording's are not.
+IN_MEMORY = 128 << 20
+
+
+@dataclass(frozen=True)
+class Laid:
+    """N messages of a fixed layout, in their order of arrival.
+
+    arrival: (N,) places among all that was read. log_ns: (N,). stamps_ns: (N,) of the header, 0 where it has none.
+    values: (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) its quaternion (x, y, z, w) and angular
+    velocity, rad/s, nan where not given. frame: (N,) places in frames, of frame_ids. covariance: (N,) places in
+    distinct (C, 3, 3), (m/s)², -1 where not given. broken: (N,) 1 + the first of its type's rules that a message
+    breaks, 0 if none. beside: (N, 3) acceleration, m/s², of an IMU, angular velocity, rad/s, of a twist; else nan.
+    world: frame_id of the first message's header, which of an odometry is that of its pose.
+    """
+
+    arrival: Stamps
+    log_ns: Stamps
+    stamps_ns: Stamps
+    values: Array
+    frame: NDArray[np.int32]
+    covariance: NDArray[np.int32]
+    broken: Codes
+    beside: Array
+    world: str = ""
+    frames: tuple[str, ...] = ()
+    distinct: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+
+    def __len__(self) -> int:
+        return len(self.arrival)
+
+    def part(self, at: slice | Index) -> Laid:
+        """The rows of a slice or of indices."""
+        return replace(self, **{name: getattr(self, name)[at] for name in _DTYPES})
+
+    @property
+    def covariances(self) -> Covariances:
+        """Of these rows, with no more distinct ones than they have."""
+        given = self.covariance[self.covariance >= 0]
+        if not len(given):
+            return Covariances.none(len(self))
+        first, last = int(given.min()), int(given.max())
+        index = np.where(self.covariance < 0, -1, self.covariance - first).astype(np.intp)
+        return Covariances(self.distinct[first : last + 1], index)
+
+    @property
+    def variances(self) -> Array:
+        """(N, 3) (m/s)², nan where not given, or where one of them is no variance."""
+        variances = np.full((len(self), 3), np.nan)
+        given = self.covariance >= 0
+        if given.any():
+            variances[given] = np.diagonal(self.distinct, axis1=1, axis2=2)[self.covariance[given]]
+            variances[(variances <= 0.0).any(axis=1)] = np.nan
+        return variances
+
+
+_DTYPES: Mapping[str, Any] = {
+    "arrival": np.int64, "log_ns": np.int64, "stamps_ns": np.int64, "values": np.float64, "frame": np.int32,
+    "covariance": np.int32, "broken": np.uint8, "beside": np.float64,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Singles:
+    """M messages that are decoded one by one, in their order of arrival.
+
+    arrival, log_ns: (M,). channel: (M,) places in channels. end: (M,) where each ends in content, which is bytes.
+    """
+
+    arrival: Stamps
+    log_ns: Stamps
+    channel: NDArray[np.int32]
+    end: Stamps
+    content: Codes
+    channels: tuple[Channel, ...]
+    decoder: Decoder
+
+    def __len__(self) -> int:
+        return len(self.arrival)
+
+    def messages(self, at: slice | Index = slice(None)) -> Iterator[tuple[int, int, Any, str]]:
+        """Arrival, log time (ns), decoded message (None if it cannot be decoded) and then why, of some."""
+        places = np.arange(len(self))[at]
+        starts = np.where(places > 0, self.end[places - 1], 0) if len(places) else places
+        rows = zip(
+            self.arrival[places].tolist(), self.log_ns[places].tolist(), self.channel[places].tolist(),
+            starts.tolist(), self.end[places].tolist(), strict=True,
+        )  # fmt: skip
+        for arrival, log_ns, channel, start, end in rows:
+            try:
+                yield arrival, log_ns, self.decoder(self.channels[channel], self.content[start:end].tobytes()), ""
+            except DecodingError as error:
+                yield arrival, log_ns, None, str(error)
+
+
+@dataclass(frozen=True)
+class TopicColumns:
+    """All messages of a topic in one recording."""
+
+    topic: str
+    msgtype: str
+    laid: Laid
+    singles: Singles
+
+    def __len__(self) -> int:
+        return len(self.laid) + len(self.singles)
+
+    @property
+    def arrivals(self) -> tuple[Stamps, Stamps]:
+        """Places of all messages among all that was read, in order, and their log times (ns)."""
+        if not len(self.singles):
+            return self.laid.arrival, self.laid.log_ns
+        arrival = np.concatenate([self.laid.arrival, self.singles.arrival])
+        order = np.argsort(arrival, kind="stable")
+        return arrival[order], np.concatenate([self.laid.log_ns, self.singles.log_ns])[order]
+
+    def arriving(self, renumbered: Callable[[Stamps], Stamps]) -> TopicColumns:
+        """The same, at other places among all that was read."""
+        return replace(
+            self,
+            laid=replace(self.laid, arrival=renumbered(self.laid.arrival)),
+            singles=replace(self.singles, arrival=renumbered(self.singles.arrival)),
+        )
+
+
+def is_kept(msgtype: str) -> bool:
+    """Whether messages of this type may be the DVL's, a reference or an IMU's."""
+    return msgtype == IMU_TYPE or msgtype in VELOCITY_TYPES
+
+
+class Collector:
+    """Collects a topic's messages as they are read.
+
+    expected: how many there will be. parameters: by which a type's rules judge its messages.
+    """
+
+    def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
+        self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
+        shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "beside": (3,)}
+        self._laid = {name: _Column(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
+        self._world = ""
+        self._frames: dict[bytes, int] = {}
+        self._distinct: list[Array] = []
+        self._n_distinct = 0
+        self._singles = {
+            name: _Column(dtype)
+            for name, dtype in (("arrival", np.int64), ("log_ns", np.int64), ("channel", np.int32), ("end", np.int64),
+                                ("content", np.uint8))
+        }  # fmt: skip
+        self._bytes = 0
+        self._channels: dict[Channel, int] = {}
+
+    def take(self, part: Part) -> None:
+        """Take messages of one channel that follow those before."""
+        try:
+            self._take_columns(part)
+        except UNREADABLE:  # of no fixed layout, or its definition has other fields: one by one it is said what lacks
+            self._take_singly(part)
+
+    def _take_columns(self, part: Part) -> None:
+        columns = part.columns
+        if columns is None:
+            raise ValueError("not laid out alike")
+        kind = VELOCITY_TYPES.get(self._msgtype)
+        frame_ids = columns.header.frame_id if kind is None else kind.frame_id(columns)
+        stamp = columns.header.stamp
+        stamps_ns = stamp.sec.astype(np.int64) * 1_000_000_000 + stamp.nanosec
+        n = len(part)
+        covariances, broken = Covariances.none(n), np.zeros(n, dtype=np.uint8)
+        if kind is None:
+            values, beside = _imu(columns)
+        else:
+            velocity = kind.velocity(columns)
+            values, beside = _columns_of(velocity), np.broadcast_to(turning(columns), (n, 3))
+            covariances = _covariances(kind, columns)
+            broken = _broken(kind, columns, self._parameters)
+        self._world = self._world or columns.header.frame_id[0].tobytes().decode("ascii")
+        # nothing is taken before all of it is known to be readable
+        index = np.where(covariances.index < 0, -1, covariances.index + self._n_distinct)
+        if len(covariances.distinct):
+            self._distinct.append(covariances.distinct)
+            self._n_distinct += len(covariances.distinct)
+        rows = (part.arrival, part.log_ns, stamps_ns, values, self._frame(frame_ids), index, broken, beside)
+        for column, each in zip(self._laid.values(), rows, strict=True):
+            column.add(each)
+
+    def _frame(self, frame_ids: Any) -> Index:
+        """Of (N, length) ASCII which frame is a row's."""
+        n = len(frame_ids)
+        if not frame_ids.shape[1] or (frame_ids == frame_ids[0]).all():
+            return np.full(n, self._frames.setdefault(frame_ids[0].tobytes(), len(self._frames)))
+        return np.array([self._frames.setdefault(row.tobytes(), len(self._frames)) for row in frame_ids])
+
+    def _take_singly(self, part: Part) -> None:
+        data = list(part.data())
+        end = self._bytes + np.cumsum([len(each) for each in data], dtype=np.int64)
+        self._bytes = int(end[-1])
+        channel = np.full(len(data), self._channels.setdefault(part.channel, len(self._channels)))
+        content = np.frombuffer(b"".join(data), dtype=np.uint8)
+        for column, each in zip(
+            self._singles.values(), (part.arrival, part.log_ns, channel, end, content), strict=True
+        ):
+            column.add(each)
+
+    def columns(self) -> TopicColumns:
+        """All that was taken."""
+        laid = Laid(
+            **{name: column.array() for name, column in self._laid.items()},
+            world=self._world,
+            frames=tuple(name.decode("ascii") for name in self._frames),
+            distinct=np.concatenate([np.zeros((0, 3, 3)), *self._distinct]),
+        )
+        if (laid.arrival[1:] < laid.arrival[:-1]).any():  # of several layouts in turn
+            laid = laid.part(np.argsort(laid.arrival, kind="stable"))
+        singles = Singles(
+            **{name: column.array() for name, column in self._singles.items()},
+            channels=tuple(self._channels), decoder=self._decoder,
+        )  # fmt: skip
+        if (singles.arrival[1:] < singles.arrival[:-1]).any():
+            singles = _in_order(singles)
+        return TopicColumns(self._topic, self._msgtype, laid, singles)
+
+
+def _columns_of(vector: Any) -> Array:
+    """(N, 3)."""
+    return np.column_stack([vector.x, vector.y, vector.z]).astype(float)
+
+
+def turning(message: Any) -> Array:
+    """Angular velocity of a twist, rad/s, of columns (N, 3) or of a message (1, 3); nan of other types."""
+    twist = getattr(message, "twist", None)
+    if twist is None:
+        return np.full((1, 3), np.nan)
+    return _columns_of(getattr(twist, "twist", twist).angular)
+
+
+def _imu(columns: Columns) -> tuple[Array, Array]:
+    """Quaternion and angular velocity (N, 7), and acceleration (N, 3); nan where not given."""
+    q, w, a = columns.orientation, columns.angular_velocity, columns.linear_acceleration
+    values = np.column_stack([q.x, q.y, q.z, q.w, w.x, w.y, w.z]).astype(float)
+    values[columns.orientation_covariance[:, 0] == NO_DATA, :4] = np.nan
+    values[columns.angular_velocity_covariance[:, 0] == NO_DATA, 4:] = np.nan
+    acceleration = _columns_of(a)
+    acceleration[columns.linear_acceleration_covariance[:, 0] == NO_DATA] = np.nan
+    return values, acceleration
+
+
+def _covariances(kind: VelocityType, columns: Columns) -> Covariances:
+    given, n = kind.covariance(columns), len(columns)
+    if given is None:
+        return Covariances.none(n)
+    size = {9: 3, 36: 6}.get(given.shape[1])
+    if size is None:
+        raise ValueError(f"a covariance of {given.shape[1]} numbers")
+    covariances = Covariances.of(given.reshape(n, size, size)[:, :3, :3], n)
+    lacks = kind.lacks_covariance(columns)
+    return Covariances(covariances.distinct, np.where(lacks, -1, covariances.index).astype(np.intp))
+
+
+def _broken(kind: VelocityType, columns: Columns, parameters: Parameters) -> Codes:
+    broken = np.zeros(len(columns), dtype=np.uint8)
+    if kind.is_dvl:
+        for code, rule in enumerate(kind.rules, start=1):
+            broken[np.asarray(rule.broken(columns, parameters)) & (broken == 0)] = code
+    return broken
+
+
+def _in_order(singles: Singles) -> Singles:
+    """Messages of several channels in turn, by arrival."""
+    order = np.argsort(singles.arrival, kind="stable")
+    starts = np.concatenate([[0], singles.end[:-1]])[order]
+    lengths = singles.end[order] - starts
+    end = np.cumsum(lengths)
+    at = np.repeat(starts - (end - lengths), lengths) + np.arange(len(singles.content))
+    return replace(
+        singles, arrival=singles.arrival[order], log_ns=singles.log_ns[order], channel=singles.channel[order], end=end,
+        content=singles.content[at],
+    )  # fmt: skip
+
+
+class _Column:
+    """Rows that come piece by piece, on disk once there are many."""
+
+    def __init__(self, dtype: Any, shape: tuple[int, ...] = (), expected: int = 0) -> None:
+        """shape: of a row. expected: how many there will be, as far as that is known: more are taken as well."""
+        self._file: BinaryIO | None = None
+        row = np.dtype(dtype).itemsize * max(1, math.prod(shape))
+        self._rows = np.empty((max(1, min(expected, IN_MEMORY // row)), *shape), dtype)
+        self._n = 0
+
+    def add(self, rows: Any) -> None:
+        """Take further rows (N, ...)."""
+        if self._n + len(rows) > len(self._rows):
+            if self._rows.nbytes >= IN_MEMORY:
+                self._spill()
+            # grown where it is, not copied: there is no second one at any time
+            wanted = max(self._n + len(rows), 2 * self._n)
+            self._rows.resize((max(wanted, len(self._rows)), *self._rows.shape[1:]), refcheck=False)
+        self._rows[self._n : self._n + len(rows)] = rows
+        self._n += len(rows)
+
+    def _spill(self) -> None:
+        if self._file is None:
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115  # until its rows are mapped
+        self._file.write(self._rows[: self._n].tobytes())
+        self._n = 0
+
+    def array(self) -> NDArray[Any]:
+        """All rows; they are given once."""
+        if self._file is None:
+            self._rows.resize((self._n, *self._rows.shape[1:]), refcheck=False)
+            return self._rows
+        self._spill()
+        self._file.flush()
+        rows = np.asarray(np.memmap(self._file, dtype=self._rows.dtype, mode="r"))
+        self._file.close()  # the map holds it
+        return rows.reshape(-1, *self._rows.shape[1:])
+
+
+def stamped(message: Any, log_ns: int) -> int:
+    """The stamp of a message (ns), the log time where it has none."""
+    return stamp_ns(message.header.stamp) or log_ns

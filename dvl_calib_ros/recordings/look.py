@@ -1,0 +1,255 @@
+"""A first look at a topic: some of its messages, to choose topics by and to find frames.
+
+They are taken in bursts spread over the recording, so that a look at hours costs no more than one at minutes, and yet
+the streams have samples at the same times, which can be compared.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import accumulate
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.robust import median
+from ..calibration.samples import Index, Mask, Stamps
+from ..messages.decode import NO_DATA, UNREADABLE
+from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
+from ..messages.fixes import FixDifference
+from .columns import TopicColumns, stamped, turning
+
+# Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
+# straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
+BURSTS, BURST_NS, BURST_EVERY_NS = 24, 6_000_000_000, 95_000_000
+# What is faster (m/s) is garbage, whose square may be no number any more; millimetres per second still pass.
+FASTEST = 1e5
+
+
+@dataclass(frozen=True)
+class Look:
+    """Some messages of one topic, N of them.
+
+    count: messages in the recording. rate_hz: over the whole of it, 0 if that is an instant. frame_id: of the velocity
+    or of the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the
+    log where it is zero. ahead_s: by how much they are ahead of the log, in the median. values: velocity (N, 3) m/s, as
+    in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
+    given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero where it has none. world:
+    frame_id of the header, which of an odometry is that of its pose.
+    """
+
+    topic: str
+    msgtype: str
+    count: int
+    rate_hz: float
+    frame_id: str
+    stamps_s: Array
+    ahead_s: float
+    values: Array
+    rates: Array | None = None
+    world: str = ""
+
+    @property
+    def speed(self) -> float:
+        """Root mean square of the velocity, m/s; 0 without samples."""
+        return float(np.sqrt((self.values**2).sum(axis=1).mean())) if len(self.values) else 0.0
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether an IMU gives an orientation: most quaternions are of unit length, and they are not all the same."""
+        q = self.values[:, :4]
+        if len(q) < 2 or np.isnan(q).any(axis=1).mean() > 0.5:
+            return False
+        given = q[~np.isnan(q).any(axis=1)]
+        unit = np.abs(np.linalg.norm(given, axis=1) - 1.0) < 0.01
+        return bool(unit.mean() > 0.5 and np.ptp(given, axis=0).max() > 0.0)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was seen. looks: by topic. transforms: messages of tf_static; descriptions: of robot_description."""
+
+    topics: Mapping[str, str]
+    counts: Mapping[str, int]
+    looks: Mapping[str, Look]
+    transforms: tuple[Any, ...]
+    descriptions: tuple[str, ...]
+
+
+def look_of(
+    parts: Sequence[TopicColumns], count: int, start_ns: int, spans_ns: Sequence[tuple[int, int]]
+) -> Look | None:
+    """A look at a topic, of which each recording has a part; None where no message of it can be read.
+
+    start_ns: first log time of the recordings. spans_ns: from and to when was recorded, in order.
+    """
+    topic, msgtype = parts[0].topic, parts[0].msgtype
+    numbers = _Numbers(msgtype)
+    taken = in_bursts(parts, spans_ns)
+    for part in parts:
+        numbers.add_columns(part, _places(part.laid.arrival, taken))
+    singly = sorted(
+        (row for part in parts for row in part.singles.messages(_places(part.singles.arrival, taken))),
+        key=lambda row: row[0],
+    )
+    numbers.add_messages([(arrival, log_ns, message) for arrival, log_ns, message, _ in singly if message is not None])
+    found = numbers.in_order()
+    if found is None:
+        return None
+    stamps_ns, log_ns, values, beside, kept = found
+    seconds = 1e-9 * sum(end - start for start, end in spans_ns)
+    ahead_s = 1e-9 * float(median(np.asarray(stamps_ns - log_ns, dtype=float)))
+    stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
+    rate_hz = count / seconds if seconds else 0.0
+    rates = beside[kept]
+    if msgtype == IMU_TYPE:
+        values, rates = np.hstack([values, beside]), np.full((0, 3), np.nan)
+    turns = None if np.isnan(rates).all() else rates
+    return Look(topic, msgtype, count, rate_hz, numbers.frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world)
+
+
+def _places(arrival: Stamps, taken: Stamps) -> Index:
+    """Which rows, in order of arrival, are among those taken."""
+    if not len(arrival) or not len(taken):
+        return np.zeros(0, dtype=np.intp)
+    at = np.minimum(np.searchsorted(arrival, taken), len(arrival) - 1)
+    return np.asarray(at[arrival[at] == taken])
+
+
+def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]) -> Stamps:
+    """Arrivals of the messages of a topic that are looked at.
+
+    spans_ns: from and to when was recorded, in order.
+    """
+    both = [part.arrivals for part in parts]
+    arrival, log_ns = (np.concatenate(each) for each in zip(*both, strict=True))
+    if len(parts) > 1:
+        order = np.argsort(arrival, kind="stable")
+        arrival, log_ns = arrival[order], log_ns[order]
+    starts_ns = [start_ns for start_ns, _ in spans_ns]
+    recorded_before_ns = [0, *accumulate(end_ns - start_ns for start_ns, end_ns in spans_ns)]
+    period_ns = max(recorded_before_ns[-1] // BURSTS, BURST_NS)
+    taken = []
+    at = 0
+    while at < len(log_ns):
+        now_ns = int(log_ns[at])
+        span = max(bisect_right(starts_ns, now_ns) - 1, 0)
+        since_ns = (now_ns - starts_ns[span] + recorded_before_ns[span]) % period_ns
+        if since_ns < BURST_NS:
+            taken.append(at)
+            next_ns = now_ns + BURST_EVERY_NS
+        else:
+            next_ns = now_ns + period_ns - since_ns
+        at = max(at + 1, int(np.searchsorted(log_ns, next_ns)))
+    return arrival[taken]
+
+
+class _Numbers:
+    """Collects what a look is made of: of each message arrival, log time, stamp and numbers."""
+
+    def __init__(self, msgtype: str) -> None:
+        self._msgtype, self._kind = msgtype, VELOCITY_TYPES.get(msgtype)
+        self._rows: list[tuple[Stamps, Stamps, Stamps, Array, Array]] = []
+        self._names: list[tuple[int, str]] = []
+        self.world = ""
+
+    @property
+    def frame_id(self) -> str:
+        """Of the first message that names one."""
+        return min(self._names)[1] if self._names else ""
+
+    def add_columns(self, part: TopicColumns, at: Index) -> None:
+        if not len(at):
+            return
+        laid = part.laid.part(at)
+        stamps_ns = np.where(laid.stamps_ns == 0, laid.log_ns, laid.stamps_ns)
+        self._rows.append((laid.arrival, laid.log_ns, stamps_ns, laid.values, laid.beside))
+        self.world = self.world or laid.world
+        self._names += [
+            (int(arrival), part.laid.frames[place])
+            for arrival, place in zip(laid.arrival.tolist(), laid.frame.tolist(), strict=True)
+            if part.laid.frames[place]
+        ][:1]
+
+    def add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
+        """Arrival, log time (ns) and message of each."""
+        if self._kind is not None and self._kind.is_position:
+            messages = _differences(messages)
+        for arrival, log_ns, message in messages:
+            with suppress(*UNREADABLE):
+                values, beside = self._of(message)
+                row = np.array([[arrival], [log_ns], [stamped(message, log_ns)]])
+                name = str(message.header.frame_id if self._kind is None else self._kind.frame_id(message))
+                self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), beside))
+                self._names += [(arrival, name)] if name else []
+                self.world = self.world or str(message.header.frame_id)
+
+    def _of(self, message: Any) -> tuple[list[float], Array]:
+        """A velocity, or quaternion and angular velocity of an IMU; and what is kept beside."""
+        if self._kind is not None:
+            v = message.velocity if self._kind.is_position else self._kind.velocity(message)
+            return [v.x, v.y, v.z], turning(message)
+        q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
+        given = (
+            ((q.x, q.y, q.z, q.w), message.orientation_covariance),
+            ((w.x, w.y, w.z), message.angular_velocity_covariance),
+            ((a.x, a.y, a.z), message.linear_acceleration_covariance),
+        )
+        numbers = [np.nan if covariance[0] == NO_DATA else value for values, covariance in given for value in values]
+        return numbers[:7], np.array([numbers[7:]], dtype=float)
+
+    def in_order(self) -> tuple[Stamps, Stamps, Array, Array, Index] | None:
+        """Stamps, log times, values, what is beside; which of them are of use, in order of stamps."""
+        if not self._rows:
+            return None
+        arrival, log_ns, stamps_ns, values, beside = (np.concatenate(each) for each in zip(*self._rows, strict=True))
+        whole = np.ones(len(values), dtype=bool)
+        if self._msgtype != IMU_TYPE:
+            values[(values == 0.0).all(axis=1)] = np.nan  # what drivers send for want of a measurement
+            whole = (np.abs(values) < FASTEST).all(axis=1)
+        for each in (values, beside):
+            each[~(np.abs(each) < FASTEST)] = np.nan  # so that their squares are numbers
+        order = np.lexsort((arrival, stamps_ns))
+        return stamps_ns, log_ns, values, beside, order[whole[order]]
+
+
+def _differences(messages: Iterable[tuple[int, int, Any]]) -> list[tuple[int, int, Any]]:
+    """Satellite positions as the velocities between them, at the middle of each window."""
+    difference = FixDifference()
+    found = []
+    for arrival, log_ns, message in messages:
+        at_ns = stamped(message, log_ns)
+        fixed = difference(at_ns, message.latitude, message.longitude, message.altitude, None)
+        if fixed is not None and message.status.status >= 0:
+            velocity = SimpleNamespace(**dict(zip("xyz", fixed.velocity, strict=True)))
+            seconds, nanoseconds = divmod(fixed.stamp_ns, 1_000_000_000)
+            header = SimpleNamespace(
+                stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=message.header.frame_id
+            )
+            found.append((arrival, log_ns, SimpleNamespace(velocity=velocity, header=header)))
+    return found
+
+
+def comparable(a: Look, at_s: Array, longest_gap_s: float = 1.5) -> tuple[Array, Mask]:
+    """Columns of a look at other times: (M, k) and whether they lie between two samples that are close (M,)."""
+    n = len(a.stamps_s)
+    if n < 2:
+        return np.full((len(at_s), a.values.shape[1]), np.nan), np.zeros(len(at_s), dtype=bool)
+    after = np.clip(np.searchsorted(a.stamps_s, at_s), 1, n - 1)
+    t0, t1 = a.stamps_s[after - 1], a.stamps_s[after]
+    near = (t1 - t0 <= longest_gap_s) & (at_s >= t0) & (at_s <= t1) & (t1 > t0)
+    share = np.divide(at_s - t0, t1 - t0, out=np.zeros(len(at_s)), where=t1 > t0)[:, None]
+    before, later = a.values[after - 1], a.values[after].copy()
+    if a.msgtype == IMU_TYPE:  # the shorter way round; samples are close, so that a straight line will do
+        other_way = (before[:, :4] * later[:, :4]).sum(axis=1) < 0.0
+        later[other_way, :4] *= -1.0
+    values = before + share * (later - before)
+    if a.msgtype == IMU_TYPE:
+        with np.errstate(divide="ignore", invalid="ignore"):  # an orientation of zeros is none, and becomes nan
+            values[:, :4] /= np.linalg.norm(values[:, :4], axis=1, keepdims=True)
+    return values, near

@@ -1,0 +1,148 @@
+"""All messages of a topic as they are: nothing left out, nothing turned."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.parameters import Parameters
+from ..calibration.samples import Stamps
+from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
+from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
+from ..messages.fixes import FixDifference
+from .columns import TopicColumns, stamped
+from .look import FASTEST
+
+# Of an IMU
+NO_VARIANCES = np.zeros((0, 3))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A topic's messages, N of them, in order of log time.
+
+    stamps_ns: (N,) of the header, 0 where it has none. log_ns: (N,). values: (N, 3) m/s; of an IMU (N, 4) its
+    quaternion. variances: (N, 3) (m/s)², nan where not given; (0, 3) of an IMU. refused: by counter of the driver's
+    rules, of how many. unreadable: messages that could not be read.
+    """
+
+    topic: str
+    msgtype: str
+    stamps_ns: Stamps
+    log_ns: Stamps
+    values: Array
+    variances: Array
+    refused: Mapping[str, int]
+    unreadable: int
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+class _Row(NamedTuple):
+    arrival: int
+    log_ns: int
+    stamp_ns: int
+    values: tuple[float, ...]
+    variances: Any
+
+
+def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
+    """All messages of a topic, of which each recording has a part."""
+    topic, msgtype = parts[0].topic, parts[0].msgtype
+    refused: Counter[str] = Counter()
+    unreadable = 0
+    rules = VELOCITY_TYPES[msgtype].rules if msgtype in VELOCITY_TYPES else ()
+    for part in parts:
+        for code in np.flatnonzero(np.bincount(part.laid.broken)).tolist():
+            if code:
+                refused[rules[code - 1].counter] += int(np.count_nonzero(part.laid.broken == code))
+    singly = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
+    rows: list[_Row] = []
+    if msgtype in VELOCITY_TYPES and VELOCITY_TYPES[msgtype].is_position:
+        rows = _differences(singly, parameters)
+    else:
+        for arrival, log_ns, message, _ in singly:
+            try:
+                row, broken = _row(arrival, log_ns, message, msgtype, parameters)
+            except UNREADABLE:
+                unreadable += 1
+                continue
+            rows.append(row)
+            refused.update(broken)
+    is_imu = msgtype == IMU_TYPE
+    width = 4 if is_imu else 3
+    columns = [
+        (each.arrival, each.log_ns, each.stamps_ns, each.values[:, :width], NO_VARIANCES if is_imu else each.variances)
+        for each in (part.laid for part in parts)
+    ]
+    if rows or len(columns) > 1:
+        columns.append(_of_rows(rows, width, is_imu))
+    _, log_ns, stamps_ns, values, variances = columns[0] if len(columns) == 1 else _in_order(columns)
+    values, variances = _plausible(values, FASTEST), _plausible(variances, FASTEST**2)
+    return Recorded(topic, msgtype, stamps_ns, log_ns, values, variances, refused, unreadable)
+
+
+def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Rows of several, by arrival, which comes first."""
+    joined = [np.concatenate(each) for each in zip(*columns, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return tuple(each[order] if len(each) == len(order) else each for each in joined)
+
+
+def _plausible(values: Array, most: float) -> Array:
+    """With nan for what nothing measures."""
+    garbage = ~(np.abs(values) < most)
+    if not (garbage & ~np.isnan(values)).any():
+        return values
+    return np.where(garbage, np.nan, values)
+
+
+def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Parameters) -> tuple[_Row, list[str]]:
+    """A message, and under which rule's counter it is refused. Raises what is `UNREADABLE`."""
+    at_ns = stamp_ns(message.header.stamp)
+    if msgtype == IMU_TYPE:
+        q = message.orientation
+        given = message.orientation_covariance[0] != NO_DATA
+        values = (q.x, q.y, q.z, q.w) if given else (np.nan,) * 4
+        return _Row(arrival, log_ns, at_ns, values, np.full(3, np.nan)), []
+    kind = VELOCITY_TYPES[msgtype]
+    v = kind.velocity(message)
+    variances = np.full(3, np.nan)
+    covariance = kind.covariance(message)
+    if covariance is not None and not kind.lacks_covariance(message):
+        flat = np.asarray(covariance, dtype=float).reshape(-1)
+        step = 4 if len(flat) == 9 else 7
+        if not (flat[[0, step, 2 * step]] <= 0.0).any():
+            variances = flat[[0, step, 2 * step]]
+    broken = kind.broken_rule(message, parameters)
+    return _Row(arrival, log_ns, at_ns, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
+
+
+def _differences(singly: Sequence[tuple[int, int, Any, str]], parameters: Parameters) -> list[_Row]:
+    """Satellite positions as the velocities between them."""
+    difference = FixDifference(parameters.position_window)
+    rows = []
+    for arrival, log_ns, message, _ in singly:
+        if message is None or message.status.status < 0:
+            continue
+        given = message.position_covariance if message.position_covariance_type else None
+        at_ns = stamped(message, log_ns)
+        found = difference(at_ns, message.latitude, message.longitude, message.altitude, given)
+        if found is not None:
+            variances = np.full(3, np.nan) if found.covariance is None else np.diag(found.covariance)
+            # by the log time of the middle of its window, as if it had been measured then
+            rows.append(_Row(arrival, log_ns - (at_ns - found.stamp_ns), found.stamp_ns, found.velocity, variances))
+    return rows
+
+
+def _of_rows(rows: Sequence[_Row], width: int, is_imu: bool) -> tuple[Any, ...]:
+    times = (np.array([row[place] for row in rows], dtype=np.int64) for place in range(3))
+    values = np.array([row.values for row in rows], dtype=float).reshape(-1, width)
+    variances = NO_VARIANCES if is_imu else np.array([row.variances for row in rows]).reshape(-1, 3)
+    return (*times, values, variances)

@@ -1,0 +1,266 @@
+"""Recordings, opened once: one pass over their bytes gives all that any command asks of them.
+
+Kept are the columns of all topics that may be the DVL's, a reference or an IMU's; of transforms and descriptions the
+first; of all others nothing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, reduce
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bags.columns import windows
+from ..calibration.parameters import Parameters
+from ..calibration.samples import SampleBlock, Stamps, Stream, Streams, no_samples
+from ..messages.decode import MessageDecoder
+from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
+from ..messages.opening import open_bags
+from .columns import Collector, TopicColumns, is_kept
+from .look import Survey, look_of
+from .recorded import Recorded, recorded
+from .streams import Stretch, stretches
+from .topics import Topics
+
+TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
+# Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
+MOST_STATIC = 200
+Span = tuple[int, int]
+"""First and last log time, ns."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording, or several as one.
+
+    paths: of it. types: topic -> message type, of all topics; held: topic -> all the types and whether a definition is
+    lacking, of those that are kept. counts: topic -> number of messages. file_spans_ns: of each file. span_ns: of all,
+    (0, 0) without any. notes: what the user should know of what was read (damage). columns: of the topics that are
+    kept, a part for each path. transforms, descriptions: as `Survey` has them. each: the recordings that it is made
+    of, by themselves; itself, if it is one.
+    """
+
+    paths: tuple[Path, ...]
+    types: Mapping[str, str]
+    held: Mapping[str, Held]
+    counts: Mapping[str, int]
+    file_spans_ns: tuple[Span, ...]
+    path_spans_ns: tuple[Span | None, ...]
+    notes: tuple[str, ...]
+    columns: Mapping[str, tuple[TopicColumns, ...]]
+    transforms: tuple[Any, ...] = ()
+    descriptions: tuple[str, ...] = ()
+    parts: tuple[Recording, ...] = field(default=(), repr=False)
+
+    @property
+    def each(self) -> tuple[Recording, ...]:
+        """The recordings of each path."""
+        return self.parts or (self,)
+
+    @property
+    def where(self) -> str:
+        """Its paths, in words."""
+        return ", ".join(map(str, self.paths))
+
+    @property
+    def span_ns(self) -> Span:
+        """First and last log time."""
+        return min(start for start, _ in self.file_spans_ns), max(end for _, end in self.file_spans_ns)
+
+    @property
+    def recorded_spans_ns(self) -> list[Span]:
+        """First and last log time of each stretch that was recorded, in order; of those that overlap as one."""
+        spans: list[Span] = []
+        for start_ns, end_ns in sorted(self.file_spans_ns):
+            if spans and start_ns <= spans[-1][1]:
+                spans[-1] = spans[-1][0], max(spans[-1][1], end_ns)
+            else:
+                spans.append((start_ns, end_ns))
+        return spans
+
+    @cached_property
+    def survey(self) -> Survey:
+        """A first look at all that may be of use."""
+        start_ns = self.span_ns[0] if self.types else 0
+        spans_ns = self.recorded_spans_ns if self.types else [(0, 0)]
+        looks = {
+            topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
+                           spans_ns)
+            for topic, parts in self.columns.items()
+        }  # fmt: skip
+        seen = {topic: look for topic, look in looks.items() if look is not None}
+        return Survey(self.types, self.counts, seen, self.transforms, self.descriptions)
+
+    def recorded(self, topic: str, parameters: Parameters) -> Recorded:
+        """All messages of a topic that is kept, as they are."""
+        return recorded(self.columns[topic], parameters)
+
+    def stretches(self, topics: Mapping[str, Stream], decoder: MessageDecoder) -> Iterator[Stretch]:
+        """All messages of some topics as samples, stretch by stretch, in their order of arrival."""
+        return stretches({stream: self.columns.get(name, ()) for name, stream in topics.items()}, decoder)
+
+    def streams(self, topics: Topics, decoder: MessageDecoder) -> Streams:
+        """All messages of three topics as samples."""
+        named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
+        return _joined(list(self.stretches(named, decoder)))
+
+    def of_types(self, topics: Topics, parameters: Parameters) -> Parameters:
+        """The parameters with the message types that the recording has on these topics."""
+        types = self.types
+        return parameters.replace(
+            dvl_type=types.get(topics.dvl, parameters.dvl_type), gnss_type=types.get(topics.gnss, parameters.gnss_type)
+        )
+
+
+@dataclass(frozen=True)
+class Held:
+    """What a recording holds on a topic: all the types; whether one of them is of a definition that it lacks."""
+
+    types: frozenset[str]
+    lacks_definition: bool
+
+
+def _joined(found: Sequence[Stretch]) -> Streams:
+    if not found:
+        return Streams(*map(no_samples, (Stream.DVL, Stream.REFERENCE, Stream.IMU)))
+    blocks = [reduce(SampleBlock.joined, each) for each in zip(*(stretch.streams for stretch in found), strict=True)]
+    return Streams(*blocks)
+
+
+def open_recording(
+    paths: Sequence[Path],
+    topics: Topics | None = None,
+    parameters: Parameters | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Recording:
+    """Read recordings once, several as one in order of log time. Raises InputError for what is no bag.
+
+    topics: those to keep; all that may be of use by default. parameters: by which messages themselves are judged
+    (max_fom), the default ones if not given. on_progress: told the share (0..1) that is read.
+    """
+    parameters = parameters or Parameters()
+    each = []
+    for index, path in enumerate(paths):
+
+        def progress(share: float, index: int = index) -> None:
+            on_progress((index + share) / len(paths))
+
+        each.append(_opened(path, topics, parameters, progress))
+    return together(each)
+
+
+def together(each: Sequence[Recording]) -> Recording:
+    """Several recordings as one."""
+    if len(each) == 1:
+        return each[0]
+    counts: Counter[str] = Counter()
+    for one in each:
+        counts.update(one.counts)
+    names = dict.fromkeys(name for one in each for name in one.types)
+    held = {name: [one.held[name] for one in each if name in one.held] for name in names}
+    return Recording(
+        tuple(path for one in each for path in one.paths),
+        {name: kind for one in each for name, kind in one.types.items()},
+        {
+            name: Held(frozenset().union(*(own.types for own in owns)), any(own.lacks_definition for own in owns))
+            for name, owns in held.items()
+            if owns
+        },
+        counts,
+        tuple(span for one in each for span in one.file_spans_ns),
+        tuple(span for one in each for span in one.path_spans_ns),
+        tuple(note for one in each for note in one.notes),
+        _renumbered(each, names),
+        tuple(transform for one in each for transform in one.transforms),
+        tuple(dict.fromkeys(text for one in each for text in one.descriptions)),
+        tuple(each),
+    )
+
+
+def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, tuple[TopicColumns, ...]]:
+    """Columns of all recordings, which arrive in order of log time; at one time in that of the recordings."""
+    arrivals, logs = [], []
+    for one in each:
+        found = [part.arrivals for parts in one.columns.values() for part in parts] or [_NOTHING]
+        arrival, log_ns = (np.concatenate(column) for column in zip(*found, strict=True))
+        order = np.argsort(arrival, kind="stable")
+        arrivals.append(arrival[order])
+        logs.append(log_ns[order])
+    place = np.empty(sum(map(len, logs)), dtype=np.int64)
+    place[np.argsort(np.concatenate(logs), kind="stable")] = np.arange(len(place))
+    columns: dict[str, list[TopicColumns]] = {name: [] for name in names if any(name in one.columns for one in each)}
+    at = 0
+    for one, arrival in zip(each, arrivals, strict=True):
+        own = place[at : at + len(arrival)]
+        at += len(arrival)
+
+        def renumbered(of: Stamps, arrival: Stamps = arrival, own: Stamps = own) -> Stamps:
+            return np.asarray(own[np.searchsorted(arrival, of)])
+
+        for name, parts in one.columns.items():
+            columns[name] += [part.arriving(renumbered) for part in parts]
+    return {name: tuple(parts) for name, parts in columns.items()}
+
+
+_NOTHING = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
+
+
+def _opened(
+    path: Path, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
+) -> Recording:
+    with open_bags([path]) as bag:
+        types = bag.topics
+        moving = {topic for topic, kind in types.items() if is_kept(kind)}
+        static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
+        if topics is not None:
+            found = topics.found_in(types)
+            moving, static = moving & {found.dvl, found.gnss, found.imu}, set()
+        one_by_one = static | {topic for topic in moving if not _is_read_in_columns(types[topic])}
+        counts = bag.message_counts
+        collectors = {
+            topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
+        }
+        left = dict.fromkeys(static, MOST_STATIC)
+        transforms: list[Any] = []
+        descriptions: list[str] = []
+        start_ns, end_ns = bag.span_ns
+        for window in windows(bag, moving | static, one_by_one):
+            for part in window.parts:
+                topic = part.channel.topic
+                if topic in collectors:
+                    collectors[topic].take(part)
+                    continue
+                for message, _ in islice(part.messages(), left[topic]):
+                    left[topic] -= 1
+                    if message is not None and types[topic] == TF_TYPE:
+                        transforms += list(message.transforms)
+                    elif message is not None:
+                        descriptions.append(message.data)
+            on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
+        return Recording(
+            (path,),
+            types,
+            {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types},
+            counts,
+            tuple(bag.file_spans_ns),
+            tuple(bag.span_of_each_ns),
+            tuple(bag.notes),
+            {topic: (collector.columns(),) for topic, collector in collectors.items()},
+            tuple(transforms),
+            tuple(dict.fromkeys(descriptions)),
+        )
+
+
+def _is_read_in_columns(kind: str) -> bool:
+    return kind == IMU_TYPE or VELOCITY_TYPES[kind].is_read_in_columns
+
+
+def _is_static(topic: str, kind: str) -> bool:
+    name = topic.rsplit("/", 1)[-1]
+    return (kind == TF_TYPE and name == "tf_static") or (kind == STRING_TYPE and name == "robot_description")

@@ -1,0 +1,232 @@
+"""Kept messages to samples, thousands at once: the same samples, refusals and problems as one by one."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.frames import FLU_FROM_FRD, Array
+from ..calibration.samples import (
+    FRAME_CODES,
+    Covariances,
+    DvlSample,
+    ImuSample,
+    Mask,
+    ReferenceSample,
+    SampleBlock,
+    Stamps,
+    Stream,
+    Streams,
+    no_samples,
+    sample_block,
+)
+from ..messages.decode import TURNED_COVARIANCE, WRONG_FRAME, MessageDecoder, Refusal
+from .columns import Laid, TopicColumns
+
+# Messages of a stretch: enough for columns to pay, few enough for what is made of them to stay in the caches.
+STRETCH_MESSAGES = 4096
+Decoded = DvlSample | ReferenceSample | ImuSample | Refusal
+Row = tuple[int, int, Any, str]
+"""Arrival, log time (ns), message (None if it cannot be decoded) and then why."""
+
+
+class Stretch(NamedTuple):
+    """What messages that follow each other in a recording are. log_ns: of the last of them."""
+
+    streams: Streams
+    log_ns: int
+
+
+def stretches(
+    columns: Mapping[Stream, Sequence[TopicColumns]], decoder: MessageDecoder, size: int | None = None
+) -> Iterator[Stretch]:
+    """All messages of streams, so many at a time; `SampleBlock.arrival` has their order of log time.
+
+    columns: of each stream's topic, a part for each recording.
+    """
+    at_once = STRETCH_MESSAGES if size is None else size
+    all_parts = [part for parts in columns.values() for part in parts]
+    arrival = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *(part.arrivals[0] for part in all_parts)]))
+    ends = [*arrival[at_once::at_once].tolist(), int(arrival[-1]) + 1] if len(arrival) else []
+    cut = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
+    for index in range(len(ends)):
+        log_ns = max(each.newest_ns(index) for cuts in cut.values() for each in cuts)
+        dvl, reference, imu = (
+            _block(
+                stream,
+                [laid for each in cut[stream] if len(laid := each.laid(index))],
+                [each.singles(index) for each in cut[stream]],
+                decoder,
+            )
+            for stream in (Stream.DVL, Stream.REFERENCE, Stream.IMU)
+        )
+        yield Stretch(Streams(dvl, reference, imu), log_ns)
+
+
+class _Cut:
+    """A topic's messages, cut where stretches end."""
+
+    def __init__(self, part: TopicColumns, ends: Sequence[int]) -> None:
+        """ends: arrivals, of each stretch the first that it does not hold."""
+        self._part = part
+        self._laid = [0, *np.searchsorted(part.laid.arrival, ends).tolist()]
+        self._singles = [0, *np.searchsorted(part.singles.arrival, ends).tolist()]
+
+    def laid(self, index: int) -> Laid:
+        return self._part.laid.part(slice(self._laid[index], self._laid[index + 1]))
+
+    def singles(self, index: int) -> Iterator[Row]:
+        return self._part.singles.messages(slice(self._singles[index], self._singles[index + 1]))
+
+    def newest_ns(self, index: int) -> int:
+        """Log time of the last message of this stretch or of those before; 0 without any."""
+        both = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
+        return max(int(each.log_ns[end - 1]) if end else 0 for each, end in both)
+
+
+def _block(
+    stream: Stream, laid: Sequence[Laid], singles: Sequence[Iterator[Row]], decoder: MessageDecoder
+) -> SampleBlock:
+    """The messages of one stream, in their order of arrival."""
+    # a frame is judged when the first message of it arrives: the DVL's first is its own
+    pending = deque(sorted(first for each in laid for first in _first_of_frames(each)))
+    judge: Callable[[str], object] = {
+        Stream.DVL: decoder.accepts_dvl_frame, Stream.REFERENCE: decoder.reference_frame,
+        Stream.IMU: decoder.note_imu_frame,
+    }[stream]  # fmt: skip
+    rows: list[tuple[int, Decoded]] = []
+    decode: Callable[[Any, int], Decoded] = {
+        Stream.DVL: decoder.dvl, Stream.REFERENCE: decoder.reference, Stream.IMU: decoder.imu
+    }[stream]  # fmt: skip
+    for arrival, log_ns, message, why in heapq.merge(*singles, key=lambda row: row[0]):
+        while pending and pending[0][0] < arrival:
+            judge(pending.popleft()[1])
+        rows.append((arrival, decoder.undecodable(stream, why) if why else decode(message, log_ns)))
+    for _, name in pending:
+        judge(name)
+    make = _imu if stream is Stream.IMU else _velocity
+    blocks = [make(stream, each, decoder) for each in laid] + ([_of_rows(stream, rows)] if rows else [])
+    if not blocks:
+        return no_samples(stream)
+    block = blocks[0]
+    for other in blocks[1:]:
+        block = block.joined(other)
+    return block if len(blocks) == 1 else block.part(np.argsort(block.arrival, kind="stable"))
+
+
+def _first_of_frames(laid: Laid) -> list[tuple[int, str]]:
+    """Arrival of the first message of each frame, and the frame's name."""
+    if (laid.frame == laid.frame[0]).all():
+        places = [int(laid.frame[0])]
+    else:
+        places = np.flatnonzero(np.bincount(laid.frame)).tolist()
+    return [(int(laid.arrival[np.argmax(laid.frame == place)]), laid.frames[place]) for place in places]
+
+
+def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
+    """Of the DVL or of the reference, once all frames are judged."""
+    refused = np.zeros(len(laid), dtype=np.uint8)
+    reasons: list[str] = []
+    frames = np.zeros(len(laid), dtype=np.uint8)
+    values, covariances = laid.values, laid.covariances
+    names = {place: laid.frames[place] for place in np.flatnonzero(np.bincount(laid.frame)).tolist()}
+    is_other = np.zeros(len(laid.frames), dtype=bool)
+    broken: list[tuple[str, Any]] = []
+    if stream is Stream.DVL:
+        for place, name in names.items():
+            is_other[place] = name != decoder.dvl_frame
+        broken = [(rule.counter, laid.broken == code) for code, rule in enumerate(decoder.dvl_type.rules, start=1)]
+    else:
+        codes = np.zeros(len(laid.frames), dtype=np.uint8)
+        down = np.zeros(len(laid.frames), dtype=bool)
+        for place, name in names.items():
+            said = decoder.reference_frame(name)
+            is_other[place] = said is None
+            codes[place] = 0 if said is None else FRAME_CODES[said.frame]
+            down[place] = said is not None and said.points_down
+        frames = codes[laid.frame]
+        if down.any():
+            values, covariances = _turned(values, covariances, down[laid.frame])
+    for reason, is_broken in [(WRONG_FRAME, is_other[laid.frame]), *broken]:
+        new = is_broken & (refused == 0)
+        if new.any():
+            refused[new] = 1 + _place(reasons, reason)
+    if stream is Stream.DVL and not refused.all():
+        decoder.note_axes()
+        if decoder.turns_dvl:
+            values, covariances = _turned(values, covariances, np.ones(len(laid), dtype=bool))
+    return sample_block(
+        stream, _stamped(stream, laid, decoder, refused), values, covariance=covariances, frames=frames,
+        arrival=laid.arrival, refused=refused, reasons=reasons,
+    )  # fmt: skip
+
+
+def _turned(values: Array, covariances: Covariances, which: Mask) -> tuple[Array, Covariances]:
+    """Those of N velocities that are forward-right-down (N,) as forward-left-up, with their covariances."""
+    if which.all():
+        return values * FLU_FROM_FRD.diagonal(), Covariances(
+            covariances.distinct * TURNED_COVARIANCE, covariances.index
+        )
+    n = len(covariances.distinct)
+    both = np.concatenate([covariances.distinct, covariances.distinct * TURNED_COVARIANCE])
+    index = np.where(which & (covariances.index >= 0), covariances.index + n, covariances.index)
+    return np.where(which[:, None], values * FLU_FROM_FRD.diagonal(), values), Covariances(both, index.astype(np.intp))
+
+
+def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
+    """Attitudes and angular velocities."""
+    refused = np.zeros(len(laid), dtype=np.uint8)
+    stamps_ns = _stamped(stream, laid, decoder, refused)
+    block = sample_block(stream, stamps_ns, laid.values, arrival=laid.arrival, refused=refused)
+    return decoder.imu_alignment.block(block)
+
+
+def _stamped(stream: Stream, laid: Laid, decoder: MessageDecoder, refused: Any) -> Stamps:
+    """Stamps, with the log time where there is none."""
+    is_zero = (laid.stamps_ns == 0) & (refused == 0)
+    if is_zero.any():
+        decoder.note_zero_stamps(stream, int(np.count_nonzero(is_zero)))
+    return np.where(is_zero, laid.log_ns, laid.stamps_ns)
+
+
+def _of_rows(stream: Stream, rows: list[tuple[int, Decoded]]) -> SampleBlock:
+    """Messages that were decoded one by one."""
+    n = len(rows)
+    reasons: list[str] = []
+    refused, frames = np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
+    stamps_ns = np.zeros(n, dtype=np.int64)
+    values = np.full((n, 7 if stream is Stream.IMU else 3), np.nan)
+    distinct: list[Array] = []
+    index = np.full(n, -1, dtype=np.intp)
+    for row, (_, decoded) in enumerate(rows):
+        if isinstance(decoded, Refusal):
+            refused[row] = 1 + _place(reasons, decoded.reason)
+            continue
+        stamps_ns[row] = decoded.stamp_ns
+        if isinstance(decoded, ImuSample):
+            values[row, :4] = np.nan if decoded.orientation is None else decoded.orientation
+            values[row, 4:] = np.nan if decoded.angular_velocity is None else decoded.angular_velocity
+            continue
+        values[row] = decoded.velocity
+        if isinstance(decoded, ReferenceSample):
+            frames[row] = FRAME_CODES[decoded.frame]
+        if decoded.covariance is not None:
+            if not distinct or distinct[-1] is not decoded.covariance:
+                distinct.append(decoded.covariance)
+            index[row] = len(distinct) - 1
+    covariances = Covariances(np.array(distinct).reshape(-1, 3, 3), index)
+    arrival = np.array([arrival for arrival, _ in rows], dtype=np.int64)
+    return sample_block(
+        stream, stamps_ns, values, covariance=covariances, frames=frames, arrival=arrival, refused=refused,
+        reasons=reasons,
+    )  # fmt: skip
+
+
+def _place(reasons: list[str], reason: str) -> int:
+    if reason not in reasons:
+        reasons.append(reason)
+    return reasons.index(reason)

@@ -1,0 +1,73 @@
+"""Each command reads the bytes of each recording once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from command_line import succeed
+from io_fixtures import run, storage_file, write_bag
+
+from dvl_calib_ros.bags import sources
+from dvl_calib_ros.bags.sources import Source
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("opened")
+    later = [each._replace(stamp_ns=each.stamp_ns + 10**12) for each in run(60.0)]
+    found = {"BAG": write_bag(folder / "one", run(60.0)), "OTHER": write_bag(folder / "other", later, "sqlite3")}
+    cut = folder / "cut.mcap"
+    content = storage_file(found["BAG"]).read_bytes()
+    cut.write_bytes(content[: -len(content) // 10] + bytes(100))
+    return found | {"CUT": cut}
+
+
+@pytest.fixture
+def passes(monkeypatch) -> Counter[str]:
+    """How often each file was opened, and read from beginning to end."""
+    counted: Counter[str] = Counter()
+    opened = sources.open_source
+
+    def counting(path, *arguments, **options):
+        source = opened(path, *arguments, **options)
+        counted[f"opened {source.path.name}"] += 1
+        read = source.batches
+
+        def batches(topics):
+            counted[f"read {source.path.name}"] += 1
+            return read(topics)
+
+        return Source(source.path, source.counts, source.span_ns, batches, source.damage_noted)
+
+    monkeypatch.setattr("dvl_calib_ros.bags.reader.open_source", counting)
+    return counted
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "doctor BAG", "doctor CUT", "doctor BAG OTHER", "replay BAG", "replay BAG OTHER", "replay CUT",
+        "replay BAG -p prior_source:=reference", "replay BAG --report REPORT", "diagnose BAG", "diagnose BAG OTHER",
+        "diagnose BAG --simulator OTHER", "compare BAG OTHER", "evaluate BAG OTHER --models G1 --jobs 1",
+        "simulate NEW --duration 20 --motion-of BAG",
+    ],
+)  # fmt: skip
+def test_a_command_opens_and_reads_each_recording_once(words, bags, passes, tmp_path, capsys):
+    named = bags | {"REPORT": tmp_path / "report.html", "NEW": tmp_path / "new"}
+    command, *arguments = words.split()
+    succeed(capsys, command, *(named.get(word, word) for word in arguments))
+    files = {name: bags[name] if bags[name].is_file() else storage_file(bags[name]) for name in bags}
+    expected = {
+        f"{what} {files[name].name}": 1 for name in files if name in words.split() for what in ("opened", "read")
+    }
+    assert passes == expected
+
+
+def test_a_replay_from_an_initial_calibration_reads_once_though_it_runs_twice(bags, passes, tmp_path, capsys):
+    saved = tmp_path / "saved.yaml"
+    succeed(capsys, "replay", bags["BAG"], "--save", saved)
+    passes.clear()
+    succeed(capsys, "replay", bags["OTHER"], "-p", f"initial_calibration:={saved}")
+    assert set(passes.values()) == {1}
