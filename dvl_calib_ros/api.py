@@ -73,8 +73,10 @@ class Mounting:
     nominal_rpy_deg
         What the calibration began with.
     xyz_m, xyz_std_m
-        Lever arm: position of the DVL in the body, m, as it was found, else as it was given; its standard deviations,
-        nan where the model has no lever arm.
+        Lever arm: position of the DVL from the reference point, body frame, m, as it was found, else as it was given;
+        its standard deviations, nan where the model has no lever arm.
+    position_m
+        The DVL in the body, m; None where nothing says where the reference point is.
     time_offset_s, time_offset_std_s
         By how much the DVL's stamps are late, s, likewise; of several recordings in the last one (`Result.delays`).
     scale_percent, scale_std_percent
@@ -94,13 +96,14 @@ class Mounting:
     scale_std_percent: float
     base_frame: str
     dvl_frame: str
+    position_m: tuple[float, float, float] | None = None
 
     @property
     def urdf(self) -> str:
         """The origin of the DVL's joint, to paste into a URDF: of forward-left-up axes, as `mounting_rpy` is."""
         from .files.urdf import origin_tag
 
-        return origin_tag(self.xyz_m, np.radians(self.rpy_deg))
+        return origin_tag(self.position_m, np.radians(self.rpy_deg))
 
     def __str__(self) -> str:
         angles = (
@@ -175,6 +178,7 @@ class Calibration:
             100.0 * float(scale[0]) if len(scale) else math.nan,
             parameters.base_frame,
             self.replayed.dvl_frame,
+            result.position_in_body,
         )
 
     def correct(self, velocity_dvl: Array) -> Array:

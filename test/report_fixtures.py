@@ -114,7 +114,7 @@ def recorded(bag: Path, **parameters: Any) -> Replayed:
 def replay_page(folder: Path, samples=None, models=FEW, **bag_options: Any) -> tuple[Path, Replayed]:
     """A report of a small bag with these models' estimates, and what was replayed."""
     bag = write_bag(folder / "bag", run() if samples is None else samples, **bag_options)
-    replayed = recorded(bag)
+    replayed = recorded(bag, dvl_position="told")
     path = folder / "report.html"
     write_replay_report(path, replayed, [bag], list(models))
     return path, replayed

@@ -219,6 +219,12 @@ _KINDS = (
         "turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
     ),
     FindingKind(
+        "POSITION_UNKNOWN",
+        "publish_tf is set, but nothing says where in {base} the reference point is, nor so the DVL; no transform is",
+        "The lever arm is the DVL's position from the reference point (an antenna, an INS), not from base_frame.",
+        "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's frame",
+    ),
+    FindingKind(
         "TF_NOT_THERE",
         "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, no transform is",
         "ROS from PyPI has no tf2_ros; a ROS installation has.",

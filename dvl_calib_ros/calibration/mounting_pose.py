@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,8 @@ from .error_model import corrected_mounting
 from .frames import FLU_FROM_FRD, Array
 from .kalman import GaussianState
 from .models import Model
-from .observability import scale_std_ahead
-from .parameters import Parameters
+from .observability import observability, scale_std_ahead
+from .parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
 
 _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 
@@ -20,7 +21,7 @@ _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 class MountingPose(NamedTuple):
     """A DVL's frame in the body.
 
-    position: (3,) m from the reference point, body frame. rotation_body_from_dvl: (3, 3), of the frame that the
+    position: (3,) m in the body, nan where it is not known. rotation_body_from_dvl: (3, 3), of the frame that the
     driver's data are in. covariance: (6, 6) of position (m²) and of a small turn about the body's axes (rad²), as in
     geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of what the model does not estimate.
     """
@@ -28,6 +29,26 @@ class MountingPose(NamedTuple):
     position: tuple[float, float, float]
     rotation_body_from_dvl: Array
     covariance: Array
+
+
+def position_in_body(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float] | None:
+    """Where the DVL is in the body (3,) m, by one model's state x (n,), P (n, n); None where that is not known.
+
+    The lever arm is from the reference point, of which `dvl_position` says what is known. On an axis that the data do
+    not show it is as it was given; if it was not given, nothing is known.
+    """
+    if parameters.dvl_position == UNKNOWN:
+        return None
+    given = np.array(parameters.lever_arm)
+    arm = given
+    if parameters.dvl_position == FROM_REFERENCE:
+        seen = {each.name for each in observability(model, state.p, parameters) if each.observed}
+        shown = np.array([name in seen for name in _ARM])
+        if not given.any() and not shown.all():
+            return None
+        arm = np.where(shown, lever_arm(model, state, given.tolist()), given)
+    x, y, z = (arm + parameters.reference_position).tolist()
+    return x, y, z
 
 
 def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, turned: bool = False) -> MountingPose:
@@ -54,8 +75,12 @@ def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, tu
     covariance = terms @ state.p @ terms.T
     missing = ~terms.any(axis=1)
     covariance[missing, missing] = NOT_ESTIMATED
+    position = position_in_body(model, state, parameters)
+    if position is None or parameters.dvl_position == TOLD:
+        covariance[:3] = covariance[:, :3] = 0.0
+        covariance[[0, 1, 2], [0, 1, 2]] = NOT_ESTIMATED
     return MountingPose(
-        lever_arm(model, state, parameters.lever_arm), rotation @ FLU_FROM_FRD if turned else rotation, covariance
+        (math.nan,) * 3 if position is None else position, rotation @ FLU_FROM_FRD if turned else rotation, covariance
     )
 
 

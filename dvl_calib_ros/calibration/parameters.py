@@ -24,6 +24,7 @@ from .samples import VelocityFrame
 AUTO = "auto"
 IAC = "iac"
 FROM_FRAME_ID = "from_frame_id"
+UNKNOWN, TOLD, FROM_REFERENCE = "unknown", "told", "from_reference"
 FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
 IMU_ENU, IMU_NED = "enu", "ned"
 XYZ, XY = "xyz", "xy"
@@ -203,6 +204,20 @@ class Parameters:
         unit="m",
         low=-100.0,
         high=100.0,
+    )
+    reference_position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "Position in base_frame of the reference point (antenna, INS): added to the lever arm, it is the DVL's.",
+        unit="m",
+        low=-100.0,
+        high=100.0,
+    )
+    dvl_position: str = _parameter(
+        UNKNOWN,
+        "What is known of the DVL's position in base_frame. from_reference: reference_position plus the lever arm, as "
+        "it is found; told: the same with lever_arm as it is given, for the reference's place is not known; unknown: "
+        "no position is written to URDF, TF or launch files.",
+        choices=(UNKNOWN, TOLD, FROM_REFERENCE),
     )
     imu_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),

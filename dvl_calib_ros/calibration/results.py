@@ -10,8 +10,11 @@ import numpy as np
 
 from .error_model import correct, corrected_mounting
 from .frames import Array
+from .kalman import GaussianState
 from .models import MODELS
+from .mounting_pose import position_in_body
 from .observability import Convergence, Observability
+from .parameters import Parameters
 from .selection import Segment
 from .verification import Verification
 
@@ -163,6 +166,13 @@ class Result:
     def estimate(self) -> Estimate:
         """The selected model's estimate."""
         return self.estimates[self.selected]
+
+    @property
+    def position_in_body(self) -> tuple[float, float, float] | None:
+        """Where the DVL is in the body (3,) m, by the selected model; None where that is not known."""
+        estimate = self.estimate
+        state = GaussianState(estimate.state, estimate.covariance)
+        return position_in_body(MODELS[estimate.model], state, Parameters.from_mapping(self.parameters))
 
     @property
     def own_days(self) -> tuple[Day, ...]:

@@ -166,7 +166,7 @@ def _origin(replayed: Replayed) -> str:
     result = replayed.result
     parameters = Parameters.from_mapping(result.parameters)
     rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
-    arm = result.estimate.lever_arm(parameters.lever_arm)
+    arm = result.position_in_body
     tag = origin_tag(arm, rpy_from_rotation(rotation))
     if not replayed.turned:
         return tag

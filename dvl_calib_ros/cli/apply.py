@@ -102,17 +102,21 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
     import numpy as np
     from rich.markup import escape
 
-    from ..files.mounting import scale_advice
+    from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
     errors, out = common.console(stderr=True), common.console()
     for sentence in (*calibrated.objections, *calibrated.doubts):
         errors.print(f"[yellow]warning:[/] {arguments.result}: {escape(sentence)}", soft_wrap=True)
     degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(calibrated.rpy))
+    known = calibrated.position is not None
+    transform = (
+        f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if known else POSITION_UNKNOWN
+    )
     lines = (
         f"{calibrated.model.name}: {calibrated.dvl_frame} in {calibrated.base_frame} at roll, pitch, yaw {degrees}",
         f'URDF:   rpy="{numbers(calibrated.rpy)}" (of {calibrated.dvl_frame} in {calibrated.base_frame})',
-        f"TF:     ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}",
+        f"TF:     {transform}",
         f"scale:  {scale_advice(calibrated)}",
     )
     for line in lines:
@@ -120,7 +124,7 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
     if any(calibrated.lever_arm):
         found = "found" if calibrated.lever_arm_found else "as lever_arm says"
         at = " ".join(f"{value:+.2f}" for value in calibrated.lever_arm)
-        out.print(f"position: {at} m from the reference point, {found}", soft_wrap=True)
+        out.print(f"lever arm: {at} m from the reference point, {found}", soft_wrap=True)
     if calibrated.dvl_time_offset:
         late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         out.print(
@@ -128,8 +132,9 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
             "delay; --params writes dvl_time_offset, or set the DVL's clock",
             soft_wrap=True,
         )
-    if not any(calibrated.lever_arm):
-        out.print("position: lever_arm is not set, so the static transform is at 0 0 0", soft_wrap=True)
+    if calibrated.position is not None:
+        at = " ".join(f"{value:+.2f}" for value in calibrated.position)
+        out.print(f"position: {at} m in {calibrated.base_frame}", soft_wrap=True)
 
 
 def _roll_back(arguments: argparse.Namespace) -> None:

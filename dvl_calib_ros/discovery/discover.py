@@ -17,7 +17,7 @@ import numpy as np
 from ..calibration.coarse_mounting import DELAYS_S
 from ..calibration.directions import Directions
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
-from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
+from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
@@ -228,6 +228,33 @@ class _Search:
                 f"lever arm {_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} says where the "
                 "DVL sits; half a metre turns the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
             )
+        self._know_position(placed, reference)
+
+    def _know_position(self, placed: Placed | None, reference: Look | None) -> None:
+        """Say what is known of the DVL's position in the body, which the lever arm alone is not."""
+        if self._gives("dvl_position"):
+            return
+        told = placed is not None and bool(placed.source) and not self._gives("lever_arm")
+        at = None if reference is None else self._known_reference_position(reference)
+        if self._gives("reference_position"):
+            at = np.array(self._parameters.reference_position)
+        if at is not None and reference is not None:
+            self._values["dvl_position"] = FROM_REFERENCE
+            if at.any() and not self._gives("reference_position"):
+                self._values["reference_position"] = tuple((at + 0.0).tolist())
+        elif told:
+            self._values["dvl_position"] = TOLD
+
+    def _known_reference_position(self, reference: Look) -> Array | None:
+        """Where in the body the reference point is; None if nothing says."""
+        placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
+        if placed is not None and placed.source:
+            return placed.position
+        base = self._parameters.base_frame
+        named = frame_named(reference.frame_id, (base, self._values.get("base_frame", base)))
+        in_body = self._reference_frame(reference) is VelocityFrame.BODY
+        says_body = named is not None and named.frame is VelocityFrame.BODY
+        return np.zeros(3) if in_body and says_body else None
 
     def _place_dvl(self, dvl: Look) -> Placed | None:
         base_frame = self._parameters.base_frame

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.frames import Array, rpy_from_rotation
-from ..calibration.parameters import FLU, FROM_MESSAGE, Parameters
+from ..calibration.parameters import FLU, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from .transforms import FrameTree
 
 # The range of parameter lever_arm, m: more is a transform in another unit.
@@ -18,13 +18,14 @@ FARTHEST = 100.0
 
 class Frames(NamedTuple):
     """frame_ids of the streams' messages, '' where none has come. points_down: the DVL's data are
-    forward-right-down.
+    forward-right-down. reference_in_body: the reference is the velocity of the body's own frame.
     """
 
     dvl: str
     reference: str
     imu: str
     points_down: bool
+    reference_in_body: bool = False
 
 
 class Placement(NamedTuple):
@@ -54,9 +55,15 @@ def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Co
             values["dvl_axes"] = FLU  # the transform is of the driver's own axes, which the data are in
     if "lever_arm" not in given:
         reference = tree.placed(frames.reference, parameters.base_frame) if frames.reference else None
-        position = placed.position - (np.zeros(3) if reference is None else reference.position)
+        at = np.zeros(3) if reference is None else reference.position
+        position = placed.position - at
         if np.abs(position).max() <= FARTHEST:
             values["lever_arm"] = _numbers(position)
+            if "dvl_position" not in given:
+                known = frames.reference_in_body or (reference is not None and bool(reference.source))
+                values["dvl_position"] = FROM_REFERENCE if known else TOLD
+                if "reference_position" not in given and at.any():
+                    values["reference_position"] = _numbers(at)
             said.append("lever arm " + " ".join(f"{value:.3g}" for value in values["lever_arm"]) + " m")
     imu = tree.placed(frames.imu, parameters.base_frame) if frames.imu else None
     if imu is not None and imu.source and "imu_rpy" not in given and not np.allclose(imu.rotation, np.eye(3)):

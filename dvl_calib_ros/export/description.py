@@ -15,7 +15,7 @@ from ..calibration.frames import rotation_from_rpy, rpy_from_rotation
 from ..effects.base import ActsOn, AnyEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
-from ..files.mounting import load_calibrated_mounting
+from ..files.mounting import POSITION_UNKNOWN, load_calibrated_mounting
 from ..files.parameter_files import load_parameters
 from ..files.reading import read_file
 from ..files.result_file import FORMAT
@@ -203,10 +203,14 @@ def _of_result(path: Path) -> DvlDescription:
     return DvlDescription(
         source=str(path),
         mounting_rpy=_three(rpy_from_rotation(calibrated.rotation_body_from_dvl)),
-        lever_arm=_three(calibrated.lever_arm),
+        lever_arm=_three(calibrated.position or (0.0, 0.0, 0.0)),
         scale=_three(calibrated.scale),
         others=(Other("dvl_time_offset", {"seconds": late}),) if late else (),
-        doubts=(*calibrated.objections, *calibrated.doubts),
+        doubts=(
+            *calibrated.objections,
+            *calibrated.doubts,
+            *([] if calibrated.position is not None else [f"{POSITION_UNKNOWN}; the DVL is put at 0 0 0"]),
+        ),
     )
 
 

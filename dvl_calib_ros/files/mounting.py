@@ -18,7 +18,7 @@ from ..calibration.error_model import corrected_mounting
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
-from ..calibration.mounting_pose import scale_and_delay
+from ..calibration.mounting_pose import position_in_body, scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
 from ..calibration.verification import Word, use_findings
@@ -34,6 +34,10 @@ SAME_MOUNTING = 2e-3
 SAME_POSITION = 0.011
 # Below this there is nothing to write, rad and m: nine digits are written.
 ALREADY = 1e-7
+POSITION_UNKNOWN = (
+    "the DVL's position in the body is not known, for nothing says where the reference point is: set dvl_position "
+    "to from_reference, with reference_position, and calibrate again, or record the transform of the reference's frame"
+)
 FUSION_NODE = "ekf_filter_node"
 
 
@@ -42,7 +46,8 @@ class CalibratedMounting:
     """The selected model's calibration of a result file.
 
     rotation_body_from_dvl (3, 3): corrected, of the forward-left-up axes that are calibrated. turned: whether the
-    driver's data, in dvl_frame, are forward-right-down, and were turned to those. scale (3,): δk per DVL axis, 0 where
+    driver's data, in dvl_frame, are forward-right-down, and were turned to those. position: (3,) m in the body, None
+    where that is not known. scale (3,): δk per DVL axis, 0 where
     not estimated; scale_ahead: of motion ahead. lever_arm (3,): m from the reference point, body frame, and
     dvl_time_offset: s, positive late; as they were found, else as the parameters say. objections: why it should not be
     applied; doubts: what to know when it is; both in sentences.
@@ -60,6 +65,7 @@ class CalibratedMounting:
     turned: bool = False
     lever_arm: tuple[float, ...] = (0.0, 0.0, 0.0)
     dvl_time_offset: float = 0.0
+    position: tuple[float, ...] | None = None
 
     @property
     def lever_arm_found(self) -> bool:
@@ -94,9 +100,11 @@ class CalibratedMounting:
 
     @property
     def static_transform(self) -> str:
-        """Arguments of tf2's static_transform_publisher."""
+        """Arguments of tf2's static_transform_publisher. Raises InputError where the position is not known."""
+        if self.position is None:
+            raise InputError(f"{self.path}: {POSITION_UNKNOWN}")
         quaternion = quaternion_from_rotation(self.rotation_body_from_dvl_frame)
-        return static_transform_arguments(self.lever_arm, quaternion, self.base_frame, self.dvl_frame)
+        return static_transform_arguments(self.position, quaternion, self.base_frame, self.dvl_frame)
 
 
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:
@@ -122,13 +130,13 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
             raise InputError(f"{path}: {frame!r} is no name of a frame; letters, digits and _ . / - make one")
     errors = model.error_terms_from_state @ state.x
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
-    position = lever_arm(model, state, parameters.lever_arm)
+    arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
     if not angle_between(rotation, saved) < 1e-6:
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     doubts += _unseen(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
     return CalibratedMounting(
-        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, position, delay
+        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, arm, delay, position
     )
 
 
@@ -197,7 +205,8 @@ def calibrated_urdf(
     begun_with = calibrated.parameters.rotation_dvl_from_body.T
     if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
         corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
-    position = np.array(calibrated.lever_arm) if calibrated.lever_arm_found and not keep_position else mounting.position
+    moves = calibrated.position is not None and calibrated.lever_arm_found and not keep_position
+    position = np.array(calibrated.position) if moves else mounting.position
     is_there = np.abs(mounting.position - position).max() < ALREADY
     if angle_between(now, corrected) < ALREADY and is_there:
         return urdf.content
@@ -208,13 +217,12 @@ def calibrated_urdf(
             f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
             "or write the calibrated one all the same with --force"
         )
-    began_at = np.array(calibrated.parameters.lever_arm)
+    began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
     if not is_there and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
         raise InputError(
             f"{urdf.path}: has the DVL at {numbers(mounting.position)} in {calibrated.base_frame} (joint "
-            f"{mounting.joint.name}), but {calibrated.path} began with lever_arm {numbers(began_at)} and found "
-            f"{numbers(_rounded(position))} from the reference point; --keep-position turns the joint alone, --force "
-            f"moves it there, which is right if the reference velocity is that of {calibrated.base_frame}'s origin"
+            f"{mounting.joint.name}), but {calibrated.path} began with {numbers(began_at)} and found "
+            f"{numbers(_rounded(position))}; --keep-position turns the joint alone, --force moves it there"
         )
     return urdf.moved(mounting, corrected, None if is_there else position)
 

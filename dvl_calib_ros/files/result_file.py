@@ -21,7 +21,7 @@ from ..calibration.folds import with_states_of
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
-from ..calibration.mounting_pose import mounting_pose, scale_and_delay
+from ..calibration.mounting_pose import mounting_pose, position_in_body, scale_and_delay
 from ..calibration.observability import Convergence
 from ..calibration.parameters import FLU, FRD, Parameters
 from ..calibration.results import Estimate, Result
@@ -63,10 +63,10 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
     to_frame = quaternion_from_rotation(corrected @ FLU_FROM_FRD) if turned else quaternion
     verification = result.verifications.get(result.selected)
     parent, child = parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
-    lever_arm = estimate.lever_arm(parameters["lever_arm"]).tolist()
     model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance)
     checked = Parameters.from_mapping(parameters)
     pose = mounting_pose(model, state, checked, turned)
+    position = position_in_body(model, state, checked)
     beside = scale_and_delay(model, state, checked)
     return {
         "format": FORMAT,
@@ -87,7 +87,8 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
             "corrected_rpy": rpy.tolist(),
             "corrected_quaternion_xyzw": list(quaternion),
             "scale_error_xyz": estimate.scale.tolist(),
-            "lever_arm": lever_arm,
+            "lever_arm": estimate.lever_arm(parameters["lever_arm"]).tolist(),
+            "position": None if position is None else list(position),
             "pose_covariance": pose.covariance.tolist(),
             "scale_error_ahead": beside.scale,
             "scale_error_ahead_std": beside.scale_std,
@@ -96,7 +97,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
             "dvl_data_axes": FRD if turned else FLU,
             "frame_id": parent,
             "child_frame_id": child,
-            "static_transform_publisher": _static_transform_publisher(lever_arm, to_frame, parent, child),
+            "static_transform_publisher": _static_transform_publisher(position, to_frame, parent, child),
         },
         **days_document(result),
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
@@ -136,7 +137,9 @@ def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
     return words
 
 
-def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str:
+def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str | None:
+    if position is None:
+        return None
     return (
         f"ros2 run tf2_ros static_transform_publisher {static_transform_arguments(position, quaternion, parent, child)}"
     )

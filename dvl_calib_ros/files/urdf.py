@@ -123,8 +123,10 @@ def numbers(values: Sequence[float] | Array) -> str:
     return " ".join(f"{float(value) + 0.0:.9g}" for value in values)
 
 
-def origin_tag(xyz: Sequence[float] | Array, rpy: Sequence[float] | Array) -> str:
-    """A joint's origin to paste: xyz (3,) m to four digits, rpy (3,) rad to a microradian."""
+def origin_tag(xyz: Sequence[float] | Array | None, rpy: Sequence[float] | Array) -> str:
+    """A joint's origin to paste: xyz (3,) m to four digits, none if unknown; rpy (3,) rad to a microradian."""
+    if xyz is None:
+        return f'<origin rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
     position = [float(f"{float(value):.4g}") for value in xyz]
     return f'<origin xyz="{numbers(position)}" rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
 

@@ -32,7 +32,7 @@ from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
-from ..calibration.samples import DvlSample
+from ..calibration.samples import DvlSample, VelocityFrame
 from ..discovery.placement import Frames, not_default, placement
 from ..errors import InputError
 from ..files.atomic import check_writable
@@ -154,10 +154,15 @@ class CalibrationNode(AnsweringNode):
         if tried == self._transforms_tried:
             return
         self._transforms_tried = tried
-        frames = Frames(dvl, reference, imu, decoder.dvl_type.points_down)
+        in_body = decoder.frame_of_reference is VelocityFrame.BODY
+        frames = Frames(dvl, reference, imu, decoder.dvl_type.points_down, in_body)
         parameters = self._calibrator.parameters
         found = placement(self._transforms.tree(), frames, parameters, self._given)
         if found is None or parameters.replace(**found.values) == parameters:
+            return
+        place = {name: value for name, value in found.values.items() if name in ("dvl_position", "reference_position")}
+        if parameters.replace(**found.values) == parameters.replace(**place):  # which nothing was learnt with
+            self._calibrator.set_parameters(parameters.replace(**place))
             return
         self.get_logger().info(f"{found.said}; the calibration begins with it (use_transforms: false does without)")
         self._begin(parameters.replace(**found.values), None)

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..messages.drivers import VELOCITY_TYPES, may_be_recognised, velocity_type
-from ..messages.opening import recognised
+from ..messages.recognised import recognised
 
 
 def velocity_class(parameter: str, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,7 @@ class MountingOutput:
     def __init__(self, node: Any, publisher: Any, broadcasts: bool, warn: Callable[[str], None]) -> None:
         self._publisher = publisher
         self._broadcaster: Any = None
+        self._unknown_in = ""
         if not broadcasts:
             return
         try:
@@ -40,7 +42,8 @@ class MountingOutput:
         turn.x, turn.y, turn.z, turn.w = quaternion_from_rotation(pose.rotation_body_from_dvl)
         message.pose.covariance = pose.covariance.ravel()
         self._publisher.publish(message)
-        if self._broadcaster is None:
+        self._unknown_in = "" if math.isfinite(at.x) else base
+        if self._broadcaster is None or self._unknown_in:
             return
         transform = TransformStamped()
         transform.header, transform.child_frame_id = message.header, dvl
@@ -53,6 +56,8 @@ class MountingOutput:
 
     def problems(self, dvl: str, transforms: Transforms | None) -> list[Finding]:
         """Whether others publish a transform to frame `dvl` beside ours."""
+        if self._broadcaster is not None and self._unknown_in:
+            return [finding("POSITION_UNKNOWN", base=self._unknown_in)]
         if self._broadcaster is None or transforms is None or not transforms.has(dvl):
             return []
         return [finding("TF_TWICE", frame=dvl)]

@@ -55,7 +55,7 @@ def result(tmp_path_factory):
     errors = DvlErrors((0.02, -0.03, 0.05), (0.004,) * 3, beam_std=0.002)
     scenario = Scenario("box", 120.0, imu_rate=20, errors=errors, mounting_rpy=MOUNTING, gnss_std=0.01)
     write_scenario(scenario, bag, Storage.MCAP, Compression.NONE)
-    return bag, replayed(bag, mounting_rpy=MOUNTING).result
+    return bag, replayed(bag, mounting_rpy=MOUNTING, dvl_position="told").result
 
 
 @pytest.fixture(scope="module")
@@ -446,7 +446,7 @@ def displaced(tmp_path_factory):
         effects=(injection("lever_arm:x_m=-1.2,y_m=0.3,z_m=-0.2"), injection("dvl_time_offset:seconds=0.6")),
     )  # fmt: skip
     write_scenario(scenario, bag, Storage.MCAP, Compression.NONE)
-    return bag, replayed(bag).result
+    return bag, replayed(bag, dvl_position="from_reference").result
 
 
 def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_path, displaced, capsys):
@@ -523,11 +523,12 @@ def test_the_joint_is_moved_to_the_lever_arm_that_was_found(tmp_path, displaced,
 def test_python_and_the_terminal_paste_the_origin_that_apply_writes(tmp_path, displaced, capsys):
     bag, _ = displaced
     saved = tmp_path / "result.yaml"
-    assert main(["replay", str(bag), "--save", str(saved)]) == 0
-    mounting = dc.replay(bag).mounting
+    assert main(["replay", str(bag), "-p", "dvl_position:=from_reference", "--save", str(saved)]) == 0
+    mounting = dc.replay(bag, dvl_position="from_reference").mounting
     assert mounting.urdf in capsys.readouterr().out
     document = parsed(saved.read_text())["mounting"]
     np.testing.assert_allclose(mounting.xyz_m, document["lever_arm"], atol=1e-12)
+    np.testing.assert_allclose(mounting.position_m, document["position"], atol=1e-12)
     assert mounting.xyz_m[0] == pytest.approx(-1.2, abs=4.0 * mounting.xyz_std_m[0]) and mounting.xyz_std_m[0] < 0.1
     assert mounting.time_offset_s == document["dvl_time_offset"] == pytest.approx(0.6, abs=0.05)
     assert mounting.time_offset_std_s == document["dvl_time_offset_std"]
@@ -541,7 +542,7 @@ def test_of_a_driver_that_is_forward_right_down_both_origins_are_said(tmp_path, 
     samples = simulate(Scenario("figure8", 60.0, mounting_rpy=(math.pi, 0.0, 0.0)))
     ordered = heapq.merge(samples.imu, samples.gnss, samples.dvl, key=lambda sample: sample.stamp_ns)
     bag, saved = write_bag(tmp_path / "bag", tuple(ordered)), tmp_path / "result.yaml"
-    assert main(["replay", str(bag), "-p", "dvl_axes:=frd", "--save", str(saved)]) == 0
+    assert main(["replay", str(bag), "-p", "dvl_axes:=frd", "-p", "dvl_position:=told", "--save", str(saved)]) == 0
     out = capsys.readouterr().out
     ours, drivers = [
         Rotation.from_euler("xyz", [float(word) for word in rpy.split()])
@@ -560,7 +561,7 @@ def test_a_urdf_with_another_position_is_moved_by_force_only_or_turned_alone(tmp
     saved, urdf = change(tmp_path / "result.yaml", displaced[1]), robot(tmp_path / "robot.urdf", mounting=(0, 0, 0))
     there = place(urdf)
     error = refused(capsys, saved, "--urdf", urdf)
-    assert "began with lever_arm 0 0 0" in error and "--keep-position" in error
+    assert "began with 0 0 0" in error and "--keep-position" in error
     assert apply(saved, "--urdf", urdf, "--keep-position") == 0
     np.testing.assert_allclose(place(urdf), there, atol=1e-12)
     assert difference(mounted(urdf), corrected(saved)) < 1e-8

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from stacks import DVL_STD, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion
@@ -9,6 +11,7 @@ from stacks import DVL_STD, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import ReferenceSample, VelocityFrame
+from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
 from dvl_calib_ros.messages.decode import MessageDecoder, frame_named
 from dvl_calib_ros.replay.replay import replay
@@ -91,3 +94,38 @@ def test_two_dvls_are_two_and_each_is_calibrated_by_itself(tmp_path):
     assert "/starboard/dvl (starboard_dvl_link)" in said and "--dvl-topic /starboard/dvl" in said
     other = discover([bag], Parameters(), Given(dvl_topic="/starboard/dvl"))
     assert other.topics.dvl == "/starboard/dvl" and other.topics.gnss == "/gnss/vel"
+
+
+ANTENNA = (-0.3, 0.0, 0.4)
+
+
+@pytest.mark.parametrize(
+    ("frame", "position"), [("gps_link", LEVER_ARM), ("map", LEVER_ARM), ("base_link", LEVER_ARM), ("", None)]
+)
+def test_what_is_written_is_the_dvl_in_base_link_or_nothing(tmp_path, capsys, frame, position):
+    """The lever arm is from the antenna; where that is nobody knows, the transform of the DVL stands, or nothing."""
+    told, m = Told(), motion()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    antenna = np.array(ANTENNA if frame in ("gps_link", "map") else (0.0, 0.0, 0.0))
+    for i, stamp in told.every(5.0, 0.04):
+        velocity = m.velocity_body[i] + np.cross(m.angular_velocity[i], antenna) + told.rng.normal(0.0, 0.02, 3)
+        if frame != "base_link":
+            velocity = m.rotation_enu_from_body[i] @ velocity
+        sample = Sample(stamp, velocity, 4e-4 * np.eye(3))
+        told.say(stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, sample, frame or "map"))
+    told.imu("/imu", "base_link")
+    if frame:
+        antennas = [told.transform("base_link", "gps_link", (0.0, 0.0, 0.0), ANTENNA)] if frame == "gps_link" else []
+        told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM), *antennas)
+    bag, saved, launch = told.write(tmp_path / "bag"), tmp_path / "saved.yaml", tmp_path / "dvl.launch.xml"
+    assert main(["replay", str(bag), "--save", str(saved)]) == 0
+    written = re.search(r"URDF  <origin (?:xyz=\"([^\"]*)\" )?rpy", capsys.readouterr().out)[1]
+    if position is None:
+        assert written is None
+        assert main(["apply", str(saved), "--launch", str(launch)]) == 2
+        assert "reference_position" in capsys.readouterr().err and not launch.exists()
+        return
+    np.testing.assert_allclose([float(word) for word in written.split()], position, atol=0.05)
+    assert main(["apply", str(saved), "--launch", str(launch)]) == 0
+    at = [float(re.search(rf"--{axis} (\S+)", launch.read_text())[1]) for axis in "xyz"]
+    np.testing.assert_allclose(at, position, atol=0.05)

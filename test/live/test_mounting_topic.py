@@ -55,6 +55,7 @@ def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_l
         f"result_file:={saved}",
         "model:=G2",
         "publish_tf:=true",
+        "dvl_position:=from_reference",
     ) as process:
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         player = BagPlayer(world.node, [bag])
@@ -74,7 +75,8 @@ def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_l
     assert result["model"] == "G2"
     assert poses[-1].header.frame_id == "base_link"
     at, turn = pose.pose.position, pose.pose.orientation
-    np.testing.assert_allclose([at.x, at.y, at.z], mounting["lever_arm"], atol=1e-12)
+    np.testing.assert_allclose([at.x, at.y, at.z], mounting["position"], atol=1e-12)
+    assert mounting["position"] == mounting["lever_arm"]  # the reference is that of the body's own point
     np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], mounting["corrected_quaternion_xyzw"], atol=1e-12)
     covariance = pose.covariance.reshape(6, 6)
     np.testing.assert_allclose(covariance, mounting["pose_covariance"], atol=1e-12)
@@ -90,7 +92,7 @@ def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_l
 
 
 def test_a_model_without_lever_arm_gives_the_one_that_is_set_and_says_that_it_is_not_estimated(world):
-    with node_here(world, model="M7", lever_arm=[0.3, 0.0, -0.1]):
+    with node_here(world, model="M7", lever_arm=[0.3, 0.0, -0.1], dvl_position="from_reference"):
         poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         Publisher(world).send(*(twist(1000 + 0.2 * i) for i in range(30)))
@@ -119,7 +121,7 @@ def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_fram
     stub = ModuleType("tf2_ros")
     stub.StaticTransformBroadcaster = Broadcaster
     monkeypatch.setitem(sys.modules, "tf2_ros", stub)
-    with node_here(world, publish_tf=True, dvl_frame="dvl_a50") as node:
+    with node_here(world, publish_tf=True, dvl_frame="dvl_a50", dvl_position="told") as node:
         poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         Publisher(world).send(*(twist(1000 + 0.2 * i, frame="dvl_a50") for i in range(30)))
@@ -138,6 +140,21 @@ def test_with_publish_tf_the_transform_is_that_pose_and_another_of_the_same_fram
         other.child_frame_id = "dvl_a50"
         node._transforms._on_transforms(SimpleNamespace(transforms=[other]))
         until(lambda: "TF_TWICE" in diagnostics[-1].status[0].message, "the warning")
+
+
+def test_no_transform_is_broadcast_of_a_dvl_whose_place_nobody_knows_and_that_is_said(world, monkeypatch):
+    stub = ModuleType("tf2_ros")
+    stub.StaticTransformBroadcaster = Broadcaster
+    monkeypatch.setitem(sys.modules, "tf2_ros", stub)
+    SENT.clear()
+    with node_here(world, publish_tf=True, lever_arm=[0.3, 0.0, -0.1]) as node:
+        poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        Publisher(world).send(*(twist(1000 + 0.2 * i) for i in range(30)))
+        until(lambda: received(node) == 30 and poses, "the mounting")
+        assert np.isnan(poses[-1].pose.pose.position.x)
+        until(lambda: diagnostics and "POSITION_UNKNOWN" in diagnostics[-1].status[0].message, "the finding")
+        assert not SENT[NODE]
 
 
 def test_no_transform_is_broadcast_unless_asked_for(world, monkeypatch):

@@ -11,7 +11,9 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.mounting_pose import mounting_pose, scale_and_delay
 from dvl_calib_ros.calibration.parameters import Parameters
 
-PARAMETERS = Parameters(mounting_rpy=(0.3, -0.2, 2.1), lever_arm=(0.5, 0.0, 0.2), dvl_time_offset=0.25)
+PARAMETERS = Parameters(
+    mounting_rpy=(0.3, -0.2, 2.1), lever_arm=(0.5, 0.0, 0.2), dvl_time_offset=0.25, dvl_position="from_reference"
+)
 
 
 def state_of(name: str, rng) -> GaussianState:
@@ -35,6 +37,34 @@ def test_the_covariance_is_that_of_poses_drawn_from_the_state(rng, turned):
     np.testing.assert_allclose(
         np.cov(np.transpose(drawn)) / np.outer(scale, scale), found.covariance / np.outer(scale, scale), atol=0.06
     )
+
+
+def test_where_the_reference_point_is_comes_off_and_where_nothing_says_so_there_is_no_position(rng):
+    model, state = MODELS["G2"], state_of("G2", rng)
+    at = np.array(mounting_pose(model, state, PARAMETERS).position)
+    antenna = PARAMETERS.replace(reference_position=(-0.3, 0.0, 0.4))
+    np.testing.assert_allclose(
+        mounting_pose(model, state, antenna).position, at + np.array((-0.3, 0.0, 0.4)), atol=1e-12
+    )
+    told = mounting_pose(model, state, antenna.replace(dvl_position="told"))  # not what was found from who knows where
+    np.testing.assert_allclose(told.position, (0.2, 0.0, 0.6), atol=1e-12)
+    np.testing.assert_array_equal(told.covariance[:3, :3], -np.eye(3))
+    unknown = mounting_pose(model, state, PARAMETERS.replace(dvl_position="unknown"))
+    assert np.isnan(unknown.position).all()
+    np.testing.assert_array_equal(
+        unknown.covariance[:3], [[-1, 0, 0, 0, 0, 0], [0, -1, 0, 0, 0, 0], [0, 0, -1, 0, 0, 0]]
+    )
+
+
+@pytest.mark.parametrize("given", [(0.5, 0.0, 0.2), (0.0, 0.0, 0.0)])
+def test_an_axis_that_the_data_do_not_show_is_where_it_was_said_to_be_or_unknown(rng, given):
+    model, state = MODELS["G2"], state_of("G2", rng)
+    height = model.state_names.index("lever_arm_z")
+    p = state.p.copy()
+    p[height] = p[:, height] = 0.0
+    p[height, height] = PARAMETERS.initial_std_lever_arm**2
+    position = mounting_pose(model, GaussianState(state.x, p), PARAMETERS.replace(lever_arm=given)).position
+    assert position[2] == 0.2 and position[0] != 0.5 if any(given) else np.isnan(position).all()
 
 
 def test_what_a_model_does_not_estimate_is_the_parameters_with_variance_minus_one(rng):

@@ -209,7 +209,7 @@ def test_a_result_file_of_a_calibration_is_exported_too(tmp_path, capsys):
     succeed(capsys, "simulate", tmp_path / "bag", "--trajectory", "box", "--duration", "120", "--gnss-std", "0.02",
             "--misalignment", "1", "-2", "3")  # fmt: skip
     succeed(capsys, "replay", tmp_path / "bag", "--save", tmp_path / "calibration.yaml", "-p", "lever_arm:=[0.1,0,0]",
-            "-p", "mounting_rpy:=[0.0,0.0,0.0]")  # fmt: skip
+            "-p", "dvl_position:=from_reference", "-p", "mounting_rpy:=[0.0,0.0,0.0]")  # fmt: skip
     succeed(capsys, "export", "stonefish", tmp_path / "calibration.yaml", "-o", tmp_path / "dvl.xml")
     dvl = READERS["stonefish"](tmp_path / "dvl.xml")
     saved = load_yaml(tmp_path / "calibration.yaml", "result file")["mounting"]

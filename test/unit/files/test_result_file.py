@@ -43,7 +43,9 @@ def bag(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(bag) -> Result:
-    return replayed(bag, mounting_rpy=MOUNTING, lever_arm=(1.0, 0.0, -0.5), gate_probability=0.0, model="G1").result
+    return replayed(
+        bag, mounting_rpy=MOUNTING, lever_arm=(1.0, 0.0, -0.5), dvl_position="told", gate_probability=0.0, model="G1"
+    ).result
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.yaml_files import load_yaml
 from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
 from dvl_calib_ros.messages.feed import MessageFeed
-from dvl_calib_ros.messages.opening import recognised
+from dvl_calib_ros.messages.recognised import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay
@@ -186,7 +186,7 @@ def test_a_mounting_in_the_urdf_of_the_drivers_own_frame_does_as_well_with_axes_
 
 def test_the_transform_of_the_result_is_of_the_drivers_frame_and_the_mounting_of_what_is_calibrated(tmp_path):
     bag = write_driver_bag(tmp_path / "bag", steady_run(100), MARINE)
-    assert main(["replay", str(bag), "--save", str(tmp_path / "result.yaml")]) == 0
+    assert main(["replay", str(bag), "-p", "dvl_position:=told", "--save", str(tmp_path / "result.yaml")]) == 0
     mounting = load_yaml(tmp_path / "result.yaml", "result file")["mounting"]
     words = mounting["static_transform_publisher"].split()
     frame = rotation_from_quaternion([float(words[words.index(f"--{name}") + 1]) for name in ("qx", "qy", "qz", "qw")])
