@@ -34,6 +34,7 @@ _ANY_FORMAT = "dvl_calib_ros result"
 FORMAT = f"{_ANY_FORMAT} 1"
 # The last entry of a result file, which its head announces: what of a copy was cut off would else go unseen
 _END = "complete"
+_PUBLISHER = "ros2 run tf2_ros static_transform_publisher"
 
 
 def estimate_document(estimate: Estimate) -> dict[str, Any]:
@@ -97,7 +98,9 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
             "dvl_data_axes": FRD if turned else FLU,
             "frame_id": parent,
             "child_frame_id": child,
-            "static_transform_publisher": _static_transform_publisher(position, to_frame, parent, child),
+            "static_transform_publisher": None
+            if position is None
+            else f"{_PUBLISHER} {static_transform_arguments(position, to_frame, parent, child)}",
         },
         **days_document(result),
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
@@ -135,14 +138,6 @@ def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
         factor, unit = known.get(name) or units[name.partition("_")[0]]
         words[name] = f"{factor * std:.4f} {unit}".rstrip()
     return words
-
-
-def _static_transform_publisher(position: Any, quaternion: Any, parent: str, child: str) -> str | None:
-    if position is None:
-        return None
-    return (
-        f"ros2 run tf2_ros static_transform_publisher {static_transform_arguments(position, quaternion, parent, child)}"
-    )
 
 
 def static_transform_arguments(position: Any, quaternion: Any, parent: str, child: str) -> str:
