@@ -185,19 +185,23 @@ class Calibrator:
         """Let the selection know what is paired, and update the models if enough samples have come together."""
         aligner = self._aligner
         if self._extends:
-            if aligner.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
+            if aligner.partners.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
                 self._delay.take_rows()
             self._delay.advance()
         self._look_at_headings()
-        if aligner.n_paired > self._n_selected:
+        if aligner.partners.n_paired > self._n_selected:
             self._select()
-        for group in self._groups:
-            if aligner.given[group.needs] - group.n_given >= self._block_size:
-                self._update(group)
+        due = [
+            group for group in self._groups if aligner.partners.given[group.needs] - group.n_given >= self._block_size
+        ]
+        if due:
+            for group in due:
+                self._give_decided(group)
+            self._forget_rows()
 
     def _select(self) -> None:
         """Let the selection know what is paired, but for what may go by blocks that G2 has not solved."""
-        rows, end = self._aligner.rows, self._aligner.n_paired
+        rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
         until_ns = self._delay.told_until_ns
@@ -211,7 +215,7 @@ class Calibrator:
     def _look_at_headings(self) -> None:
         """Let the selection know once headings show the current: later than the last row could be decided."""
         aligner, rows = self._aligner, self._aligner.rows
-        first, decided = self._n_headings, aligner.n_oriented
+        first, decided = self._n_headings, aligner.partners.n_oriented
         if self._headings.shown or decided == first:
             return
         if not self._headings.waits_for(int(rows.stamps_ns[decided - 1 - rows.base])):
@@ -250,15 +254,20 @@ class Calibrator:
 
     def _update(self, group: Group) -> None:
         """Give a group's models the rows that are decided and that they have not had."""
+        if self._give_decided(group):
+            self._forget_rows()
+
+    def _give_decided(self, group: Group) -> bool:
+        """`_update` that forgets nothing; whether there were any."""
         decided = self._decided(group.needs)
         first, group.next_row = group.next_row, decided
         if decided == first:
-            return
+            return False
         for start, end, is_new_day in self._by_days(first, decided):
             if is_new_day:
                 group.end_day()
             self._give(group, start, end)
-        self._forget_rows()
+        return True
 
     def _give(self, group: Group, first: int, decided: int) -> None:
         """Give a group's models the rows first .. decided - 1, of one day."""
@@ -277,9 +286,9 @@ class Calibrator:
 
     def _decided(self, needs: Needs) -> int:
         """Number of the first row that is not decided for models with these needs."""
-        aligner = self._aligner
+        partners = self._aligner.partners
         return {
-            Needs.NOTHING: aligner.n_judged, Needs.ATTITUDE: aligner.n_oriented, Needs.REFERENCE: aligner.n_paired,
+            Needs.NOTHING: partners.n_judged, Needs.ATTITUDE: partners.n_oriented, Needs.REFERENCE: partners.n_paired,
         }[needs]  # fmt: skip
 
     def _observed(self, needs: Needs, first: int, decided: int) -> _Seen:
@@ -291,7 +300,9 @@ class Calibrator:
             numbers = np.arange(first, decided)
             if not has.all():
                 block, numbers = block.part(has), numbers[has]
-            found = self._observer.observe(block, needs, self._aligner.prior.sway_heave) if len(block) else None
+            found = (
+                self._observer.observe(block, needs, self._aligner.partners.prior.sway_heave) if len(block) else None
+            )
             seen = self._seen[needs] = _Seen(first, decided, block, numbers, found)
         return seen
 
@@ -342,17 +353,17 @@ class Calibrator:
         unused = ("slow", "frozen", "turning", "no_turn_rate")
         for key in (*unused, "dropouts", "wrong_frame"):
             dvl.setdefault(key, 0)
-        dvl["repeated"] = aligner.gates.repeated
+        dvl["repeated"] = aligner.partners.gates.repeated
         for key in ("wrong_frame", "late"):
             counts["reference"].setdefault(key, 0)
         for key in ("paired", "unpaired", "without_attitude", "oriented", "not_oriented"):
             pairing.setdefault(key, 0)
         not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *aligner.refused_as["dvl"]}
         dvl["accepted"] = dvl["received"] - sum(dvl.get(key, 0) for key in not_accepted)
-        dvl["awaiting_imu"] = aligner.rows.end - aligner.n_judged
+        dvl["awaiting_imu"] = aligner.rows.end - aligner.partners.n_judged
         dvl["usable"] = dvl["accepted"] - sum(dvl[key] for key in (*unused, "awaiting_imu"))
         pairing["gnss_losses"] = self.selection.gnss.losses
-        pairing["awaiting_reference"] = aligner.n_judged - aligner.n_paired
+        pairing["awaiting_reference"] = aligner.partners.n_judged - aligner.partners.n_paired
         pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
         counts["calibration"] = {"restarts": self.restarts}
         for name in self._models:
@@ -407,11 +418,11 @@ class Calibrator:
         selection = self.selection  # by what was so far
         self.parameters = self._aligner.parameters = parameters
         if self._n_selected:
-            selection.record(self._aligner.decided_ns, parameters)
+            selection.record(self._aligner.partners.decided_ns, parameters)
 
     def n_given(self, name: str) -> int:
         """Number of samples that a model was given so far; it grows when there may be a new estimate."""
-        return self._aligner.given[MODELS[name].needs]
+        return self._aligner.partners.given[MODELS[name].needs]
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model."""

@@ -107,13 +107,14 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
 
 def rotation_from_quaternion(q: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) in the order x, y, z, w."""
-    x, y, z, w = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    q = np.asarray(q, dtype=float)
+    x, y, z, w = (q[..., i] for i in range(4))
+    xx, yy, zz, xy, xz, yz, xw, yw, zw = x * x, y * y, z * z, x * y, x * z, y * z, x * w, y * w, z * w
+    rotation = np.empty((*q.shape[:-1], 3, 3))
+    rotation[..., 0, 0], rotation[..., 0, 1], rotation[..., 0, 2] = 1 - 2 * (yy + zz), 2 * (xy - zw), 2 * (xz + yw)
+    rotation[..., 1, 0], rotation[..., 1, 1], rotation[..., 1, 2] = 2 * (xy + zw), 1 - 2 * (xx + zz), 2 * (yz - xw)
+    rotation[..., 2, 0], rotation[..., 2, 1], rotation[..., 2, 2] = 2 * (xz - yw), 2 * (yz + xw), 1 - 2 * (xx + yy)
+    return rotation
 
 
 def rotation_vector(q: ArrayLike) -> Array:
@@ -130,26 +131,13 @@ def rotation_vector(q: ArrayLike) -> Array:
 _SHORT_ARC = 0.9999995
 
 
-def slerp(q0: Quaternion, q1: Quaternion, fraction: float) -> Quaternion:
-    """Spherical linear interpolation between unit quaternions along the shorter arc, fraction in 0..1."""
-    dot = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
-    sign = 1.0 if dot >= 0.0 else -1.0
-    dot = min(abs(dot), 1.0)
-    if dot > _SHORT_ARC:
-        w0, w1 = 1.0 - fraction, fraction * sign
-    else:
-        angle = math.acos(dot)
-        w0 = math.sin((1.0 - fraction) * angle) / math.sin(angle)
-        w1 = sign * math.sin(fraction * angle) / math.sin(angle)
-    x, y, z, w = w0 * q0[0] + w1 * q1[0], w0 * q0[1] + w1 * q1[1], w0 * q0[2] + w1 * q1[2], w0 * q0[3] + w1 * q1[3]
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    return x / norm, y / norm, z / norm, w / norm
-
-
 def slerps(q0: Array, q1: Array, fraction: Array) -> Array:
-    """`slerp` of N pairs (N, 4), fraction (N,); nan where either is nan."""
+    """Spherical linear interpolation between N pairs of unit quaternions (N, 4) along the shorter arc.
+
+    fraction: (N,) in 0..1. nan where either is nan.
+    """
     a, b = q0.T, q1.T
-    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]  # in the order of `slerp`, to take its branches
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
     sign = np.where(dot >= 0.0, 1.0, -1.0)
     dot = np.minimum(np.abs(dot), 1.0)
     angle = np.arccos(np.where(dot > _SHORT_ARC, 0.0, dot))

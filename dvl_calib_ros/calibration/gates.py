@@ -1,8 +1,4 @@
-"""Which DVL samples in order are used: not too slow, not frozen, not in too sharp a turn. And the prior's window.
-
-Each rule stands here twice, for one sample and for columns of them, because a live sample's few numbers are dealt
-with ten times faster by themselves; test_alignment.py holds both equal.
-"""
+"""Which DVL samples in order are used: not too slow, not frozen, not in too sharp a turn. And the prior's window."""
 
 from __future__ import annotations
 
@@ -21,33 +17,16 @@ class Gates:
         self._velocity_before: Vector | None = None
         self._repeats = 0
 
-    def judge(self, velocity: Vector, angular_velocity: Vector | None, p: Parameters) -> int:
-        """A sample's `Verdict`. velocity: m/s. angular_velocity: rad/s, None where not known."""
-        x, y, z = velocity
-        if x * x + y * y + z * z < p.min_speed * p.min_speed:
-            return Verdict.SLOW
-        if velocity != self._velocity_before:
-            self._velocity_before, self._repeats = velocity, 0
-        else:
-            self._repeats += 1
-            self.repeated += 1
-            if 0 < p.max_repeats < self._repeats:
-                return Verdict.FROZEN
-        if p.max_turn_rate > 0.0:
-            if angular_velocity is None:
-                return Verdict.NO_TURN_RATE
-            x, y, z = angular_velocity
-            if x * x + y * y + z * z > p.max_turn_rate * p.max_turn_rate:
-                return Verdict.TURNING
-        return Verdict.USED
-
-    def judge_columns(self, velocity: Array, angular_velocity: Array, p: Parameters) -> Codes:
+    def judge(self, velocity: Array, angular_velocity: Array, p: Parameters) -> Codes:
         """Verdicts (N,). velocity: (N, 3) m/s. angular_velocity: (N, 3) rad/s, nan where not known."""
         verdict = np.zeros(len(velocity), dtype=np.uint8)
         slow = _squared(velocity) < p.min_speed * p.min_speed
-        verdict[slow] = Verdict.SLOW
-        moving = np.flatnonzero(~slow)
-        verdict[moving[self._frozen(velocity[moving], p)]] = Verdict.FROZEN
+        if slow.any():
+            verdict[slow] = Verdict.SLOW
+            moving = np.flatnonzero(~slow)
+            verdict[moving[self._frozen(velocity[moving], p)]] = Verdict.FROZEN
+        else:
+            verdict[self._frozen(velocity, p)] = Verdict.FROZEN
         if p.max_turn_rate > 0.0:
             square = _squared(angular_velocity)
             open_ = verdict == Verdict.USED
@@ -62,7 +41,12 @@ class Gates:
             return np.zeros(0, dtype=bool)
         same = np.empty(n, dtype=bool)
         same[0] = self._velocity_before is not None and tuple(velocity[0].tolist()) == self._velocity_before
-        same[1:] = (velocity[1:] == velocity[:-1]).all(axis=1)
+        if n > 1:
+            same[1:] = (velocity[1:] == velocity[:-1]).all(axis=1)
+        if not same.any():  # as nearly always
+            x, y, z = velocity[-1].tolist()
+            self._velocity_before, self._repeats = (x, y, z), 0
+            return same
         at = np.arange(n)
         other = np.maximum.accumulate(np.where(same, -1, at))  # the last one that was not the same; -1: before these
         repeats = np.where(other < 0, self._repeats + at + 1, at - other)
@@ -90,14 +74,8 @@ class PriorWindow:
         self.sway_heave: Array = np.array(parameters.prior_sway_heave if given is None else given)
         self._collecting = parameters.prior_source == "initial_window"
 
-    def known_at(self, stamp_ns: int, velocity_dvl: Vector) -> bool:
-        """Whether the prior is known at a usable sample; until then, take it into the mean."""
-        if not self._collecting:
-            return True
-        return bool(self.known_at_columns(np.array([stamp_ns]), np.array([velocity_dvl]))[0])
-
-    def known_at_columns(self, stamps_ns: Stamps, velocity_dvl: Array) -> Mask:
-        """`known_at` (N,) for usable samples, in order."""
+    def known_at(self, stamps_ns: Stamps, velocity_dvl: Array) -> Mask:
+        """Whether the prior is known at usable samples (N,), in order; until then, take them into the mean."""
         known = np.ones(len(stamps_ns), dtype=bool)
         if not self._collecting or not len(stamps_ns):
             return known

@@ -78,9 +78,16 @@ class HeaveRows:
 
     def starts(self, stamps_ns: Stamps) -> Index:
         """Which samples (of N) begin a block that is not the one before."""
-        before = np.concatenate([[stamps_ns[0] if self._last_ns is None else self._last_ns], stamps_ns[:-1]])
-        other = (stamps_ns // BLOCK_NS != before // BLOCK_NS) | (stamps_ns - before > PAUSE_NS)
+        since = self._since(stamps_ns)
+        other = (since > PAUSE_NS) | (stamps_ns // BLOCK_NS != (stamps_ns - since) // BLOCK_NS)
         return np.flatnonzero(other)
+
+    def _since(self, stamps_ns: Stamps) -> Stamps:
+        """(N,) ns since the sample before each; 0 for the very first."""
+        since = np.empty_like(stamps_ns)
+        since[0] = 0 if self._last_ns is None else int(stamps_ns[0]) - self._last_ns
+        np.subtract(stamps_ns[1:], stamps_ns[:-1], out=since[1:])
+        return since
 
     def add(self, stamps_ns: Stamps, rows: Array, used: Mask, ends: Sequence[int] = ()) -> list[HeaveSums]:
         """Add N samples of (H, z) (N, K, n+1), as far as they are used (N,).
@@ -96,8 +103,7 @@ class HeaveRows:
         if not len(stamps_ns):
             return [self.sums() for _ in ends]
         starts = set(self.starts(stamps_ns).tolist())
-        last_ns = stamps_ns[0] if self._last_ns is None else self._last_ns
-        seconds = np.diff(stamps_ns, prepend=last_ns) * 1e-9
+        seconds = self._since(stamps_ns) * 1e-9
         seconds[seconds > PAUSE_NS * 1e-9] = 0.0
         seconds *= used
         found = {0: self.sums()} if 0 in ends else {}

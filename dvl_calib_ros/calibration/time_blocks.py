@@ -114,6 +114,9 @@ class TimeBlocks:
         return factor
 
 
+_NO_CUTS = np.zeros(0, dtype=np.intp)
+
+
 class BlockScatter:
     """`TimeBlocks` of K filters without process noise, told by their states where one block ends and the next begins.
 
@@ -132,6 +135,10 @@ class BlockScatter:
 
     def cuts(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
         """Numbers of samples (E) of those with these stamps (N,) after which a new block begins."""
+        first, last = int(stamps_ns[0]) // self._length_ns, int(stamps_ns[-1]) // self._length_ns
+        if first == last == (first if self._last is None else self._last):  # as nearly always live
+            self._last = last
+            return _NO_CUTS
         blocks = stamps_ns // self._length_ns
         before = blocks[0] if self._last is None else self._last
         self._last = int(blocks[-1])

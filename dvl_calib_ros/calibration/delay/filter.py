@@ -354,7 +354,7 @@ class DelayFilter:
     def take_rows(self) -> None:
         """Copy the DVL samples that are judged, before the aligner forgets them."""
         aligner, rows = self._aligner, self._aligner.rows
-        first, end = self.n_taken - rows.base, aligner.n_judged - rows.base
+        first, end = self.n_taken - rows.base, aligner.partners.n_judged - rows.base
         if end <= first:
             return
         at = np.flatnonzero((rows.verdict[first:end] != Verdict.FROZEN) & ~rows.late[first:end]) + first
@@ -362,7 +362,7 @@ class DelayFilter:
         self._dvl.stamps_ns[slots] = rows.stamps_ns[at]
         self._dvl.velocity[slots] = rows.velocity_dvl[at]
         self._dvl.covariance[slots] = rows.covariance[at]
-        self.n_taken = aligner.n_judged
+        self.n_taken = aligner.partners.n_judged
 
     def _dvl_is_silent(self, stamp_ns: int) -> bool:
         """Whether the DVL stops here for so long that tracks forget what was before."""

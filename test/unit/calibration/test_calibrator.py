@@ -467,12 +467,12 @@ def test_an_initial_window_gives_m5_and_m6_the_mean_of_the_dvls_own_sway_and_hea
     samples = make_samples(variant(NOISY, trajectory="straight"))
     calibrator = calibrate(samples, Parameters(prior_source="initial_window", prior_window=10.0))
     first = np.array([s.velocity for s in only(samples, DvlSample)[:50]])
-    np.testing.assert_allclose(calibrator._aligner.prior.sway_heave, first.mean(axis=0)[1:], atol=1e-12)
+    np.testing.assert_allclose(calibrator._aligner.partners.prior.sway_heave, first.mean(axis=0)[1:], atol=1e-12)
     assert calibrator.estimate("M5").used + calibrator.estimate("M5").gated == 250
     assert calibrator.estimate("M7").used == 300
     given_it = calibrate(
         only(samples, DvlSample)[50:],
-        Parameters(prior_source="fixed", prior_sway_heave=tuple(calibrator._aligner.prior.sway_heave)),
+        Parameters(prior_source="fixed", prior_sway_heave=tuple(calibrator._aligner.partners.prior.sway_heave)),
     )
     np.testing.assert_allclose(calibrator.state("M5").x, given_it.state("M5").x, atol=1e-12)
 

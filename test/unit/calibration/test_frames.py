@@ -16,7 +16,7 @@ from dvl_calib_ros.calibration.frames import (
     rotation_from_rpy,
     rpy_from_rotation,
     skew,
-    slerp,
+    slerps,
 )
 
 RPY = np.array([0.4, -0.7, 2.1])
@@ -51,8 +51,8 @@ def test_slerp_agrees_with_scipy_and_takes_the_shorter_arc(angle):
     q1 = q0 * Rotation.from_rotvec([0, angle, 0])
     expected = Slerp([0, 1], Rotation.concatenate([q0, q1]))([0.3]).as_matrix()[0]
     for sign in (1.0, -1.0):
-        got = slerp(tuple(q0.as_quat()), tuple(sign * q1.as_quat()), 0.3)
-        np.testing.assert_allclose(rotation_from_quaternion(got), expected, atol=1e-9)
+        got = slerps(q0.as_quat()[None], sign * q1.as_quat()[None], np.array([0.3]))
+        np.testing.assert_allclose(rotation_from_quaternion(got)[0], expected, atol=1e-9)
 
 
 def test_a_north_heading_in_ned_is_yaw_90_degrees_in_enu():

@@ -63,7 +63,7 @@ def test_every_sample_is_let_through_dropped_or_held_and_order_is_kept_between_r
 def track(*seconds, gap=2.0, latency=1.0):
     made = Track(round(gap * SECOND), round(latency * SECOND), 10 * SECOND)
     for at in seconds:
-        made.append(round(at * SECOND))
+        made.stamps_ns[made.extend(1)] = round(at * SECOND)
         made.forget_old()
     return made
 

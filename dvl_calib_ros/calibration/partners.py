@@ -1,0 +1,151 @@
+"""What the IMU and the reference say at the times of the DVL's samples, and which of these are used at all.
+
+By columns only: live, of the one or two rows that a message decides. Who calls says how many rows are decided, in
+order, and how far each track had come by then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+
+from .frames import slerps
+from .gates import Gates, PriorWindow
+from .models import Needs
+from .parameters import Parameters
+from .rows import Rows
+from .samples import FRAME_CODES, Mask, Pairing, Stamps, VelocityFrame, Verdict
+from .streams import LONG_AGO_NS, Track
+
+BODY = FRAME_CODES[VelocityFrame.BODY]
+
+
+def add_count(tally: Counter[str], name: str, count: int) -> None:
+    """Add to a counter what is more than nothing: one that never counted is not in it."""
+    if count:
+        tally[name] += count
+
+
+class Partners:
+    """Fills in the rows of an aligner.
+
+    n_judged, n_oriented, n_paired: numbers of the first row whose verdict, attitude or reference is not decided yet.
+    given: by need, how many rows there are so far for models that have it. decided_ns: stamp of the newest row whose
+    reference is decided. needs_turn_rate: whether verdicts wait for the angular velocity.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        rows: Rows,
+        reference: Track,
+        imu: Track,
+        tally: Mapping[str, Counter[str]],
+        prior_sway_heave: tuple[float, float] | None,
+    ) -> None:
+        self._rows, self._reference, self._imu, self._tally = rows, reference, imu, tally
+        self._has_lever_arm = any(parameters.lever_arm)
+        self.needs_turn_rate = self._has_lever_arm or parameters.max_turn_rate > 0.0
+        self.n_judged = self.n_oriented = self.n_paired = 0
+        self.given = dict.fromkeys(Needs, 0)
+        self.gates = Gates()
+        self.prior = PriorWindow(parameters, prior_sway_heave)
+        self.decided_ns = LONG_AGO_NS
+
+    def judge(self, end: int, parameters: Parameters) -> None:
+        """Decide on the verdicts of the rows before `end`, and count them."""
+        first, rows, tally = self.n_judged, self._rows, self._tally["dvl"]
+        if end <= first:
+            return
+        at = slice(first - rows.base, end - rows.base)
+        rates = rows.attitude[at, 4:]
+        verdict = self.gates.judge(rows.velocity_dvl[at], rates, parameters)
+        rows.verdict[at] = verdict
+        self.n_judged = end
+        used = verdict == Verdict.USED
+        n_used = int(np.count_nonzero(used))
+        if n_used < end - first:
+            for code, count in enumerate(np.bincount(verdict, minlength=len(Verdict.NAMES)).tolist()):
+                if code != Verdict.USED:
+                    add_count(tally, Verdict.NAMES[code], count)
+        self.given[Needs.NOTHING] += n_used
+        if self._has_lever_arm:
+            add_count(tally, "lever_arm_uncompensated", int(np.count_nonzero(used & np.isnan(rates[:, 0]))))
+        if n_used:
+            slots = np.flatnonzero(used) + at.start
+            rows.prior_known[slots] = self.prior.known_at(rows.stamps_ns[slots], rows.velocity_dvl[slots])
+
+    def orient(self, newest_ns: Stamps, parameters: Parameters) -> None:
+        """Orient the next rows (N,). newest_ns: (N,) stamp of the newest IMU sample when each was decided."""
+        n, first, rows, track = len(newest_ns), self.n_oriented, self._rows, self._imu
+        if not n:
+            return
+        at = slice(first - rows.base, first + n - rows.base)
+        before, after, fraction, found = track.brackets(rows.stamps_ns[at], newest_ns)
+        if found.any():
+            values = np.where(found[:, None], track.values[after, :7], math.nan)
+            between = np.flatnonzero(found & (fraction != 1.0))
+            if len(between):
+                earlier, later, share = track.values[before[between], :7], values[between], fraction[between]
+                values[between, :4] = slerps(earlier[:, :4], later[:, :4], share)
+                values[between, 4:] = earlier[:, 4:] + (later[:, 4:] - earlier[:, 4:]) * share[:, None]
+            rows.attitude[at] = values
+        self.n_oriented = first + n
+        if self.needs_turn_rate:
+            self.judge(first + n, parameters)
+        usable = rows.verdict[at] == Verdict.USED
+        n_usable = int(np.count_nonzero(usable))
+        oriented = int(np.count_nonzero(usable & ~np.isnan(rows.attitude[at, 0] + rows.attitude[at, 4])))
+        add_count(self._tally["pairing"], "oriented", oriented)
+        add_count(self._tally["pairing"], "not_oriented", n_usable - oriented)
+        self.given[Needs.ATTITUDE] += oriented
+
+    def in_earth_frame(self, end: int, newest_ns: Stamps) -> Mask:
+        """(N,) of the next rows, before `end`, those whose reference is in an earth frame. newest_ns: as for `pair`."""
+        rows, track = self._rows, self._reference
+        stamps_ns = rows.stamps_ns[self.n_paired - rows.base : end - rows.base]
+        _, after, _, found = track.brackets(stamps_ns, newest_ns)
+        return found & (track.frames[after] != BODY)
+
+    def pair(self, newest_ns: Stamps) -> None:
+        """Pair the next rows (N,). newest_ns: (N,) stamp of the newest reference when each was decided."""
+        n, first, rows, track = len(newest_ns), self.n_paired, self._rows, self._reference
+        if not n:
+            return
+        at = slice(first - rows.base, first + n - rows.base)
+        stamps_ns = rows.stamps_ns[at]
+        before, after, fraction, found = track.brackets(stamps_ns, newest_ns)
+        pairing = np.full(n, Pairing.UNPAIRED, dtype=np.uint8)
+        if found.any():
+            has_before = found & (before >= 0)
+            before = np.maximum(before, track.begin)
+            between = has_before & (fraction != 1.0)
+            frame = track.frames[after]
+            has_attitude = (frame == BODY) | ~np.isnan(rows.attitude[at, 0])
+            fits = found & (~between | (track.frames[before] == frame))
+            pairing[fits] = np.where(has_attitude[fits], Pairing.PAIRED, Pairing.WITHOUT_ATTITUDE)
+            is_paired = fits & has_attitude
+            # The mean of two samples is less noisy than each, but its neighbours share them: over a run a reference
+            # sample carries its own information once, which is what the plain mean of the covariances gives.
+            earlier, later = track.values[before], track.values[after]
+            values = np.where(between[:, None], earlier + (later - earlier) * fraction[:, None], later)
+            rows.reference[at] = np.where(is_paired[:, None], values, math.nan)
+            rows.frames[at] = np.where(is_paired, frame, 0)
+            early, late = track.unmeasured[before], track.unmeasured[after]
+            rows.unmeasured[at] = np.where(is_paired, np.where(between, early | late, late), 0)
+            interval_ns = rows.interval_ns[at]
+            shared = np.rint((track.stamps_ns[after] - track.stamps_ns[before]) / np.maximum(interval_ns, 1))
+            is_shared = is_paired & has_before & (interval_ns > 0)
+            rows.weight[at] = np.where(is_shared, 1.0 / np.maximum(1.0, shared), 1.0)
+        rows.pairing[at] = pairing
+        self.n_paired = first + n
+        self.decided_ns = int(stamps_ns[-1])
+        is_paired = pairing == Pairing.PAIRED
+        paired, tally = int(np.count_nonzero(is_paired)), self._tally["pairing"]
+        add_count(tally, "paired", paired)
+        add_count(tally, "unpaired", n - paired)
+        add_count(tally, "without_attitude", int(np.count_nonzero(pairing == Pairing.WITHOUT_ATTITUDE)))
+        self.given[Needs.REFERENCE] += int(np.count_nonzero(is_paired & (rows.verdict[at] == Verdict.USED)))
