@@ -12,7 +12,7 @@ from .channels import Channel
 from .sorting import BagMessage
 
 # What single messages are gathered to, and their bytes.
-_MOST, _MOST_BYTES = 4096, 4 << 20
+MOST_MESSAGES, MOST_BYTES = 4096, 4 << 20
 _LATEST_NS = 2**63 - 1
 
 Times = NDArray[Any]
@@ -116,7 +116,7 @@ def batched(messages: Iterable[BagMessage]) -> Iterator[Batch]:
         for message in messages:
             held.append(message)
             size += len(message[2])
-            if len(held) >= _MOST or size >= _MOST_BYTES:
+            if len(held) >= MOST_MESSAGES or size >= MOST_BYTES:
                 yield one_batch(held)
                 held, size = [], 0
     except Exception:

@@ -16,6 +16,7 @@ from .reader import BagReader
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
 WINDOW_MESSAGES, WINDOW_BYTES = 4096, 4 << 20
+ENOUGH_MESSAGES = 1024
 # A recorder has one layout or a few; garbage could have ever new ones.
 _MOST_LAYOUTS = 8
 Stamps = NDArray[np.int64]
@@ -82,7 +83,8 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
                 data = [each for batch, at, _ in found for each in batch.part(at).data()]
                 parts.append(Part(channel, place + arrived, log_ns[place], None, data, bag.decoder))
                 continue
-            contents = np.concatenate([batch.rows(at, length) for batch, at, _ in found])
+            rows_of = [batch.rows(at, length) for batch, at, _ in found]
+            contents = rows_of[0] if len(rows_of) == 1 else np.concatenate(rows_of)
             for columns, rows in layouts.split(channel, contents):
                 own = place if len(rows) == len(place) else place[rows]
                 data = [] if columns is not None else [each.tobytes() for each in contents[rows]]
@@ -104,7 +106,8 @@ def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
             end = min(first + WINDOW_MESSAGES - count, full, batch.size)
             taken.append(batch.part(slice(first, end)))
             count, size, first = count + end - first, size + int(sizes[end - 1]) - before, end
-            if count >= WINDOW_MESSAGES or size >= WINDOW_BYTES:
+            # what comes by the thousand is taken as it comes: to join it with what follows would copy it
+            if count >= WINDOW_MESSAGES or size >= WINDOW_BYTES or (first == batch.size and count >= ENOUGH_MESSAGES):
                 yield taken
                 taken, count, size = [], 0, 0
     if taken:

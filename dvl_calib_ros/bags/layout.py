@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,12 @@ class Layout:
     lengths: dict[str, int]
     flags: frozenset[str]
 
+    @cached_property
+    def inner(self) -> frozenset[str]:
+        """Paths of what has fields of its own."""
+        paths = (path.split(".") for path in self.dtype.names or ())
+        return frozenset(".".join(steps[:depth]) for steps in paths for depth in range(1, len(steps)))
+
     def view(self, messages: Rows) -> Rows:
         """Messages (N,), items of this many bytes, as rows, of which those count that `shared` says."""
         return messages.view(self.dtype)
@@ -84,7 +91,7 @@ class Columns:
             return self._rows[path]
         if path in layout.lengths:
             return np.zeros((len(self), 0), dtype=np.uint8)
-        if not any(each.startswith(f"{path}.") for each in layout.dtype.names):  # type: ignore[union-attr]
+        if path not in layout.inner:
             raise AttributeError(f"no field {path!r}")
         return Columns(layout, self._rows, f"{path}.")
 

@@ -39,10 +39,14 @@ class _RawFile(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        data = self._read(len(buffer), self._at)
-        buffer[: len(data)] = data
-        self._at += len(data)
-        return len(data)
+        try:
+            count = os.preadv(self._descriptor, [buffer], self._at)
+        except OSError:  # in pieces, and it is said what is wrong
+            data = self._read(len(buffer), self._at)
+            count = len(data)
+            buffer[:count] = data
+        self._at += count
+        return count
 
     def close(self) -> None:
         if not self.closed:

@@ -137,11 +137,7 @@ def _sqlite(path: Path, shown: Path, notes: list[str]) -> Source:
     database = Database(path)
     if database.astray:
         notes.append(f"{shown}: {database.astray} messages are of topics that it does not name, and left out")
-
-    def batches(topics: Collection[str]) -> Iterator[Batch]:
-        return batched(database.messages(topics))
-
-    found = _until_damage(batches, path, salvage_sqlite, database.counts)
+    found = _until_damage(database.batches, path, salvage_sqlite, database.counts)
     return Source(shown, database.counts, database.span_ns, found)
 
 

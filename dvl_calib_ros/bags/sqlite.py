@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
+from .batches import MOST_BYTES, MOST_MESSAGES, Batch, times
 from .channels import Channel, definition_of
 from .definitions import Definition
 from .salvage.damage import LARGEST_RECORD, DamagedError
@@ -27,8 +31,9 @@ class Database:
             self._channels = _channels(connection)
             rows = _rows(
                 connection,
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id",
-                (int, int, int, int),
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp), coalesce(max(length(data)), 0) "
+                "FROM messages GROUP BY topic_id",
+                (int, int, int, int, int),
             )
         self.counts: dict[Channel, int] = dict.fromkeys(self._channels.values(), 0)
         self.astray = 0
@@ -38,27 +43,59 @@ class Database:
             else:
                 self.astray += count
         known = [row for row in rows if row[0] in self._channels]
+        self._longest = {number: longest for number, *_, longest in rows}
         self.span_ns = (min((row[2] for row in known), default=0), max((row[3] for row in known), default=0))
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[int, Channel, bytes]]:
-        """Messages of these topics in order of log time."""
+    def batches(self, topics: Collection[str]) -> Iterator[Batch]:
+        """Messages of these topics in order of log time; those before what is raised come before it."""
         numbers = [number for number, channel in self._channels.items() if channel.topic in topics]
         query = (
             "SELECT timestamp, topic_id, data FROM messages "
             f"WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD} "
             "ORDER BY timestamp"
         )
-        channels = self._channels
+        longest = max((self._longest.get(number, 0) for number in numbers), default=0)
+        at_once = max(1, min(MOST_MESSAGES, MOST_BYTES // max(longest, 1)))
         with closing(self._connection()) as connection:
-            for log_ns, number, data in connection.execute(query, numbers):
-                if type(log_ns) is not int or type(data) is not bytes or log_ns < 0:
+            cursor = connection.execute(query, numbers)
+            error: Exception | None = None
+            while error is None:
+                rows: list[tuple[Any, Any, Any]] = []
+                try:
+                    rows.extend(islice(cursor, at_once))
+                except sqlite3.Error as raised:  # what was read before it is in the list
+                    error = raised
+                sound = _sound(rows)
+                if sound:
+                    yield self._batch(rows[:sound])
+                if sound < len(rows):
                     raise DamagedError("a message is none")
-                yield log_ns, channels[number], data
+                if not rows:
+                    break
+            if error is not None:
+                raise error
+
+    def _batch(self, rows: Sequence[tuple[int, int, bytes]]) -> Batch:
+        log_ns, number, data = zip(*rows, strict=True)
+        end = np.cumsum([*map(len, data)], dtype=np.intp)
+        start = np.concatenate([[0], end[:-1]]).astype(np.intp)
+        return Batch(times(log_ns), np.array(number, dtype=np.intp), start, end, b"".join(data), self._channels)
 
     def _connection(self) -> sqlite3.Connection:
         # immutable: no journal and no lock is looked for, so that nothing is written beside a recording
         uri = f"file:{quote(str(self._path.absolute()), safe='/')}?immutable=1&mode=ro"
         return sqlite3.connect(uri, uri=True, check_same_thread=False)
+
+
+def _sound(rows: Sequence[tuple[Any, Any, Any]]) -> int:
+    """How many of the rows, from the first on, are messages."""
+    if not rows:
+        return 0
+    log_ns, _, data = zip(*rows, strict=True)
+    if set(map(type, log_ns)) == {int} and set(map(type, data)) == {bytes} and min(log_ns) >= 0:
+        return len(rows)
+    are = (type(at) is int and at >= 0 and type(content) is bytes for at, content in zip(log_ns, data, strict=True))
+    return sum(1 for _ in takewhile(bool, are))
 
 
 def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:

@@ -195,7 +195,7 @@ def shown_noise(values: Array) -> float:
 def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Finding]:
     """A constant covariance that the data contradict."""
     variances = topic.variances[used]
-    if np.isnan(variances).any() or np.ptp(variances, axis=0).max() > 0.0:
+    if np.isnan(variances).any() or (variances != variances[0]).any():
         return []
     claimed = float(np.sqrt(variances[0].mean()))
     shown = shown_noise(topic.values[used])
@@ -211,12 +211,13 @@ def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Finding]:
 def orientation_findings(imu: Recorded) -> list[Finding]:
     """Whether an IMU gives an orientation at all."""
     q = imu.values
-    given = q[np.isfinite(q).all(axis=1)]
+    finite = np.isfinite(q @ np.ones(4))  # of four at once: a sum of narrow rows takes longer than all else here
+    given = q if finite.all() else q[finite]
     if not len(given):
         why = "orientation_covariance[0] is -1"
-    elif not np.abs(np.linalg.norm(given, axis=1) - 1.0).min() < 0.1:
+    elif not np.abs(np.sqrt(np.einsum("ni,ni->n", given, given)) - 1.0).min() < 0.1:
         why = "its quaternions have no length"
-    elif len(given) > ENOUGH and np.ptp(given, axis=0).max() == 0.0:
+    elif len(given) > ENOUGH and (given == given[0]).all():
         why = "the same in every message"
     else:
         return []

@@ -150,7 +150,7 @@ def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> C
     elif not len(variances):
         covariance = "no covariance"
     else:
-        constant = " always" if np.ptp(variances, axis=0).max() == 0.0 else ""
+        constant = " always" if (variances == variances[0]).all() else ""
         covariance = f"±{math.sqrt(float(np.median(variances.mean(axis=1)))):.2g} m/s{constant}"
     name = {"dvl": "DVL", "reference": "reference", "imu": "IMU"}[role]
     frame_id = "" if look is None else look.frame_id

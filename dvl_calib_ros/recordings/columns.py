@@ -248,7 +248,7 @@ class Collector:
 
 def _columns_of(vector: Any) -> Array:
     """(N, 3)."""
-    return np.column_stack([vector.x, vector.y, vector.z]).astype(float)
+    return np.column_stack([vector.x, vector.y, vector.z]).astype(float, copy=False)
 
 
 def turning(message: Any) -> Array:
@@ -262,7 +262,7 @@ def turning(message: Any) -> Array:
 def _imu(columns: Columns) -> tuple[Array, Array]:
     """Quaternion and angular velocity (N, 7), and acceleration (N, 3); nan where not given."""
     q, w, a = columns.orientation, columns.angular_velocity, columns.linear_acceleration
-    values = np.column_stack([q.x, q.y, q.z, q.w, w.x, w.y, w.z]).astype(float)
+    values = np.column_stack([q.x, q.y, q.z, q.w, w.x, w.y, w.z]).astype(float, copy=False)
     values[columns.orientation_covariance[:, 0] == NO_DATA, :4] = np.nan
     values[columns.angular_velocity_covariance[:, 0] == NO_DATA, 4:] = np.nan
     acceleration = _columns_of(a)

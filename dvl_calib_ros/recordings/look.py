@@ -145,7 +145,7 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
             next_ns = now_ns + BURST_EVERY_NS
         else:
             next_ns = now_ns + period_ns - since_ns
-        at = max(at + 1, int(np.searchsorted(log_ns, next_ns)))
+        at = max(at + 1, int(log_ns.searchsorted(next_ns)))
     return arrival[taken]
 
 

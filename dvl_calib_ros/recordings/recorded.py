@@ -97,10 +97,9 @@ def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 def _plausible(values: Array, most: float) -> Array:
     """With nan for what nothing measures."""
-    garbage = ~(np.abs(values) < most)
-    if not (garbage & ~np.isnan(values)).any():
+    if not len(values) or (values.max() < most and values.min() > -most):
         return values
-    return np.where(garbage, np.nan, values)
+    return np.where(np.abs(values) < most, values, np.nan)
 
 
 def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Parameters) -> tuple[_Row, list[str]]:

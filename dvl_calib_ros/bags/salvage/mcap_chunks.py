@@ -150,6 +150,11 @@ def _unpack_start(new: Callable[[], Any], packed: bytes, size: int) -> bytes:
     A decompressor that meets damage withholds all that the call would have returned. So what is damaged is fed again
     in small pieces, for the damage to cost what comes after it and not what comes before.
     """
+    with suppress(zstd.ZstdError, RuntimeError, EOFError):  # sound, as nearly all are: nothing is copied
+        decompressor = new()
+        whole: bytes = decompressor.decompress(packed, max_length=size + 1)
+        if decompressor.eof and not decompressor.unused_data:
+            return whole
     output = bytearray()
     for piece in (len(packed) or 1, SMALL_PIECE):
         decompressor, output = new(), bytearray()

@@ -23,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
+from numpy.typing import NDArray
 
 from ..batches import Batch, one_batch, times
 from ..channels import Channel
@@ -36,6 +37,7 @@ from .mcap_records import (
     Found,
     Tables,
     messages_of,
+    places_by_index,
     places_of,
     record_head,
     search,
@@ -48,6 +50,8 @@ FIRST_PRIVATE = 0x80
 # How a chunk begins: its opcode, a length below 4 GB, 28 bytes of times, size and checksum, the compression, a length
 _CHUNK_BEGIN = re.compile(rb"(?=\x06.{4}\0{4}.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd).{4}\0{4})", re.DOTALL)
 _CHUNK_BEGIN_SIZE = 64
+# Of an index of messages: opcode, length, channel, bytes of its pairs of log time and place
+_INDEX_HEAD = struct.Struct("<BQHI")
 # At the very end: where the summary begins, where its offsets do, CRC, magic
 _FOOTER = struct.Struct("<QQI8s")
 
@@ -162,7 +166,9 @@ def _whole_chunk(
     chunk = open_chunk(file, at, length, size)
     if chunk.damage:
         raise DamagedError(chunk.damage)
-    places = places_of(chunk.records, tables)
+    starts = _indexed_starts(file, index)
+    places = None if starts is None else places_by_index(chunk.records, starts, tables)
+    places = places or places_of(chunk.records, tables)
     if places is not None:
         found = Batch(times(places.log_ns), *places[1:], chunk.records, channels)
         if len(channels) < len(tables.channels):
@@ -173,6 +179,24 @@ def _whole_chunk(
     damage.raise_if_any()
     singly = ((log_ns, channels[number], data) for log_ns, number, data in messages)
     return one_batch(singly)
+
+
+def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | None:
+    """Where in a chunk its messages begin, by the indexes that follow it; None if they are not as they should be."""
+    if not index.message_index_offsets or not 0 < index.message_index_length <= LARGEST_RECORD:
+        return None
+    file.seek(index.chunk_start_offset + index.chunk_length)
+    content = file.read(index.message_index_length)
+    starts = []
+    here = 0
+    while here + _INDEX_HEAD.size <= len(content):
+        opcode, length, _, size = _INDEX_HEAD.unpack_from(content, here)
+        end = here + RECORD_HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or end != here + _INDEX_HEAD.size + size or size % 16 or end > len(content):
+            return None
+        starts.append(np.frombuffer(content, "<u8", size // 8, here + _INDEX_HEAD.size)[1::2])
+        here = end
+    return np.concatenate(starts) if starts and here == len(content) else None
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:

@@ -33,7 +33,14 @@ _LARGEST_FILE = 1 << 62
 PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
 
 # The same from where the record begins, for thousands of them; of its content begins what comes after
-_HEAD_AT = np.dtype({"names": ["channel", "log_ns"], "formats": ["<u2", "<u8"], "offsets": [9, 15], "itemsize": 31})
+_HEAD_AT = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "log_ns"],
+        "formats": ["u1", "<u8", "<u2", "<u8"],
+        "offsets": [0, 1, 9, 15],
+        "itemsize": 31,
+    }
+)
 
 Found = tuple[int, int, bytes]
 """Log time (ns), channel and content of a message."""
@@ -181,6 +188,46 @@ def places_of(records: bytes, tables: Tables) -> Places | None:
         except DamagedError:
             return None
     return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
+
+
+def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) -> Places | None:
+    """`places_of`, by an index of where messages begin; None where that is not exactly what the records hold."""
+    n = len(records)
+    start = np.sort(starts).astype(np.intp)
+    if not len(start) or start[0] < 0 or start[-1] > n - _HEAD_AT.itemsize:
+        return None
+    heads = np.ndarray((n - _HEAD_AT.itemsize + 1,), _HEAD_AT, records, strides=(1,))[start]
+    length = heads["length"]
+    if not ((heads["opcode"] == MESSAGE) & (length >= _MESSAGE_HEAD.size) & (length <= n)).all():
+        return None
+    end = start + (RECORD_HEAD.size + length.astype(np.intp))
+    # what is between messages are other records, else the index lacks some
+    before, after = np.concatenate([[0], end]), np.append(start, n)
+    if (after < before).any():
+        return None
+    gaps = np.flatnonzero(after > before).tolist()
+    between = [_others(records, int(before[gap]), int(after[gap])) for gap in gaps]
+    number = heads["channel"].astype(np.intp)
+    if None in between or not tables.channels.keys() >= set(np.flatnonzero(np.bincount(number)).tolist()):
+        return None
+    for opcode, content in (record for found in between for record in found or ()):
+        try:
+            tables.note(0, opcode, content)
+        except DamagedError:
+            return None
+    return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
+
+
+def _others(records: bytes, here: int, end: int) -> list[tuple[int, bytes]] | None:
+    """Opcode and content of the schemas and channels that are all there is between two places; else None."""
+    found = []
+    while here + RECORD_HEAD.size <= end:
+        opcode, length = RECORD_HEAD.unpack_from(records, here)
+        if opcode not in (SCHEMA, CHANNEL) or here + RECORD_HEAD.size + length > end:
+            return None
+        found.append((opcode, records[here + RECORD_HEAD.size : here + RECORD_HEAD.size + length]))
+        here += RECORD_HEAD.size + length
+    return found if here == end else None
 
 
 def messages_of(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from operator import itemgetter
 
+import numpy as np
 import pytest
 from conftest import searched
 from hypothesis import HealthCheck, given
@@ -15,7 +16,15 @@ from dvl_calib_ros.bags.batches import batched
 from dvl_calib_ros.bags.channels import Channel
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.salvage.damage import Damage, DamagedError
-from dvl_calib_ros.bags.salvage.mcap_records import MESSAGE, RECORD_HEAD, Tables, messages_of, places_of
+from dvl_calib_ros.bags.salvage.mcap_records import (
+    MESSAGE,
+    RECORD_HEAD,
+    SCHEMA,
+    Tables,
+    messages_of,
+    places_by_index,
+    places_of,
+)
 
 TIMES = st.integers(0, 40) | st.sampled_from([2**63 - 1, 2**63, 2**64 - 1])
 
@@ -75,6 +84,41 @@ def test_places_are_those_of_messages_read_one_by_one_or_there_are_none(tables, 
     found = [(log_ns, number, bytes(records[start:end])) for log_ns, number, start, end in columns]
     assert sorted(found, key=itemgetter(0)) == expected
     assert not noted
+
+
+@searched(150, HealthCheck.function_scoped_fixture)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([1, 7, "schema"]), st.integers(0, 2**64 - 1), st.binary(max_size=40)), max_size=12
+    ),
+    st.none() | st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)),
+    st.none() | st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(-3, 3) | st.integers(0, 2**64 - 1)),
+    st.booleans(),
+)
+def test_an_index_leads_to_all_that_one_finds_from_record_to_record_or_to_nothing(
+    tables, messages, damage, wrong, is_short
+):
+    """damage: where one byte is another; wrong: where one of the index's places is another; short: it lacks one."""
+    parts = [
+        record(SCHEMA, b"\1\0" + bytes(12)) if number == "schema" else message(number, *each)
+        for number, *each in messages
+    ]
+    places = np.cumsum([0, *map(len, parts)])[:-1]
+    starts = np.array(
+        [at for at, (kind, *_) in zip(places, messages, strict=True) if kind != "schema"], dtype=np.uint64
+    )
+    records = bytearray(b"".join(parts))
+    if damage is not None and records:
+        records[int(damage[0] * len(records))] = damage[1]
+    if wrong is not None and len(starts):
+        at = int(wrong[0] * len(starts))
+        starts[at] = (int(starts[at]) + wrong[1]) % 2**64
+    found = places_by_index(bytes(records), starts[: len(starts) - is_short], tables)
+    if found is not None:
+        expected = places_of(bytes(records), tables)
+        assert [column.tolist() for column in found] == [column.tolist() for column in expected]
+    elif damage is None and wrong is None and not is_short:
+        assert not len(starts)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,10 @@ NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZST
 
 
 class Disk:
-    """os.pread with failures. bad: sectors that fail for ever. failing: numbers of the calls that fail once."""
+    """os.pread and os.preadv with failures.
+
+    bad: sectors that fail for ever. failing: numbers of the calls that fail once.
+    """
 
     def __init__(self, bad=(), failing=()) -> None:
         self.bad, self.failing, self.calls = set(bad), set(failing), 0
@@ -41,12 +44,18 @@ class Disk:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         return PREAD(descriptor, size, at)
 
+    def preadv(self, descriptor: int, buffers: list, at: int) -> int:
+        data = self.pread(descriptor, len(buffers[0]), at)
+        buffers[0][: len(data)] = data
+        return len(data)
+
 
 @contextmanager
 def failing(**failures):
     disk = Disk(**failures)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "pread", disk.pread)
+        patch.setattr(os, "preadv", disk.preadv)
         # SQLite reads for itself: of a disk with a bad sector it gives up, as rosbags does
         if disk.bad:
             patch.setattr(sources, "Database", BadDatabase)
@@ -63,11 +72,13 @@ class BadDatabase(Database):
             raise sqlite3.OperationalError("disk I/O error")
         super().__init__(path)
 
-    def messages(self, topics):
-        for number, message in enumerate(super().messages(topics)):
-            if number == self.rows_before:
+    def batches(self, topics):
+        left = self.rows_before
+        for batch in super().batches(topics):
+            yield batch.part(slice(left))
+            left -= batch.size
+            if left < 0:
                 raise sqlite3.OperationalError("disk I/O error")
-            yield message
 
 
 @pytest.fixture(scope="module")
@@ -212,6 +223,7 @@ def test_other_errors_of_a_disk_than_unreadable_places_are_told_in_one_line(tmp_
         raise OSError(errno.ESTALE, "Stale file handle")
 
     monkeypatch.setattr(os, "pread", gone)
+    monkeypatch.setattr(os, "preadv", gone)
     assert main(["replay", str(bag)]) == 2
     assert "Stale file handle" in capsys.readouterr().err
 
