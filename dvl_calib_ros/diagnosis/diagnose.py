@@ -22,11 +22,11 @@ from ..recordings.topics import Topics
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
-from .far_clocks import check_clocks
 from .fitting import prior_std
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
 from .recordings import Recording, load_recordings
+from .registered import check_clocks
 from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
 from .selection import Selected, Selection, blocks_of, select
 from .series import collect_series

@@ -21,12 +21,12 @@ from ..calibration.frames import Array
 from ..effects.base import Effect
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
-from .first_fit import FirstGuess, first_guess
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
 from .recordings import Recording
+from .registered import FirstGuess, first_guess
 from .settings import SETTINGS
 
 # What a vehicle with a gap has most often; the first fit starts with all of these

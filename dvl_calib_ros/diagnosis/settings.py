@@ -19,7 +19,7 @@ class DiagnosisSettings:
     shortest_bin at least, and so that no more than max_bins are left. max_points: of a stream, to which a long
     recording is averaged.
 
-    Finding: first_offset, first_step: delays that are tried, for the whole run. level: family-wise, of the claim that
+    Finding: level: family-wise, of the claim that
     there is an effect. max_effects: named at most. ghost_share: of what is explained already that a further effect
     must add; less is what the inexactness of a strong one leaves. indistinguishable: deviance within which two
     explanations are one answer: with truth j and a rival that looks better by d, the odds are those of a normal
@@ -47,8 +47,6 @@ class DiagnosisSettings:
     max_points: int = 60_000
     min_bins: int = 60
     min_seconds: float = 60.0
-    first_offset: float = 6.0
-    first_step: float = 0.25
     level: float = 0.008
     max_effects: int = 4
     ghost_share: float = 0.0008

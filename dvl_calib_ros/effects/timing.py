@@ -9,11 +9,12 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.frames import Array
+from ..calibration.register.coarse import LONGEST_S
 from ..calibration.samples import VelocityFrame
 from .base import ActsOn, ClockEffect, Effect, EffectInput, Needs, ParameterSpec
 
-# Half of what pairing can bridge by its parameters
-LONGEST_OFFSET_S = 8.0
+# As far as clocks are registered
+LONGEST_OFFSET_S = LONGEST_S
 
 
 def _seconds(what: str) -> tuple[ParameterSpec]:

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.register.far import lag
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis.claims import claims_of, exponents, followed
 from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.contradicted import without_contradicted
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.far_clocks import lag
 from dvl_calib_ros.diagnosis.recordings import Recording, make_recording
 from dvl_calib_ros.diagnosis.results import Verdict
 from dvl_calib_ros.diagnosis.selection import blocks_of

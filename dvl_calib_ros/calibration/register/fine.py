@@ -1,0 +1,273 @@
+"""About a place of the clocks: both clocks, rotation, lever arm and scale together, by robust least squares.
+
+With s the stamp of a reference sample, ρ and τ the delays of reference and DVL and δ = τ - ρ, what is compared is
+
+    B(s - ρ) + ω(s - ρ) × l - (1 + k) C v(s + δ),   B(s - ρ) = R(s - ρ)ᵀ g(s)
+
+in which C, k and l are linear about the last round, and so is δ by the slope of v and ρ by ω × B: where the reference
+is turned into the body by an attitude of another time, its velocity turns as the vehicle does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..delay.local_motion import local_fit, reach_at, spacing_at
+from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at, attitude_at
+from ..extrinsics import rotation_of, rotation_vector
+from ..frames import Array, cross, skew
+from ..robust import median
+from ..time_blocks import TimeBlocks
+from .motion import Motion
+
+# States: turn (rad, body), scale, lever arm (m), δ (s), ρ (s).
+TURN, SCALE, ARM, APART, LATE = slice(0, 3), 3, slice(4, 7), 7, 8
+N = 9
+# Whose product with the states is how late a clock is.
+DVL: Array = np.array([0.0] * 7 + [1.0, 1.0])
+REFERENCE: Array = np.array([0.0] * 8 + [1.0])
+# A clock that is in time is so to this, s.
+HELD_STD_S = 1e-4
+# What is likely of each. A lever arm decides what the motion does not: at one speed a clock looks like one.
+LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
+# References that are looked at, evenly spread: more tell little more, and take longer.
+MOST_ROWS = 4000
+# Rounds at most, and the step (s, m, rad) from which on another one changes nothing.
+ROUNDS, SETTLED_S = 12, 5e-4
+# A delay moves no further in one round, s: slopes hold that far.
+FARTHEST_S = 0.7
+# Samples so many times further off than usual count by half.
+HALF_AT = 3.0
+# Attitudes further apart than this are no attitude between, s.
+GAP_S = 2.0
+# Slower, nothing is compared, m/s. Fewer rows tell nothing.
+SLOW_MPS, ENOUGH = 0.1, 20
+# No more of what is known of δ is taken for noise.
+MOST_OF_NOISE = 0.95
+# Blocks of time by whose scatter σ is found.
+BLOCKS = 48
+# Median of chi-square of 1, 2, 3 degrees of freedom.
+_MEDIAN_CHI2 = (0.455, 1.386, 2.366)
+
+
+class Fitted(NamedTuple):
+    """x (9,) and its covariance p (9, 9), σ of it as blocks of time show; rotation_body_from_dvl (3, 3).
+
+    squares (J,) (m/s)²: of what is left of each reference. inflation: by how much σ of the clocks is more than white
+    noise makes it, by blocks of time and by how long what is left lasts.
+
+    level: m/s per axis, robust, of what is left of `rows` references. speed: RMS of what was compared, m/s.
+    """
+
+    x: Array
+    p: Array
+    rotation_body_from_dvl: Array
+    level: float
+    rows: int
+    speed: float
+    squares: Array
+    axes: int
+    inflation: float
+
+    def cost(self, level: float) -> float:
+        """What is left, in chi-square by a level of noise (m/s), robust, and as independent as blocks show."""
+        scale = HALF_AT**2 * self.axes
+        return scale * float(np.log1p(self.squares / (scale * level**2)).sum())
+
+    @property
+    def std(self) -> Array:
+        """(9,)."""
+        return np.sqrt(np.diag(self.p))
+
+    @property
+    def dvl_late(self) -> float:
+        """τ, s."""
+        return float(self.x[APART] + self.x[LATE])
+
+    @property
+    def dvl_std(self) -> float:
+        """σ of τ, s."""
+        return float(np.sqrt(self.p[[APART, APART, LATE, LATE], [APART, LATE, APART, LATE]].sum()))
+
+
+class _Rows(NamedTuple):
+    """residual (J, A), jacobian (J, A, 9) of it, times (J,) s; of_noise (J,): how much of the square of the column of δ
+    is expected of noise alone; speed: RMS, m/s."""
+
+    residual: Array
+    jacobian: Array
+    times: Array
+    of_noise: Array
+    speed: float
+
+
+class Fit:
+    """Least squares of one motion from one place of the clocks."""
+
+    def __init__(self, motion: Motion, lever_arm: Array) -> None:
+        """lever_arm: (3,) m, that is known."""
+        self._motion, self._lever_arm = motion, lever_arm
+        m = motion
+        moving = np.flatnonzero((m.reference**2).sum(axis=1) >= SLOW_MPS**2)
+        if len(moving) > MOST_ROWS:
+            moving = moving[np.linspace(0, len(moving) - 1, MOST_ROWS).astype(int)]
+        self._times, self._velocity = m.reference_times[moving], m.reference[moving]
+        self._reach = np.clip(
+            reach_at(spacing_at(m.dvl.times, self._times), LEAST_SLOPE_REACH_S, MOST_REACH_S), LEAST_SLOPE_REACH_S, None
+        )
+        # of the DVL, (m/s)²: where hardly anything changes, what seems to is its noise
+        self._noise = float(_noise(m.dvl.velocity))
+        typical = float(median(np.diff(m.dvl.times))) if len(m.dvl.times) > 1 else 1.0
+        self._reach[np.isnan(self._reach)] = max(LEAST_SLOPE_REACH_S, min(2.6 * typical, MOST_REACH_S))
+
+    def __call__(
+        self,
+        reference: float,
+        apart: float,
+        rotation_body_from_dvl: Array | None,
+        in_time: Sequence[Array] = (),
+    ) -> Fitted | None:
+        """From ρ and δ (s) on; None where too little can be compared.
+
+        rotation_body_from_dvl: (3, 3), about which turns are likely; None to find it. in_time: clocks that are in time,
+        `DVL` and `REFERENCE`; without an attitude that turns it, the reference's is.
+        """
+        rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
+        if rotation is None:
+            return None
+        x = np.zeros(N)
+        x[APART], x[LATE] = apart, reference
+        nominal = rotation
+        solved = None
+        if not (self._motion.in_earth and self._motion.has_attitude):
+            in_time = (*in_time, REFERENCE)
+        for _ in range(ROUNDS):
+            rows = self._rows(x, rotation)
+            if rows is None:
+                return None
+            solved = self._solved(x, rows, nominal, rotation, in_time)
+            step = solved[0]
+            far = float(np.abs(step[[APART, LATE]]).max())
+            step = step * min(1.0, FARTHEST_S / max(far, 1e-9))
+            x = x + step
+            rotation = rotation_of(step[TURN]) @ rotation
+            x[TURN] = 0.0
+            if far < SETTLED_S and float(np.abs(step).max()) < SETTLED_S:
+                break
+        rows = self._rows(x, rotation)
+        if rows is None or solved is None:
+            return None
+        _, information, level, weight = self._solved(x, rows, nominal, rotation, in_time)
+        p, factor = self._covariance(rows, information, level, weight)
+        squares, axes = (rows.residual**2).sum(axis=1), rows.residual.shape[1]
+        inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
+        return Fitted(x, p, rotation, level, len(rows.times), rows.speed, squares, axes, inflation)
+
+    def _streams(self, reference: float, apart: float) -> tuple[Array, ...] | None:
+        """B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), times (J,), noise gain of
+        the slope (J,)."""
+        m = self._motion
+        own = self._times - reference
+        fit = local_fit(m.dvl.times, m.dvl.velocity, self._times + apart, self._reach)
+        known = fit.found
+        rotation, oriented = attitude_at(m.imu, own, GAP_S)
+        if m.in_earth and not m.has_attitude:
+            return None
+        if m.in_earth:
+            known = known & oriented
+        rates = np.nan_to_num(angular_velocity_at(m.turns, own, GAP_S)[0])
+        if np.count_nonzero(known) < ENOUGH:
+            return None
+        at = np.flatnonzero(known)
+        velocity, rotation = self._velocity[at], rotation[at]
+        body = np.einsum("nji,nj->ni", rotation, velocity) if m.in_earth else velocity
+        return body, rates[at], fit.value[at], fit.slope[at], rotation, self._times[at], fit.slope_gain[at]
+
+    def _best_rotation(self, reference: float, apart: float) -> Array | None:
+        """C (3, 3) that fits best without a lever arm, by singular values."""
+        streams = self._streams(reference, apart)
+        if streams is None:
+            return None
+        body, _, velocity, *_ = streams
+        square = float((velocity**2).sum())
+        u, _, vt = np.linalg.svd(body.T @ velocity + 1e-3 * square * np.eye(3))
+        return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+    def _rows(self, x: Array, rotation: Array) -> _Rows | None:
+        streams = self._streams(float(x[LATE]), float(x[APART]))
+        if streams is None:
+            return None
+        body, rates, velocity, slope, attitude, times, gain = streams
+        own = (1.0 + x[SCALE]) * velocity @ rotation.T
+        residual = body + cross(rates, self._lever_arm + x[ARM]) - own
+        jacobian = np.zeros((len(times), 3, N))
+        jacobian[:, :, TURN] = skew(own)
+        jacobian[:, :, SCALE] = -velocity @ rotation.T
+        jacobian[:, :, ARM] = skew(rates)
+        jacobian[:, :, APART] = -(1.0 + x[SCALE]) * slope @ rotation.T
+        jacobian[:, :, LATE] = cross(rates, body)
+        measured = np.array(self._motion.measured)
+        if not measured.all():
+            if self._motion.in_earth:
+                residual = np.einsum("nij,nj->ni", attitude, residual)
+                jacobian = attitude @ jacobian
+            residual, jacobian = residual[:, measured], jacobian[:, measured]
+        speed = float(np.sqrt((body**2).sum(axis=1).mean()))
+        return _Rows(residual, jacobian, times, gain * self._noise * residual.shape[1], speed)
+
+    def _solved(
+        self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
+    ) -> tuple[Array, Array, float, Array]:
+        """The step (9,), its information (9, 9), the level of noise (m/s), and the weight of each row (J,)."""
+        axes = rows.residual.shape[1]
+        squares = (rows.residual**2).sum(axis=1)
+        level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
+        weight = 1.0 / (1.0 + squares / (HALF_AT**2 * axes * level2))
+        h = rows.jacobian.reshape(-1, N)
+        w = np.repeat(weight, axes) / level2
+        prior = LIKELY**-2.0
+        information = (h * w[:, None]).T @ h + np.diag(prior)
+        information[APART, APART] -= min(
+            float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * float(information[APART, APART])
+        )
+        away = x.copy()
+        away[TURN] = rotation_vector(rotation @ nominal.T)
+        away[[APART, LATE]] = 0.0
+        vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * away
+        for row in in_time:
+            information += HELD_STD_S**-2.0 * np.outer(row, row)
+            vector -= HELD_STD_S**-2.0 * row * float(row @ x)
+        return np.linalg.solve(information, vector), information, float(np.sqrt(level2)), weight
+
+    def _covariance(self, rows: _Rows, information: Array, level: float, weight: Array) -> tuple[Array, Array]:
+        p = np.linalg.inv(information)
+        blocks = TimeBlocks()
+        for part in np.array_split(np.arange(len(rows.times)), min(BLOCKS, max(1, len(rows.times) // 10))):
+            h = rows.jacobian[part].reshape(-1, N)
+            w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
+            blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
+        factor = blocks.inflation(0, np.zeros(N), p)
+        return p * np.outer(factor, factor), factor
+
+
+def _noise(velocity: Array) -> float:
+    """Variance (m/s)² of white noise on a stream (N, 3), by its second differences."""
+    if len(velocity) < 3:
+        return 0.0
+    bent = median(np.diff(velocity, 2, axis=0) ** 2) / (6.0 * _MEDIAN_CHI2[0])
+    return float(bent.mean())
+
+
+def _lasting(residual: Array) -> float:
+    """By how much σ of a mean of residuals (J, A) is more than that of white ones, by their autocorrelation."""
+    n = len(residual)
+    size = 1 << (2 * n - 1).bit_length()
+    power = (np.abs(np.fft.rfft(residual, size, axis=0)) ** 2).sum(axis=1)
+    alike = np.fft.irfft(power, size)[: max(2, n // 8)]
+    alike = alike / max(float(alike[0]), 1e-30)
+    # up to where it is lost in chance
+    until = int(np.argmax(alike < 2.0 / np.sqrt(n))) or len(alike)
+    return float(np.sqrt(1.0 + 2.0 * alike[1:until].sum()))

@@ -1,0 +1,121 @@
+"""What is registered: the three streams as columns, each by stamps of its own, in s since a common epoch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..clocks import Clocks
+from ..delay.rows import DvlColumns, ImuColumns, TurnRates, binned
+from ..frames import ENU_FROM_NED, Array
+from ..imu_alignment import ImuAlignment
+from ..parameters import Parameters
+from ..samples import FRAME_CODES, SampleBlock, Streams, VelocityFrame
+from ..screening import screen_columns, unit_quaternions
+from ..spikes import without_spikes
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Streams of one vehicle. Stamps that go back are left out.
+
+    dvl: velocity in the DVL's frame. reference_times (M,) s, reference (M, 3) m/s: in the earth (ENU) if in_earth, else
+    in the body. measured: (3,) which of its axes are measured. imu: attitudes; without any none is known. turns: rates.
+    """
+
+    dvl: DvlColumns
+    reference_times: Array
+    reference: Array
+    in_earth: bool
+    measured: tuple[bool, bool, bool]
+    imu: ImuColumns
+    turns: TurnRates
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether there are attitudes to interpolate between."""
+        return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
+
+    def in_the_body(self) -> Motion:
+        """The same as if the reference were in the body."""
+        return replace(self, in_earth=False)
+
+
+def motion_of(streams: Streams, parameters: Parameters) -> Motion | None:
+    """What samples say, each stream's clock corrected as the parameters have it; None where two have too little."""
+    dvl, reference = (_valid(block, parameters) for block in (streams.dvl, streams.reference))
+    imu = ImuAlignment(parameters).block(streams.imu.part(streams.imu.refused == 0))
+    if len(dvl) < 2 or len(reference) < 2:
+        return None
+    clocks = Clocks.of(parameters)
+    first_ns = int(dvl.stamps_ns[0])
+    code = int(np.bincount(reference.frames).argmax())
+    reference = reference.part(reference.frames == code)
+    times = 1e-9 * (clocks.dvl(dvl.stamps_ns, first_ns) - first_ns)
+    dvl_times, velocity = _in_order(times, dvl.values)
+    reference_times, seen = _in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
+    imu_times, numbers = _in_order(
+        1e-9 * (imu.stamps_ns - clocks.imu_ns - first_ns),
+        np.hstack([unit_quaternions(imu.orientation), imu.angular_velocity]),
+    )
+    if code == FRAME_CODES[VelocityFrame.NED]:
+        seen = seen @ ENU_FROM_NED.T
+    measured = _measured(reference, parameters)
+    if code == FRAME_CODES[VelocityFrame.NED]:
+        measured = measured[1], measured[0], measured[2]
+    return make_motion(
+        (dvl_times, velocity),
+        (reference_times, seen),
+        code != FRAME_CODES[VelocityFrame.BODY],
+        measured,
+        ImuColumns(imu_times, numbers[:, :4], numbers[:, 4:]),
+    )
+
+
+def make_motion(
+    dvl: tuple[Array, Array],
+    reference: tuple[Array, Array],
+    in_earth: bool,
+    measured: tuple[bool, bool, bool],
+    imu: ImuColumns,
+) -> Motion | None:
+    """A motion without the spikes of its velocities; None where too little is left. Times increase.
+
+    dvl, reference: times (N,) s and velocities (N, 3) m/s.
+    """
+    times, velocity = _cleaned(*dvl)
+    reference_times, seen = _cleaned(*reference)
+    if min(len(times), len(reference_times)) < 2:
+        return None
+    return Motion(DvlColumns(times, velocity), reference_times, seen, in_earth, measured, imu, TurnRates.of(imu))
+
+
+def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:
+    """Without spikes, and no faster than needed."""
+    finite = np.isfinite(velocity).all(axis=1)
+    times, velocity = times[finite], velocity[finite]
+    good = without_spikes(velocity, smallest=0.1, also_at_ends=True)
+    times, velocity = binned(times[good], velocity[good])
+    return times, velocity
+
+
+def _in_order(times: Array, values: Array) -> tuple[Array, Array]:
+    later = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
+    return times[later], values[later]
+
+
+def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
+    speed = np.sqrt((block.values[:, :3] ** 2).sum(axis=1))
+    return block.part((block.refused == 0) & (speed <= parameters.max_speed) & (speed > 0.0))
+
+
+def _measured(reference: SampleBlock, parameters: Parameters) -> tuple[bool, bool, bool]:
+    """Which axes a reference measures, by its claims, by parameter, and by what is zero throughout."""
+    bits = screen_columns(reference.covariances).unmeasured
+    measured = np.array([2 * np.count_nonzero(bits & bit) < len(bits) for bit in (1, 2, 4)])
+    if parameters.gnss_axes != "auto":
+        measured[2] = parameters.gnss_axes == "xyz"
+    measured[2] &= bool(reference.values[:, 2].any())
+    x, y, z = measured.tolist()
+    return x, y, z

@@ -1,0 +1,73 @@
+"""What a diagnosis starts from: how the instruments of a recording stand to each other, as `register` finds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.delay.rows import ImuColumns
+from ..calibration.extrinsics import rotation_vector
+from ..calibration.frames import Array
+from ..calibration.register.far import far_clocks
+from ..calibration.register.motion import Motion, make_motion
+from ..calibration.register.registration import register
+from ..calibration.samples import VelocityFrame
+from ..effects.base import Needs
+from ..errors import InputError
+from .composed import Offsets
+from .recordings import Recording
+
+
+@dataclass(frozen=True)
+class FirstGuess:
+    """Of one recording. offsets: of clocks. lever_arm: (3,) m, beyond what is known of it. phi: (3,) rad."""
+
+    offsets: Offsets
+    lever_arm: Array
+    phi: Array
+
+
+def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
+    """Raise InputError if stamps are too far apart for anything to be found.
+
+    Parameters
+    ----------
+    recording: What is to be compared.
+    rotation_dvl_from_body: (3, 3), the nominal mounting.
+
+    """
+    motion = _motion(recording)
+    far = None if motion is None else far_clocks(motion, rotation_dvl_from_body)
+    if far is not None:
+        raise InputError(f"{recording.name}: {far.says}")
+
+
+def first_guess(recording: Recording, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
+    """Delays, lever arm and mounting of one recording; none where it cannot be registered."""
+    motion = _motion(recording)
+    found = None if motion is None else register(motion, rotation_dvl_from_body.T, lever_arm)
+    if found is None:
+        return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
+    phi = rotation_vector(found.rotation_body_from_dvl.T @ rotation_dvl_from_body.T)
+    return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi)
+
+
+def _motion(recording: Recording) -> Motion | None:
+    attitude, dvl, reference = recording.attitude, recording.dvl, recording.reference
+    times = np.zeros(0) if attitude is None else attitude.time
+    quaternions = np.zeros((0, 4)) if attitude is None else attitude.values
+    rates = np.full((len(times), 3), np.nan)
+    if len(times) > 1 and Needs.ANGULAR_VELOCITY in recording.available:
+        rates = recording.angular_velocity(times)
+    elif recording.rates is not None:
+        times, rates = recording.rates.time, recording.rates.values
+        quaternions = np.full((len(times), 4), np.nan)
+    length = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
+    return make_motion(
+        (dvl.time, dvl.values),
+        (reference.time, reference.values),
+        recording.frame is not VelocityFrame.BODY,
+        recording.measured,
+        ImuColumns(times, quaternions / length, rates),
+    )
