@@ -594,6 +594,11 @@ class Calibrator:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
         return self._delay.suggestion
 
+    @property
+    def suggestion_so_far(self) -> str:
+        """`suggestion`, live: what a look that is not made anew for every message says."""
+        return self._delay.suggestion_so_far
+
 
 def _own(block: AlignedBlock) -> AlignedBlock:
     """A copy that what is added later does not change."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..calibration.delay.rows import ImuColumns
-from ..calibration.extrinsics import rotation_vector
+from ..calibration.extrinsics import turn_between
 from ..calibration.frames import Array
 from ..calibration.register.far import far_clocks
 from ..calibration.register.motion import Motion, make_motion
@@ -49,7 +49,7 @@ def first_guess(recording: Recording, rotation_dvl_from_body: Array, lever_arm: 
     found = None if motion is None else register(motion, rotation_dvl_from_body.T, lever_arm)
     if found is None:
         return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
-    phi = rotation_vector(found.rotation_body_from_dvl.T @ rotation_dvl_from_body.T)
+    phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)
     return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi)
 
 

@@ -131,8 +131,8 @@ def diagnose(
     found += message_advice(grown) + data_advice(grown) + dvl_type.advice(grown["dvl"])
     found += gate_advice(estimate) + consistency_advice(estimate)
     found += reference_advice(estimate)
-    if calibrator.suggestion:
-        found.append(finding("CONFIGURATION_WRONG", says=calibrator.suggestion))
+    if says := calibrator.suggestion_so_far:
+        found.append(finding("CONFIGURATION_WRONG", says=says))
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
     status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"

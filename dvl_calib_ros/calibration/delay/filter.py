@@ -87,7 +87,7 @@ class DelayFilter:
         self._parameters = parameters
         self._aligner = aligner
         self._on_block = on_block
-        self._solver = BlockSolver(parameters, prior, unknown, gate, verified)
+        self._solver = BlockSolver(parameters, prior, unknown, gate, verified, live=worker is not None)
         self._worker = AtOnce() if worker is None else worker
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
@@ -103,6 +103,7 @@ class DelayFilter:
         self._gathered_ns: list[int] = []  # the same of those that are not
         self._is_telling = False
         self._suggested: tuple[Outcome, str] | None = None
+        self._suggested_so_far: tuple[Outcome, str] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
 
     def attach(self) -> None:
@@ -172,6 +173,14 @@ class DelayFilter:
         if self._suggested is None or self._suggested[0] is not newest:  # asked for more often than there is a block
             self._suggested = newest, self._solver.suggestion()
         return self._suggested[1]
+
+    @property
+    def suggestion_so_far(self) -> str:
+        """The same, where a clock is late as it was seen a little ago: nobody waits for a look at all there is."""
+        newest = self._newest()
+        if self._suggested_so_far is None or self._suggested_so_far[0] is not newest:
+            self._suggested_so_far = newest, self._solver.suggestion(fresh=False)
+        return self._suggested_so_far[1]
 
     @property
     def evidence(self) -> Evidence:

@@ -23,10 +23,10 @@ from ..shared_noise import SharedNoise
 from .bank import DelayBank, Found, Posterior
 from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
+from .clocks import KeptClocks
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, Kept
 from .parts import Parts
-from .reference_clock import ClockBlock, ReferenceClock
 from .rows import (
     DelayedRows,
     DvlColumns,
@@ -78,8 +78,10 @@ class BlockSolver:
         unknown: GaussianState,
         gate: float,
         verified: bool,
+        *,
+        live: bool = False,
     ) -> None:
-        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0."""
+        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way."""
         self._parameters = parameters
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
@@ -87,7 +89,8 @@ class BlockSolver:
         self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
-        self._reference_clock = ReferenceClock(parameters)
+        self._clocks = KeptClocks(parameters)
+        self._is_live = live
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
         self._claims = 0  # references
@@ -104,8 +107,11 @@ class BlockSolver:
         counts = ModelCounts(bank.used, bank.gated + self._spikes, bank.mean_nis, 3.0, self.restarted)
         return Outcome(bank.prior, self._posterior, counts, self._claims, has_rows)
 
-    def suggestion(self) -> str:
-        """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
+    def suggestion(self, *, fresh: bool = True) -> str:
+        """What configuration the data fit, in words, where the one given is grossly wrong; else ''.
+
+        fresh: of clocks by all that is known, which takes a while; else as they were looked at on the way, live.
+        """
         contradiction, found = self._attitude_rates.says(), self._coarse.suggestion()
         if contradiction:  # of what follows from it only what mends it is worth a word
             return f"{contradiction}; {found.says}" if found and "imu_frame" in found.says else contradiction
@@ -113,8 +119,7 @@ class BlockSolver:
             return found.says
         if shared := self._shared_noise.says():
             return shared
-        late = self._reference_clock.found()
-        return "" if late is None else late.says(self._parameters)
+        return self._clocks.says(fresh=fresh)
 
     def solve(self, blocks: Sequence[Block]) -> list[Outcome]:
         """Take blocks in order: many at once cost a third of one after the other, and come to the same."""
@@ -127,6 +132,8 @@ class BlockSolver:
                     end += 1
             outcomes += self._solve_together(blocks[at:end])
             at = end
+        if self._is_live:
+            self._clocks.look_again()
         return outcomes
 
     def _goes_alone(self, block: Block) -> bool:
@@ -141,18 +148,16 @@ class BlockSolver:
                 self.bank.end_day()
             except np.linalg.LinAlgError:  # numbers that ran away: as if it were the same day
                 self.restarted += 1
-            self._reference_clock.start()
+            self._clocks.end_day()
         streams = [cleaned(block, self._parameters, self.epoch_ns, self._contradicted) for block in blocks]
         compared = self._compared([each for each in streams if each.are_compared])
         outcomes: list[Outcome] = []
         found: list[tuple[int, Found | None]] = []
-        clocked: list[ClockBlock] = []
         for each in streams:
-            has_rows = self._take(each, compared, clocked)
+            has_rows = self._take(each, compared)
             if has_rows or each.block.new_days:
                 found.append((len(outcomes), self._found()))
             outcomes.append(self.outcome(has_rows))
-        self._reference_clock.add(clocked)
         return self._with_posteriors(outcomes, found)
 
     def _found(self) -> Found | None:
@@ -245,8 +250,8 @@ class BlockSolver:
             imu_gap_s=p.imu_timeout,
         )
 
-    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison], clocked: list[ClockBlock]) -> bool:
-        """Take a block's samples; whether it has rows. clocked: is given what `_reference_clock` is to know of it."""
+    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison]) -> bool:
+        """Take a block's samples; whether it has rows."""
         block, reference, dvl = streams.block, streams.reference, streams.dvl
         self._spikes += streams.reference_spikes
         if not streams.are_compared:
@@ -255,22 +260,22 @@ class BlockSolver:
         claimed = int(np.count_nonzero(reference.claimed))
         self._claims += claimed - (len(reference.times) - claimed)
         seen, turns, rows_of = compared[block.from_ns]
-        rows, binned_dvl = None if rows_of is None else rows_of(), streams.binned_dvl
+        rows = None if rows_of is None else rows_of()
         if streams.has_rows and streams.is_slow:
             good, rows = without_contradicted(
                 dvl, reference.times, lambda some: self._compare([streams], [some], seen, turns).rows(0),
                 self.bank.misfits,
             )  # fmt: skip
             self._leave_out(streams.dvl_ns[~good], block.from_ns)
-            dvl = binned_dvl = DvlColumns(*(column[good] for column in dvl))
+            dvl = DvlColumns(*(column[good] for column in dvl))
+        from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
+        kept = Kept.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
+        self._clocks.add(kept)
         if self.kept is not None:
-            from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
-            self.kept.append(Kept.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu))
+            self.kept.append(kept)
         if rows is None:
             return False
-        used = self.bank.add(rows, streams.reference_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
-        own, delay = reference.part(rows.index[used]), self.bank.likeliest_delay
-        clocked.append(ClockBlock(binned_dvl, own, streams.imu, turns, streams.noise_dvl, delay))
+        self.bank.add(rows, streams.reference_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
         return len(rows) > 0
 
     def _leave_out(self, stamps_ns: Stamps, block_ns: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..delay.local_motion import local_fit, reach_at, spacing_at
 from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at, attitude_at
-from ..extrinsics import rotation_of, rotation_vector
+from ..extrinsics import rotation_of, turn_between
 from ..frames import Array, cross, skew
 from ..robust import median
 from ..time_blocks import TimeBlocks
@@ -29,12 +29,14 @@ N = 9
 # Whose product with the states is how late a clock is.
 DVL: Array = np.array([0.0] * 7 + [1.0, 1.0])
 REFERENCE: Array = np.array([0.0] * 8 + [1.0])
+# ... and by how much the DVL's is later than the reference's: where it is none, it is the IMU's that is off.
+BOTH_ALIKE: Array = np.array([0.0] * 7 + [1.0, 0.0])
 # A clock that is in time is so to this, s.
 HELD_STD_S = 1e-4
 # What is likely of each. A lever arm decides what the motion does not: at one speed a clock looks like one.
 LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
-# References that are looked at, evenly spread: more tell little more, and take longer.
-MOST_ROWS = 4000
+# References that are looked at, evenly spread: more tell little more, and take longer; fewer tell places apart.
+MOST_ROWS, FEW_ROWS = 4000, 800
 # Rounds at most, and the step (s, m, rad) from which on another one changes nothing.
 ROUNDS, SETTLED_S = 12, 5e-4
 # A delay moves no further in one round, s: slopes hold that far.
@@ -80,7 +82,7 @@ class Fitted(NamedTuple):
     @property
     def std(self) -> Array:
         """(9,)."""
-        return np.sqrt(np.diag(self.p))
+        return np.sqrt(np.maximum(np.diag(self.p), 0.0))
 
     @property
     def dvl_late(self) -> float:
@@ -90,7 +92,7 @@ class Fitted(NamedTuple):
     @property
     def dvl_std(self) -> float:
         """σ of τ, s."""
-        return float(np.sqrt(self.p[[APART, APART, LATE, LATE], [APART, LATE, APART, LATE]].sum()))
+        return float(np.sqrt(max(self.p[[APART, APART, LATE, LATE], [APART, LATE, APART, LATE]].sum(), 0.0)))
 
 
 class _Rows(NamedTuple):
@@ -107,13 +109,13 @@ class _Rows(NamedTuple):
 class Fit:
     """Least squares of one motion from one place of the clocks."""
 
-    def __init__(self, motion: Motion, lever_arm: Array) -> None:
-        """lever_arm: (3,) m, that is known."""
+    def __init__(self, motion: Motion, lever_arm: Array, most: int = MOST_ROWS) -> None:
+        """lever_arm: (3,) m, that is known. most: references that are looked at."""
         self._motion, self._lever_arm = motion, lever_arm
         m = motion
         moving = np.flatnonzero((m.reference**2).sum(axis=1) >= SLOW_MPS**2)
-        if len(moving) > MOST_ROWS:
-            moving = moving[np.linspace(0, len(moving) - 1, MOST_ROWS).astype(int)]
+        if len(moving) > most:
+            moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self._times, self._velocity = m.reference_times[moving], m.reference[moving]
         self._reach = np.clip(
             reach_at(spacing_at(m.dvl.times, self._times), LEAST_SLOPE_REACH_S, MOST_REACH_S), LEAST_SLOPE_REACH_S, None
@@ -133,7 +135,7 @@ class Fit:
         """From ρ and δ (s) on; None where too little can be compared.
 
         rotation_body_from_dvl: (3, 3), about which turns are likely; None to find it. in_time: clocks that are in time,
-        `DVL` and `REFERENCE`; without an attitude that turns it, the reference's is.
+        `DVL` and `REFERENCE`, or `BOTH_ALIKE`; without an attitude that turns it, the reference's is.
         """
         rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
         if rotation is None:
@@ -234,7 +236,7 @@ class Fit:
             float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * float(information[APART, APART])
         )
         away = x.copy()
-        away[TURN] = rotation_vector(rotation @ nominal.T)
+        away[TURN] = turn_between(nominal, rotation)
         away[[APART, LATE]] = 0.0
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * away
         for row in in_time:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
 from ..frames import Array
+from ..parameters import Parameters
 from .coarse import places
-from .fine import APART, ARM, DVL, LATE, REFERENCE, SCALE, TURN, Fit, Fitted
+from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, REFERENCE, SCALE, TURN, Fit, Fitted
 from .motion import Motion
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
@@ -41,16 +43,17 @@ class Clock:
 
 @dataclass(frozen=True)
 class Registration:
-    """dvl, reference: their clocks. apart: by how much the DVL's stamps are later than the reference's.
+    """dvl, reference: their clocks beside the IMU's. imu: its own, where it alone is off.
 
-    Without a reference that an attitude turns, which clock it is does not show: then only `apart` is known, and
-    the reference is in time. rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the
-    DVL from the reference point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration
-    explains, as a share of the speed; spread: the same, m/s per axis.
+    Without a reference that an attitude turns, which clock it is does not show: then the reference is in time. apart:
+    by how much the DVL's stamps are later than the reference's. rotation_body_from_dvl (3, 3), turn_std (3,) rad.
+    lever_arm, lever_arm_std (3,) m: of the DVL from the reference point. scale, scale_std: error of the DVL's,
+    dimensionless. left: what no registration explains, as a share of the speed; spread: the same, m/s per axis.
     """
 
     dvl: Clock
     reference: Clock
+    imu: Clock
     apart: Clock
     rotation_body_from_dvl: Array
     turn_std: Array
@@ -62,9 +65,23 @@ class Registration:
     spread: float
 
     @property
-    def is_in_time(self) -> bool:
-        """Whether no clock is shown to be off."""
-        return not (self.dvl.is_shown or self.reference.is_shown or self.apart.is_shown)
+    def offsets(self) -> dict[str, float]:
+        """By parameter, how late (s) the stamps are of the clocks that are shown to be off, beyond what it says."""
+        if self.imu.is_shown:
+            return {"imu_time_offset": self.imu.late}
+        clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference}
+        return {name: clock.late for name, clock in clocks.items() if clock.is_shown}
+
+    def says(self, parameters: Parameters) -> str:
+        """What configuration would fit, in words, where a clock beside the DVL's is off beyond doubt; else ''."""
+        imu = f"imu_time_offset: {round(parameters.imu_time_offset + self.imu.late, 2):g}"
+        if self.imu.is_shown:
+            return f"the data fit an IMU whose stamps are {_late(self.imu)} ({imu})"
+        if not self.reference.is_shown:
+            return ""
+        of_reference = f"reference_time_offset: {round(parameters.reference_time_offset + self.reference.late, 2):g}"
+        dvl = f"whose stamps are {_late(self.dvl)}" if self.dvl.is_shown else "that is in time"
+        return f"the data fit a reference whose stamps are {_late(self.reference)}, and a DVL {dvl} ({of_reference})"
 
 
 def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
@@ -72,9 +89,9 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
 
     rotation_body_from_dvl: (3, 3) the mounting, None where it is not known. lever_arm: (3,) m, what is known of it.
     """
-    fit = Fit(motion, lever_arm)
+    fit, quick = Fit(motion, lever_arm), Fit(motion, lever_arm, FEW_ROWS)
     tried = [(place.reference, place.dvl - place.reference) for place in places(motion, rotation_body_from_dvl)]
-    found = [fit(*place, rotation_body_from_dvl) for place in {*tried, (0.0, 0.0)}]
+    found = [quick(*place, rotation_body_from_dvl) for place in {*tried, (0.0, 0.0)}]
     fitted = [each for each in found if each is not None and np.isfinite(each.x).all()]
     if not fitted:
         return None
@@ -82,34 +99,32 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
     # legs that repeat agree at more than one delay
     as_good = [each for each in fitted if _gain(motion, each, best) < GAIN]
     best = min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
-    return _explained(fit, best, rotation_body_from_dvl, lever_arm)
+    free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
+    return None if free is None else _explained(fit, free, rotation_body_from_dvl, lever_arm)
 
 
 def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:
-    """By the fewest clocks that are off: none, only the DVL's, only the reference's, or both."""
-    clocks = ((DVL, REFERENCE), (REFERENCE,), (DVL,))
-    held = []
-    for in_time in clocks:
-        start = 0.0 if in_time is not clocks[2] else -float(free.x[APART])
-        apart = 0.0 if in_time is clocks[0] else float(free.x[APART])
-        held.append(fit(start, apart, rotation, in_time))
-    none, of_dvl, of_reference = (math.inf if each is None else _cost(each, free) for each in held)
-    apart = free.x[APART]
-    of_dvl += EARLY if apart < 0.0 else 0.0
-    of_reference += EARLY if apart > 0.0 else 0.0
-    costs = {0: none, 1: of_dvl + ONE_MORE, 2: of_reference + ONE_MORE, 3: 2.0 * ONE_MORE}
-    likeliest = min(costs, key=lambda each: costs[each])
-    best = free if likeliest == 3 else held[likeliest] or free
+    """By the fewest clocks that are off: none, one of the three, or both of DVL and reference."""
+    apart = float(free.x[APART])
+    early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
+    tried = {
+        _Off.NONE: _held(fit, free, rotation, 0.0, 0.0, (DVL, REFERENCE)),
+        _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), ONE_MORE + early),
+        _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), ONE_MORE + too_early),
+        _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE),
+    }
+    likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # that both are off holds either one, and is no other cause
-    is_told_apart = all(
-        cost - costs[likeliest] > TOLD_APART for each, cost in costs.items() if each not in (likeliest, 3)
-    )
+    is_told_apart = min(c for each, (_, c) in tried.items() if each is not likeliest) - cost > TOLD_APART
+    if best is None or cost > 2.0 * ONE_MORE:
+        likeliest, best, is_told_apart = _Off.BOTH, free, True
     x, p = best.x, best.p
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
-        dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and _is_off(best.dvl_late, best.dvl_std)),
-        reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(float(x[LATE]), float(std[LATE]))),
-        apart=Clock(float(x[APART]), float(std[APART]), likeliest > 0 and _is_off(float(x[APART]), float(std[APART]))),
+        dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and _beyond(best.dvl_late, best.dvl_std)),
+        reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(best, LATE)),
+        imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
+        apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
         rotation_body_from_dvl=best.rotation_body_from_dvl,
         turn_std=std[TURN],
         lever_arm=lever_arm + x[ARM],
@@ -121,15 +136,40 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
     )
 
 
-def _cost(held: Fitted, free: Fitted) -> float:
-    """By how much chi-square grows where clocks are held."""
+class _Off(Enum):
+    """Which clock is off."""
+
+    NONE, DVL, REFERENCE, IMU, BOTH = range(5)
+
+
+def _held(
+    fit: Fit,
+    free: Fitted,
+    rotation: Array | None,
+    reference: float,
+    apart: float,
+    in_time: tuple[Array, ...],
+    costs: float = 0.0,
+) -> tuple[Fitted | None, float]:
+    """The fit with some clocks in time, and by how much chi-square grows, and what it costs beside; None: nothing."""
+    held = fit(reference, apart, rotation, in_time)
+    if held is None:
+        return None, math.inf
     # at other delays a sample more or less is within both streams
     grown = (held.cost(free.level) * free.rows / held.rows - free.cost(free.level)) / free.inflation**2
-    return grown if math.isfinite(grown) else math.inf
+    return held, grown + costs if math.isfinite(grown) else math.inf
 
 
-def _is_off(seconds: float, std: float) -> bool:
+def _is_off(fitted: Fitted, index: int) -> bool:
+    return _beyond(float(fitted.x[index]), float(fitted.std[index]))
+
+
+def _beyond(seconds: float, std: float) -> bool:
     return std < KNOWN_STD_S and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
+
+
+def _late(clock: Clock) -> str:
+    return f"{abs(clock.late):.2f} s {'late' if clock.late > 0.0 else 'early'}"
 
 
 def _gain(motion: Motion, one: Fitted, other: Fitted) -> float:

@@ -71,14 +71,18 @@ def test_two_late_clocks_are_told_apart():
 
 def test_a_late_imu_is_not_put_down_to_the_two_others():
     said = found(imu=0.5).suggestion
-    assert "an IMU whose stamps are 0.5" in said and "late" in said
+    assert said.startswith("the data fit an IMU whose stamps are") and "late" in said
     assert offset_named(said, "imu_time_offset") == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_reference_later_than_is_looked_for_is_said_to_be_so():
-    assert "1.2 s late or more (look again with reference_time_offset: 1.2)" in found(reference=2.0).suggestion
+@pytest.mark.parametrize("reference", [2.0, 5.0, 30.0])
+def test_a_reference_that_is_late_by_more_than_any_delay_of_the_dvl_is_named_as_well(reference):
+    """It was said to be 1.2 s late or more, or nothing."""
+    assert offset_named(found(reference=reference).suggestion, "reference_time_offset") == pytest.approx(
+        reference, abs=0.05
+    )
 
 
 def test_how_samples_are_gathered_changes_nothing_about_clocks():
     samples = stamped_late(late(0.0), ReferenceSample, 0.6)
-    assert calibrate(samples, NOISE, block_size=400).suggestion == found(reference=0.6).suggestion
+    assert calibrate(samples, NOISE, verified=True, block_size=400).suggestion == found(reference=0.6).suggestion

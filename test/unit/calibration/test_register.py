@@ -1,0 +1,158 @@
+"""One registration: clocks of all three instruments, lever arm and mounting, whichever is off and by how much."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.calibration.delay.rows import ImuColumns
+from dvl_calib_ros.calibration.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.register.coarse import places
+from dvl_calib_ros.calibration.register.motion import Motion, make_motion
+from dvl_calib_ros.calibration.register.registration import Registration, register
+from dvl_calib_ros.simulation.injection import injection
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+ARM = -0.6
+
+
+@cache
+def run(trajectory: str, rate: float, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)):
+    """Times and values of the streams of a run of ten minutes."""
+    errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
+    arm = injection(f"lever_arm:x_m={ARM}")
+    simulated = simulate(
+        Scenario(trajectory, 600.0, 3, errors, mounting, gnss_std=0.05, gnss_rate=rate, dvl_rate=rate, effects=(arm,))
+    )
+    first_ns = simulated.dvl[0].stamp_ns
+
+    def columns(samples, *fields):
+        times = np.array([1e-9 * (sample.stamp_ns - first_ns) for sample in samples])
+        return times, *(np.array([getattr(sample, field) for sample in samples]) for field in fields)
+
+    return (
+        columns(simulated.dvl, "velocity"),
+        columns(simulated.gnss, "velocity"),
+        columns(simulated.imu, "orientation", "angular_velocity"),
+    )
+
+
+def motion(trajectory: str, rate: float, dvl=0.0, reference=0.0, imu=0.0, in_earth=True, **scenario) -> Motion:
+    """A run whose stamps are late by so many seconds."""
+    (td, v), (tg, g), (ti, q, w) = run(trajectory, rate, **scenario)
+    made = make_motion((td + dvl, v), (tg + reference, g), in_earth, (True,) * 3, ImuColumns(ti + imu, q, w))
+    assert made is not None
+    return made
+
+
+def registered(*args, **late) -> Registration:
+    found = register(motion(*args, **late), np.eye(3), np.zeros(3))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("trajectory", ["box", "figure8", "free"])
+@pytest.mark.parametrize(
+    "rate", [pytest.param(1.0, marks=pytest.mark.slow), 5.0, pytest.param(10.0, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("seconds", [0.0, 0.8, 2.5, 5.0, 7.5, 30.0])
+@pytest.mark.parametrize("stream", ["dvl", "reference"])
+def test_a_late_clock_is_found_and_no_other(trajectory, rate, seconds, stream):
+    found = registered(trajectory, rate, **{stream: seconds})
+    other = "reference" if stream == "dvl" else "dvl"
+    assert getattr(found, stream).late == pytest.approx(seconds, abs=0.05 + 0.03 * seconds)
+    assert getattr(found, stream).is_shown == (seconds > 0.0)
+    assert getattr(found, other).late == pytest.approx(0.0, abs=1e-3)
+    assert not getattr(found, other).is_shown and not found.imu.is_shown
+    assert found.offsets.keys() == ({f"{stream}_time_offset"} if seconds else set())
+    assert found.lever_arm[0] == pytest.approx(ARM, abs=5.0 * found.lever_arm_std[0] + 0.02)
+
+
+@pytest.mark.parametrize("seconds", [(7.5, 7.0), (2.0, 5.0), (-1.0, 3.0)])
+def test_two_late_clocks_are_told_apart(seconds):
+    dvl, reference = seconds
+    found = registered("free", 5.0, dvl=dvl, reference=reference)
+    assert found.dvl.is_shown and found.reference.is_shown
+    assert found.dvl.late == pytest.approx(dvl, abs=max(0.1, 4.0 * found.dvl.std))
+    assert found.reference.late == pytest.approx(reference, abs=max(0.1, 4.0 * found.reference.std))
+
+
+@pytest.mark.parametrize("seconds", [-0.6, 0.5, 4.0])
+def test_where_dvl_and_reference_agree_it_is_the_imu(seconds):
+    found = registered("free", 5.0, imu=seconds)
+    assert found.imu.is_shown and found.imu.late == pytest.approx(seconds, abs=0.1)
+    assert found.offsets == {"imu_time_offset": found.imu.late}
+    assert "an IMU whose stamps are" in found.says(Parameters())
+
+
+def test_a_reference_in_the_body_shows_only_the_difference_of_the_clocks():
+    (td, v), (tg, g), (ti, q, w) = run("free", 5.0)
+    turned = np.array([1.0, 0.4, 0.1])  # any frame will do: what counts is that no attitude turns it
+    made = make_motion(
+        (td + 2.0, v), (tg, np.linalg.norm(g, axis=1)[:, None] * turned), False, (True,) * 3, ImuColumns(ti, q, w)
+    )
+    found = register(made, None, np.zeros(3))
+    assert found.apart.late == pytest.approx(2.0, abs=0.1) and not found.reference.is_shown
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.7), (np.pi, 0.0, -2.0), (0.3, 0.5, 1.0)])
+def test_a_mounting_that_nobody_told_is_found_with_the_clock(rpy):
+    found = register(motion("free", 5.0, reference=5.0, mounting=rpy), None, np.zeros(3))
+    assert found.reference.late == pytest.approx(5.0, abs=0.2)
+    away = found.rotation_body_from_dvl.T @ rotation_from_rpy(rpy)
+    assert np.arccos(0.5 * (np.trace(away) - 1.0)) < 0.1
+
+
+def test_a_straight_leg_at_one_speed_shows_no_clock():
+    times = np.arange(0.0, 300.0, 0.2)
+    rng = np.random.default_rng(1)
+    level, still = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1)), np.zeros((len(times), 3))
+    for late in (0.0, 2.0):
+        v, g = (np.array([1.5, 0.0, 0.0]) + std * rng.standard_normal((len(times), 3)) for std in (0.01, 0.1))
+        made = make_motion((times, v), (times + late, g), True, (True,) * 3, ImuColumns(times, level, still))
+        found = register(made, np.eye(3), np.zeros(3))
+        assert not (found.dvl.is_shown or found.reference.is_shown or found.imu.is_shown)
+        assert found.offsets == {} and found.says(Parameters()) == ""
+
+
+def test_sigmas_of_the_clocks_and_the_arm_are_what_runs_scatter_by():
+    z = []
+    for seed in range(12):
+        errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
+        scenario = Scenario("box", 300.0, seed, errors, gnss_std=0.1, effects=(injection(f"lever_arm:x_m={ARM}"),))
+        simulated = simulate(scenario)
+        first_ns = simulated.dvl[0].stamp_ns
+
+        def column(samples, field, first_ns=first_ns):
+            return np.array([getattr(sample, field) for sample in samples]), np.array(
+                [1e-9 * (sample.stamp_ns - first_ns) for sample in samples]
+            )
+
+        (v, td), (g, tg), (q, ti) = (
+            column(samples, field)
+            for samples, field in (
+                (simulated.dvl, "velocity"), (simulated.gnss, "velocity"), (simulated.imu, "orientation")
+            )
+        )  # fmt: skip
+        w, _ = column(simulated.imu, "angular_velocity")
+        found = register(
+            make_motion((td, v), (tg + 3.0, g), True, (True,) * 3, ImuColumns(ti, q, w)), np.eye(3), np.zeros(3)
+        )
+        z.append([(found.reference.late - 3.0) / found.reference.std,
+                  (found.lever_arm[0] - ARM) / found.lever_arm_std[0]])  # fmt: skip
+    rms = np.sqrt((np.array(z) ** 2).mean(axis=0))
+    assert (rms < 2.0).all() and (rms > 0.4).all()
+
+
+def test_too_little_is_none():
+    (td, v), (tg, g), (ti, q, w) = run("box", 1.0)
+    imu = ImuColumns(ti, q, w)
+    assert make_motion((td[:1], v[:1]), (tg, g), True, (True,) * 3, imu) is None
+    short = make_motion((td[:5], v[:5]), (tg[:5], g[:5]), True, (True,) * 3, imu)
+    assert register(short, np.eye(3), np.zeros(3)) is None
+    apart = make_motion((td, v), (tg + 5000.0, g), True, (True,) * 3, imu)
+    assert places(apart, np.eye(3)) == [] and register(apart, np.eye(3), np.zeros(3)) is None
