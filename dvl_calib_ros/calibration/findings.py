@@ -316,6 +316,12 @@ _KINDS = (
         "check its antenna; if models switch to and fro, raise gnss_hysteresis",
     ),
     FindingKind(
+        "BAG_NO_IMU",
+        "no IMU in the bag: a reference in the earth's frame cannot be compared with the DVL; no lever arm is found",
+        "Attitude turns a velocity over ground into the body; turn rates take out what a lever arm adds in turns.",
+        "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
+    ),
+    FindingKind(
         "BAG_NO_GNSS",
         "no topic {topic!r} in the bag: only the models without GNSS can run",
         "No reference velocity under this name.",
@@ -360,6 +366,13 @@ _KINDS = (
         "by a large angle fits the samples, gated ones with them, much better.",
         "stop, set it, and begin anew",
         Severity.ERROR,
+    ),
+    FindingKind(
+        "LEVER_ARM_CONTRADICTED",
+        "the data show another lever arm than the one that was given: {axes}",
+        "The place that was given is wrong, or something else is that looks like it: heading, turn rates or clock of "
+        "the IMU, DVL velocities that are not in its own axes, an antenna elsewhere. The place that was given is kept.",
+        "measure where DVL and reference point are (lever_arm, reference_position), then check the IMU's axes, clock",
     ),
     FindingKind(
         "REFERENCE_OFFSET",

@@ -21,7 +21,7 @@ from .folds import Moments
 from .frames import Array
 from .kalman import GaussianState
 from .models import Model
-from .observability import Convergence
+from .observability import OBSERVED_SHARE, Convergence, body_angle_std
 from .parameters import Parameters
 
 # Fewer samples with a reference prove nothing.
@@ -35,6 +35,8 @@ SEVERAL = 3.0
 IMPLAUSIBLE = 0.2
 # If more than this share of the samples is gated, the estimate is that of a minority.
 MOST_GATED = 0.5
+# An error of so many σ is one, however little the data show of it.
+SURELY = 4.0
 # Share of runs whose held-out error may by chance exceed what a true covariance predicts.
 CHANCE = 0.01
 
@@ -193,12 +195,17 @@ def _lever_arm_findings(turns: str, is_found: bool, parameters: Parameters) -> l
     return [(Word.REJECT, f"{known}, and {turns}: {remedy}")]
 
 
-def _angle_deg(model: Model, state: GaussianState) -> float:
-    return math.degrees(math.atan(float(np.linalg.norm((model.error_terms_from_state @ state.x)[:3]))))
+def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
+    """How far the DVL is turned, degrees, about the body's axes that are known: what is not shown proves nothing."""
+    t = parameters.rotation_dvl_from_body
+    about = t.T @ (model.error_terms_from_state @ state.x)[:3]
+    std = body_angle_std(state.p, parameters)
+    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > SURELY * std)
+    return math.degrees(math.atan(float(np.linalg.norm(about[shown]))))
 
 
 def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> str:
-    angle, from_deg = _angle_deg(model, state), math.degrees(parameters.accept_misalignment)
+    angle, from_deg = _angle_deg(model, state, parameters), math.degrees(parameters.accept_misalignment)
     if angle < from_deg:
         return ""
     return f"inspect the mounting: it is {angle:.1f}° from mounting_rpy, {from_deg:.1f}° or more"
@@ -206,12 +213,17 @@ def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> s
 
 def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Finding]:
     errors = model.error_terms_from_state @ state.x
-    angle, reject = _angle_deg(model, state), math.degrees(parameters.reject_misalignment)
+    angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
     findings = []
     if angle >= reject:
         remedy = "is mounting_rpy right, and are the frames?"
         findings.append((Word.REJECT, f"the misalignment is {angle:.1f}°, {reject:.1f}° or more: {remedy}"))
-    scale = float(np.abs(errors[3:]).max())
+    variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
+    std = np.sqrt(variance)
+    known = (variance > 0.0) & (
+        (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > SURELY * std)
+    )
+    scale = float(np.abs(errors[3:][known]).max(initial=0.0))
     if scale > parameters.max_scale_error:
         limit = 100.0 * parameters.max_scale_error
         findings.append((Word.REJECT, f"a scale is {100.0 * scale:.1f} % off, more than {limit:.1f} %"))

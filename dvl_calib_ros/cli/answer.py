@@ -27,7 +27,7 @@ VERDICTS = {
 def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Finding]:
     """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
     other = [f"{name}: " for name in replayed.result.estimates if name not in models]
-    settled = {"BAG_NO_GNSS"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
+    settled = {"BAG_NO_GNSS", "BAG_NO_IMU"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
     return [
         found
         for found in replayed.findings
@@ -39,7 +39,12 @@ def print_answer(out: Console, replayed: Replayed) -> None:
     """One paragraph, one table, the mounting in the form to paste."""
     from rich.markup import escape
 
+    from ..calibration.verification import Word
+
     result = replayed.result
+    for found in replayed.findings:
+        if found.code == "BAG_NO_IMU":
+            out.print(f"[bold]{escape(_capital(found.says))}.[/]")
     verification = result.verifications[result.selected]
     advice, colour = VERDICTS[verification.verdict.value]
     reasons = "; ".join(verification.reasons)
@@ -48,12 +53,16 @@ def print_answer(out: Console, replayed: Replayed) -> None:
     if verification.mounting:
         out.print(escape(f"{_capital(verification.mounting)}."))
     out.print()
-    out.print(escape(_headline(replayed)))
-    out.print(_table(replayed))
+    rejected = verification.verdict is Word.REJECT
+    out.print(f"[dim]Not to be used: {escape(_headline(replayed))}[/]" if rejected else escape(_headline(replayed)))
+    out.print(_table(replayed), style="dim" if rejected else None)
     _print_navigation(out, replayed)
     for sentence in _not_shown(replayed):
         out.print(escape(sentence), soft_wrap=False)
-    out.print(f"\nURDF  {escape(_origin(replayed))}", soft_wrap=True)
+    if not rejected:
+        out.print(f"\nURDF  {escape(_origin(replayed))}", soft_wrap=True)
+    else:
+        out.print()
 
 
 def _headline(replayed: Replayed) -> str:

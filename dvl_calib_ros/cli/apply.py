@@ -119,6 +119,9 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
         f"TF:     {transform}",
         f"scale:  {scale_advice(calibrated)}",
     )
+    if calibrated.objections and not arguments.force:
+        out.print("nothing to apply; --force shows and writes it all the same", soft_wrap=True)
+        return
     for line in lines:
         out.print(escape(line), soft_wrap=True)
     if any(calibrated.lever_arm):

@@ -54,6 +54,8 @@ def _print(examined: Examination) -> None:
 
     out = common.console()
     common.print_warnings(examined.notes)
+    if examined.findings and examined.findings[0].code.startswith("DOCTOR_NO_IMU"):
+        out.print(f"[bold]{escape(_sentence(examined.findings[0].says))}[/]")
     colour, answer = ANSWERS[examined.verdict]
     out.print(f"[bold {colour}]{examined.verdict}[/]: {answer} {escape(_why(examined))}")
     names = ", ".join(path.name or str(path) for path in examined.paths)
@@ -76,6 +78,10 @@ def _print(examined: Examination) -> None:
     _print_motion(out, examined)
     for word, command in zip(("next", "", ""), next_commands(examined), strict=False):
         out.print(f"{word:5} {escape(command)}", soft_wrap=True)
+
+
+def _sentence(says: str) -> str:
+    return f"{says[:1].upper()}{says[1:]}."
 
 
 def _why(examined: Examination) -> str:

@@ -50,6 +50,10 @@ OTHER_MOUNTING = math.radians(12.0)
 GRAVITY_SHOWS = 5.0
 # Of a vehicle that goes ahead, the mean velocity has at least this share of the speed.
 STRAIGHT_SHARE = 0.7
+# Root mean square of the better nine tenths of normal errors in three axes, as a share of that of all.
+TRIMMED = 0.85
+# A noise (m/s) that no reference is below, and how many times too much one may claim.
+QUIETEST, CLAIMS_TOO_MUCH = 0.01, 3.0
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
 # Reference frames, in the order in which they are taken for one that the data cannot tell.
@@ -213,6 +217,7 @@ class _Search:
         if chosen is not None and reference is not None:
             turned = chosen.hypothesis.turned
             self._take(chosen, known, imu_frames, dvl, reference, imu)
+            self._measure_noise(chosen, known, (dvl, reference, imu))
         elif imu_frames and imu is not None:
             self._take_imu(imu_frames[0], imu)
         if self._parameters.dvl_axes == FROM_MESSAGE and turned != self._turned_by_message(dvl):
@@ -391,8 +396,11 @@ class _Search:
         wanted = Hypothesis(named, first, turned, named is in_body and down[first])
         decided = _decided(fits, wanted, declared is not None)
         own = next((each for each in fits if each.hypothesis == wanted), None)
-        if decided is None or own is None or decided is own:
-            return decided if decided is None or said else self._upright(decided, fits, known, (dvl, reference, imu))
+        if decided is None:
+            return None
+        if own is None or replace(own.hypothesis, turned=decided.hypothesis.turned) == decided.hypothesis:
+            declared_fit = own or decided
+            return declared_fit if said else self._upright(declared_fit, data, known, (dvl, reference, imu))
         to_body = decided.hypothesis.reference is in_body
         if to_body and declared is not None and declared.frame is not in_body and not self._is_in_body(data, decided):
             return own
@@ -401,21 +409,19 @@ class _Search:
         best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (decided, own))
         return decided if best < CLEARLY * as_declared else own
 
-    def _upright(
-        self, fit: Fit, fits: Sequence[Fit], known: Array | None, looks: tuple[Look, Look, Look | None]
-    ) -> Fit:
+    def _upright(self, decided: Fit, data: Together, known: Array | None, looks: tuple[Look, Look, Look | None]) -> Fit:
         """The fit, or that with the DVL's axes the other way up if only that leaves little with any lever arm.
 
         A vehicle that goes ahead hardly shows which way is up; its turns do, by the lever arm that they ask for.
         """
-        other = next(
-            (each for each in fits if each.hypothesis == replace(fit.hypothesis, turned=not fit.hypothesis.turned)), fit
-        )
-        if other.left >= fit.left:
-            return fit
-        delayed, mounting = at_delays(*looks), np.eye(3) if known is None else known.T
-        best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (other, fit))
-        return other if best < BETTER * as_declared else fit
+        mounting = np.eye(3) if known is None else known.T
+        other = replace(decided.hypothesis, turned=not decided.hypothesis.turned)
+        first = fit(data, [decided.hypothesis, other], mounting)[0]
+        if first.hypothesis != other:
+            return decided
+        delayed = at_delays(*looks)
+        best, as_declared = (explained(delayed, each, mounting).left for each in (other, decided.hypothesis))
+        return fit(data, [other], None if known is None else known.T)[0] if best < BETTER * as_declared else decided
 
     def _is_in_body(self, data: Together, fit: Fit) -> bool:
         """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
@@ -445,7 +451,9 @@ class _Search:
         hypothesis, parameters = chosen.hypothesis, self._parameters
         declared = self._declared_reference(reference)
         taken = DeclaredFrame(hypothesis.reference, hypothesis.reference_turned)
-        if taken != declared:
+        if imu is None and declared is None and chosen.best_left >= FITS:  # no frame could be tried but the body's
+            self._notes.append(f"{reference.topic}: nothing says in which frame it is, and without an IMU no data do")
+        elif taken != declared:
             name = self._values["gnss_frame"] = taken.name
             if declared is None:
                 self._found.append(
@@ -474,6 +482,29 @@ class _Search:
                 f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "
                 f"{_degrees(nominal_rpy(found))}: try -p mounting_rpy:={_option(nominal_rpy(found))}"
             )
+
+    def _measure_noise(self, chosen: Fit, known: Array | None, looks: tuple[Look, Look, Look | None]) -> None:
+        """The noise of a reference that claims none, or as positions one that its velocities do not have."""
+        if self._gives("gnss_aided_std") or self._gives("use_message_covariance") or chosen.best_left > FITS:
+            return
+        dvl, reference, _ = looks
+        is_position = VELOCITY_TYPES[reference.msgtype].is_position
+        if not (is_position or math.isnan(reference.claimed_std)):
+            return
+        best = explained(at_delays(*looks), chosen.hypothesis, None if known is None else known.T).left
+        # of a lever arm and a delay that are yet to be found a part stays in
+        left = max(min(best, chosen.best_left), 0.5 * chosen.best_left)
+        shown = max(left * dvl.speed / (math.sqrt(3.0) * TRIMMED), QUIETEST)
+        if is_position:
+            if not reference.claimed_std > CLAIMS_TOO_MUCH * shown:
+                return
+            self._values["use_message_covariance"] = False
+        self._values["gnss_aided_std"] = float(f"{shown:.2g}")
+        claims = f"claims {reference.claimed_std:.2g} m/s" if is_position else "claims no noise"
+        self._found.append(
+            f"the reference {claims}; against the DVL it shows {shown:.2g} m/s per axis, which is taken "
+            f"(-p gnss_aided_std:={shown:.2g})"
+        )
 
     def _take_imu(self, frame: ImuFrame, seen: Look | None) -> None:
         if self._gives("imu_rpy") or self._gives("imu_frame"):

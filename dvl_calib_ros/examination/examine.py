@@ -25,6 +25,8 @@ from .kinds import named
 
 # A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
+# What is said first
+NO_IMU = "DOCTOR_NO_IMU"
 # Speeds that differ by more are not in one unit
 UNIT_FACTORS = (0.7, 1.4)
 UNITS = {1000.0: "mm/s", 100.0: "cm/s", 1.0 / 0.514444: "knots", 3.6: "km/h", 1.0 / 0.3048: "feet/s"}
@@ -185,6 +187,10 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
             found.append(named("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
     if imu is not None and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
         found += checks.orientation_findings(imu)
+    if imu is None:
+        in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
+        what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
+        found.append(named("DOCTOR_NO_IMU", what=what) if in_body else named("DOCTOR_NO_IMU_EARTH"))
     found += [named("DOCTOR_FRAMES", said=doubt) for doubt in discovery.contradictions]
     parameters = discovery.parameters
     speed = np.linalg.norm(velocity, axis=1)
@@ -195,7 +201,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found.append(named("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None:
         found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
-    return sorted(found, key=lambda each: each.severity is not Severity.ERROR)
+    return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
 
 
 def _has_error(found: Sequence[Finding]) -> bool:

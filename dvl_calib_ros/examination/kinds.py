@@ -114,6 +114,19 @@ _KINDS = (
         Severity.ERROR,
     ),
     FindingKind(
+        "DOCTOR_NO_IMU",
+        "no IMU in the bag: {what}",
+        "Attitude turns a velocity over ground into the body; turn rates take out what a lever arm adds in turns.",
+        "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
+    ),
+    FindingKind(
+        "DOCTOR_NO_IMU_EARTH",
+        "no IMU in the bag: the reference is not in the body's frame, so it cannot be compared with the DVL",
+        "Without an attitude, a velocity over ground says nothing of the DVL's axes.",
+        "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
+        Severity.ERROR,
+    ),
+    FindingKind(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
         "One of them is not in m/s.",

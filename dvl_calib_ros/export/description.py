@@ -199,6 +199,8 @@ def _three(values: Sequence[float] | Any) -> Three:
 
 def _of_result(path: Path) -> DvlDescription:
     calibrated = load_calibrated_mounting(path)
+    if calibrated.objections:
+        raise InputError(f"{path}: {'; '.join(calibrated.objections)}: there is nothing to export")
     late = calibrated.dvl_time_offset
     return DvlDescription(
         source=str(path),

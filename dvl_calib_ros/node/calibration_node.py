@@ -309,6 +309,8 @@ class CalibrationNode(AnsweringNode):
         state_of = (model.name, calibrator.n_given(model.name))
         if state_of == self._mounting_published or calibrator.last_ns is None:
             return
+        if calibrator.suggestion:  # of a wrong configuration: no mounting, for somebody would take it
+            return
         self._mounting_published = state_of
         stamp = Time()
         _set_stamp(stamp, calibrator.last_ns)

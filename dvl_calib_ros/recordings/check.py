@@ -27,6 +27,8 @@ def check_topics(recording: Recording, topics: Topics, found: list[Finding]) -> 
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in present:
         found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
+    if topics.imu not in recording.types:
+        found.append(finding("BAG_NO_IMU"))
 
 
 def _check_types(recording: Recording, topics: Topics, found: list[Finding]) -> None:

@@ -6,6 +6,7 @@ the streams have samples at the same times, which can be compared.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -40,7 +41,8 @@ class Look:
     log where it is zero. ahead_s: by how much they are ahead of the log, in the median. values: velocity (N, 3) m/s, as
     in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
     given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero where it has none. world:
-    frame_id of the header, which of an odometry is that of its pose.
+    frame_id of the header, which of an odometry is that of its pose. claimed_std: noise per axis that the messages
+    claim, m/s, in the median; nan where they claim none.
     """
 
     topic: str
@@ -53,6 +55,7 @@ class Look:
     values: Array
     rates: Array | None = None
     world: str = ""
+    claimed_std: float = math.nan
 
     @property
     def speed(self) -> float:
@@ -110,7 +113,10 @@ def look_of(
     if msgtype == IMU_TYPE:
         values, rates = np.hstack([values, beside]), np.full((0, 3), np.nan)
     turns = None if np.isnan(rates).all() else rates
-    return Look(topic, msgtype, count, rate_hz, numbers.frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world)
+    frame_id, claimed = numbers.frame_id, numbers.claimed_std
+    return Look(
+        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world, claimed
+    )
 
 
 def _places(arrival: Stamps, taken: Stamps) -> Index:
@@ -157,6 +163,14 @@ class _Numbers:
         self._rows: list[tuple[Stamps, Stamps, Stamps, Array, Array]] = []
         self._names: list[tuple[int, str]] = []
         self.world = ""
+        self._variances: list[Array] = []
+
+    @property
+    def claimed_std(self) -> float:
+        """Per axis, m/s, in the median; nan where none is claimed."""
+        of_each = np.concatenate([*self._variances, np.zeros(0)])
+        given = of_each[np.isfinite(of_each) & (of_each > 0.0)]
+        return math.sqrt(float(median(given))) if len(given) else math.nan
 
     @property
     def frame_id(self) -> str:
@@ -170,6 +184,7 @@ class _Numbers:
         stamps_ns = np.where(laid.stamps_ns == 0, laid.log_ns, laid.stamps_ns)
         self._rows.append((laid.arrival, laid.log_ns, stamps_ns, laid.values, laid.beside))
         self.world = self.world or laid.world
+        self._variances.append(laid.variances.mean(axis=1))
         self._names += [
             (int(arrival), part.laid.frames[place])
             for arrival, place in zip(laid.arrival.tolist(), laid.frame.tolist(), strict=True)
@@ -187,6 +202,7 @@ class _Numbers:
                 name = str(message.header.frame_id if self._kind is None else self._kind.frame_id(message))
                 self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), beside))
                 self._names += [(arrival, name)] if name else []
+                self._variances.append(np.array([self._claimed_variance(message)]))
                 self.world = self.world or str(message.header.frame_id)
 
     def _of(self, message: Any) -> tuple[list[float], Array]:
@@ -202,6 +218,15 @@ class _Numbers:
         )
         numbers = [np.nan if covariance[0] == NO_DATA else value for values, covariance in given for value in values]
         return numbers[:7], np.array([numbers[7:]], dtype=float)
+
+    def _claimed_variance(self, message: Any) -> float:
+        if self._kind is None:
+            return math.nan
+        given = message.covariance if self._kind.is_position else self._kind.covariance(message)
+        if given is None or self._kind.lacks_covariance(message):
+            return math.nan
+        flat = np.asarray(given, dtype=float).ravel()
+        return float(flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]].mean())
 
     def in_order(self) -> tuple[Stamps, Stamps, Array, Array, Index] | None:
         """Stamps, log times, values, what is beside; which of them are of use, in order of stamps."""
@@ -224,14 +249,22 @@ def _differences(messages: Iterable[tuple[int, int, Any]]) -> list[tuple[int, in
     found = []
     for arrival, log_ns, message in messages:
         at_ns = stamped(message, log_ns)
-        fixed = difference(at_ns, message.latitude, message.longitude, message.altitude, None)
+        fixed = difference(
+            at_ns,
+            message.latitude,
+            message.longitude,
+            message.altitude,
+            message.position_covariance if message.position_covariance_type else None,
+        )
         if fixed is not None and message.status.status >= 0:
             velocity = SimpleNamespace(**dict(zip("xyz", fixed.velocity, strict=True)))
             seconds, nanoseconds = divmod(fixed.stamp_ns, 1_000_000_000)
             header = SimpleNamespace(
                 stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=message.header.frame_id
             )
-            found.append((arrival, log_ns, SimpleNamespace(velocity=velocity, header=header)))
+            found.append(
+                (arrival, log_ns, SimpleNamespace(velocity=velocity, header=header, covariance=fixed.covariance))
+            )
     return found
 
 

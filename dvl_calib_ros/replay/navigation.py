@@ -236,7 +236,10 @@ def objections(navigation: Navigation | None) -> list[tuple[Word, str]]:
         return []
     before, after, noise = navigation.before.per_km, navigation.after.per_km, navigation.noise_per_km
     if after < WORSE * before or after**2 - before**2 < (2.0 * noise) ** 2:
-        return []
+        if float(_figure(after)) <= float(_figure(before)):
+            return []
+        figures = f"{_figure(after)} m per km with it, {_figure(before)} as mounted"
+        return [(Word.MARGINAL, f"on data held out dead reckoning gets no better: {figures}")]
     return [
         (
             Word.REJECT,

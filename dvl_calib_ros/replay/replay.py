@@ -27,7 +27,8 @@ from ..calibration.parameters import Parameters
 from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
-from ..calibration.verification import verification_document
+from ..calibration.told_arm import told_arm_advice
+from ..calibration.verification import Word, verification_document
 from ..errors import InputError
 from ..files.result_file import days_document, estimate_document, load_initial_calibration
 from ..messages.decode import MessageDecoder
@@ -41,6 +42,10 @@ from .recorder import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
 BLOCK_SIZE = 2048
+
+NOTHING_COMPARED = (
+    "there is no IMU, so no DVL sample can be compared with the reference: record its topic, with orientation"
+)
 
 
 @dataclass(frozen=True)
@@ -126,9 +131,14 @@ def replay(
     result = calibrator.result()
     result = replace(result, days=_named(result.days, recording))
     found += _warnings(result, topics, decoder)
+    told = told_arm_advice(result.estimates, calibrator.parameters)
+    found += told
     history = recorder.history(calibrator) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
     of_drift, of_clocks = objections(navigation), clocks.objections(parameters)
+    of_clocks += [(Word.MARGINAL, each.says) for each in told]
+    if chosen.imu not in recording.types and result.counts["reference"]["received"]:
+        of_clocks += [] if result.counts["pairing"]["paired"] else [(Word.REJECT, NOTHING_COMPARED)]
     return Replayed(
         replace(
             result,

@@ -18,7 +18,7 @@ from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
 from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate, Result
-from ..calibration.verification import HeldOutError, Verification
+from ..calibration.verification import HeldOutError, Verification, Word
 from ..files.result_file import result_document
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
@@ -72,14 +72,16 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
     document = result_document(result, replayed.dvl_frame, replayed.turned)
     time = TimeAxis(history.stamps_ns)
     names = ", ".join(bag.name or str(bag) for bag in bags)
+    verification = result.verifications.get(result.selected)
+    rejected = verification is not None and verification.verdict is Word.REJECT
     return {
         "title": "DVL calibration",
         "subtitle": names,
         "written": document["written"].replace("T", " ").replace("+00:00", " UTC"),
-        "verdict": _verdict(result.verifications.get(result.selected)),
-        "numbers": _numbers(result.estimate),
+        "verdict": _verdict(verification),
+        "numbers": [] if rejected else _numbers(result.estimate),
         "facts": _facts(replayed, document["mounting"], bags),
-        "static_transform": document["mounting"]["static_transform_publisher"],
+        "static_transform": None if rejected else document["mounting"]["static_transform_publisher"],
         "warnings": replayed.notes,
         "held_out": _held_out(result, shown),
         "navigation": navigation_section(replayed.navigation, time),

@@ -116,9 +116,17 @@ def test_verification_does_not_depend_on_how_samples_are_gathered(block_size):
     assert other.corrected == pytest.approx(one.corrected, rel=1e-9)
 
 
-def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, **parameters):
-    state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), np.eye(4))
+def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, **parameters):
+    state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), std**2 * np.eye(4))
     return verify(MODELS["M3"], state, convergence, held_out, Parameters(**parameters))
+
+
+def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_that_is_off():
+    prior = Parameters().initial_std_misalignment  # a roll that a horizontal reference leaves at the prior's
+    assert judged(degrees=6.7, scale=0.06, std=prior).verdict is Word.ACCEPT
+    assert "inspect" not in judged(degrees=6.7, std=prior).mounting
+    far = judged(degrees=27.0, std=prior)  # nine of its standard deviations are no want of motion
+    assert far.verdict is Word.REJECT and "27" in far.reasons[0]
 
 
 @pytest.mark.parametrize(

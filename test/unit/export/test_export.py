@@ -256,14 +256,14 @@ def test_what_is_no_diagnosis_is_refused_in_one_line_and_nothing_is_written(cont
     assert [each.name for each in tmp_path.iterdir()] == ["d.json"]
 
 
-def test_of_a_result_file_is_written_what_apply_would_write_and_what_speaks_against_it_is_said(tmp_path, capsys):
+def test_a_result_file_that_is_rejected_damaged_or_changed_is_not_exported(tmp_path, capsys):
     bag, saved = tmp_path / "bag", tmp_path / "r.yaml"
     succeed(capsys, "simulate", bag, "--trajectory", "straight", "--duration", "20", "--misalignment", 0, 0, 9)
     succeed(capsys, "replay", bag, "--save", saved)
     content = parsed(saved.read_text())
-    succeed(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
-    remarks = json.loads((tmp_path / "dvl.sdf.missing.json").read_text())["remarks"]
-    assert any(f"its verdict is {content['verification']['verdict']}" in each for each in remarks)
+    assert content["verification"]["verdict"] == "reject"
+    assert "its verdict is reject" in fail(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
+    assert not (tmp_path / "dvl.sdf").exists()
     for part, key, value, said in (
         ("mounting", "corrected_rpy", [0.0, 0.0, 45.0], "changed by hand"),  # degrees
         ("parameters", "lever_arm", [1300.0, 0.0, 0.0], "1300 is outside"),  # millimetres

@@ -1,0 +1,55 @@
+"""A lever arm that was told (by a transform, a URDF, a parameter) against the one that the data show.
+
+Both are the DVL's place from the reference point, and a tape measure is good to centimetres. Where they differ by far
+more than both explain, something is wrong, and the arm is the symptom: a heading that counts from north, velocities of
+a DVL in the earth's frame, turn rates of the wrong sign or unit, a late IMU, an antenna elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .findings import Finding, finding
+from .kalman import GaussianState
+from .models import MODELS, Model
+from .parameters import Parameters
+from .samples import Mask
+
+if TYPE_CHECKING:
+    from .results import Estimate
+
+ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
+# So many σ are no chance, and so many metres no tape measure's error.
+SIGMAS, MEASURED_TO = 10.0, 0.05
+FINDS_IT = "G2"
+
+
+def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
+    """(3,) whether the data show the DVL elsewhere than it was told to be, by axis of the body."""
+    if not any(parameters.lever_arm) or not set(ARM) <= set(model.state_names):
+        return np.zeros(3, dtype=bool)
+    at = [model.state_names.index(name) for name in ARM]
+    away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])
+    return np.asarray(away > np.maximum(SIGMAS * std, MEASURED_TO))
+
+
+def told_arm_advice(estimates: Mapping[str, Estimate], parameters: Parameters) -> list[Finding]:
+    """Whether the lever arm that was told is another than the one that the data show."""
+    estimate = estimates.get(FINDS_IT)
+    if estimate is None or not estimate.used:
+        return []
+    state = GaussianState(estimate.state, estimate.covariance)
+    off = contradicted(MODELS[FINDS_IT], state, parameters)
+    if not off.any():
+        return []
+    arm = estimate.lever_arm(parameters.lever_arm)
+    std = estimate.std[[estimate.state_names.index(name) for name in ARM]]
+    axes = ", ".join(
+        f"{axis} {arm[i]:+.2f} m ± {std[i]:.2f} for {parameters.lever_arm[i]:+.2f}"
+        for i, axis in enumerate("xyz")
+        if off[i]
+    )
+    return [finding("LEVER_ARM_CONTRADICTED", axes=axes)]

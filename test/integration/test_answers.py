@@ -1,0 +1,127 @@
+"""What an answer may claim, and in which order: no IMU is said first, a reject offers nothing, what was told stands."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from command_line import fail, succeed
+from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion
+
+import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.verification import Word
+from dvl_calib_ros.replay.navigation import Drift, Navigation, objections
+
+
+def vehicle(told: Told, frame: str = "map", antenna=(0.0, 0.0, 0.0), std: float = 0.03) -> None:
+    m = motion()
+    for i, stamp in told.every(5.0, 0.04):
+        velocity = m.velocity_body[i] + np.cross(m.angular_velocity[i], antenna)
+        velocity = m.rotation_enu_from_body[i] @ velocity + told.rng.normal(0.0, std, 3)
+        sample = Sample(stamp, velocity, std**2 * np.eye(3))
+        told.say(stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, sample, frame))
+
+
+@pytest.mark.parametrize("frame", ["map", "gps"])
+def test_that_there_is_no_imu_is_the_first_sentence_of_doctor_and_replay(tmp_path, capsys, frame):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    vehicle(told, frame)
+    bag = told.write(tmp_path / "bag")
+    out, _ = succeed(capsys, "doctor", bag, "--json", tmp_path / "doctor.json")
+    assert out.startswith("No IMU in the bag")
+    assert json.loads((tmp_path / "doctor.json").read_text())["verdict"] == "no"
+    out, _ = succeed(capsys, "replay", bag, "--json", tmp_path / "replay.json")
+    answer = out[out.index("No IMU") :]
+    assert answer.splitlines()[1].startswith("reject") or "reject: Do not use" in answer
+    assert out.index("No IMU") < out.index("reject") and "URDF" not in out
+    assert "27" not in answer.split("Not to be used")[0]  # no misalignment is made of velocities in two frames
+
+
+def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, math.radians(20.0)))
+    vehicle(told)
+    told.imu("/imu", "base_link")
+    bag, saved, page = told.write(tmp_path / "bag"), tmp_path / "saved.yaml", tmp_path / "page.html"
+    options = ["-p", "mounting_rpy:=[0,0,0]", "-p", "dvl_position:=told", "--save", saved, "--report", page]
+    out, _ = succeed(capsys, "replay", bag, *options)
+    assert "reject: Do not use" in out and "Not to be used" in out and "URDF" not in out
+    text = page.read_text()
+    assert "ready to paste" not in text and "static_transform_publisher" not in text
+    assert 'class="number"' not in text and 'class="number ' not in text
+    out, _ = succeed(capsys, "apply", saved)
+    assert "URDF" not in out and "static_transform_publisher" not in out and "nothing to apply" in out
+    assert "reject" in fail(capsys, "apply", saved, "--launch", tmp_path / "dvl.launch.xml")
+    assert "reject" in fail(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
+
+
+@pytest.mark.parametrize(("after", "expected"), [(9.1, []), (13.0, [Word.MARGINAL]), (9.14, [])])
+def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
+    none = np.zeros((0, 2))
+    found = objections(
+        Navigation(
+            900.0,
+            900.0,
+            100.0,
+            8,
+            Drift(9.1, 3.0),
+            Drift(after, 3.0),
+            6.0,
+            True,
+            none[:, 0],
+            none[:, 0],
+            none,
+            none,
+            none,
+        )
+    )
+    assert [word for word, _ in found] == expected
+    assert all("13 m per km with it, 9.1 as mounted" in sentence for _, sentence in found)
+
+
+@pytest.mark.parametrize(("antenna", "off"), [((0.0, 0.0, 0.0), False), ((-0.5, 0.0, 0.0), True)])
+def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(tmp_path, antenna, off):
+    """The reference says that it is base_link's velocity, and is an antenna's half a metre behind."""
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    vehicle(told, "base_link", antenna)
+    told.imu("/imu", "base_link")
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+    run = dc.replay(told.write(tmp_path / "bag"))
+    codes = [found.code for found in run.findings]
+    assert ("LEVER_ARM_CONTRADICTED" in codes) == off
+    assert run.mounting.position_m == pytest.approx(LEVER_ARM, abs=0.05)
+    if off:
+        assert run.verdict == "marginal" and any("another lever arm" in reason for reason in run.reasons)
+
+
+def test_the_noise_of_a_reference_that_claims_none_is_measured(tmp_path):
+    told, m = Told(), motion()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    for i, stamp in told.every(5.0, 0.04):
+        velocity = m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, 0.05, 3)
+        told.say(
+            stamp, "/gps/vel", TWIST_STAMPED, told.make.velocity(TWIST_STAMPED, Sample(stamp, velocity, None), "map")
+        )
+    told.imu("/imu", "base_link")
+    run = dc.replay(told.write(tmp_path / "bag"))
+    assert 0.04 < run.discovery.parameters.gnss_aided_std < 0.08
+    held_out = run.replayed.result.verifications[run.model].held_out
+    assert 0.7 < held_out.corrected / held_out.predicted < 1.1
+
+
+@pytest.mark.parametrize(("claimed", "taken"), [(0.012, True), (1.2, False)])
+def test_positions_that_claim_metres_and_show_centimetres_are_no_filter_of_the_dvl(tmp_path, claimed, taken):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    told.fixes("/gps/fix", "gps_link", 5.0, 0.012)
+    for row in told.rows:
+        if row[1] == "/gps/fix":
+            row[3].position_covariance = (claimed**2 * np.eye(3)).ravel()
+    told.imu("/imu", "base_link")
+    run = dc.replay(told.write(tmp_path / "bag"))
+    assert run.discovery.parameters.use_message_covariance == taken
+    assert run.verdict != "reject", run.reasons
