@@ -26,8 +26,8 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from dvl_calib_ros.cli import common
+from dvl_calib_ros.disk.atomic import check_writable
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.atomic import check_writable
 
 from . import Measurement
 from .results import WORSE, Baseline, Part, Run

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from dvl_calib_ros.calibration.frames import Array
-from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.node.domain import private_domain
 
 from . import Measurement

@@ -11,8 +11,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
+from dvl_calib_ros.disk.atomic import save_bytes
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.atomic import save_bytes
 
 from . import Measurement
 

@@ -21,7 +21,7 @@ from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.feed import MessageFeed
 

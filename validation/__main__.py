@@ -17,6 +17,7 @@ PROGRAM = "python -m validation"
 COMMANDS = {
     "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
     "mutants": "faults put into ten rules, each of which the tests must see",
+    "size": "lines of code, modules, arrows between the rooms of the package",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
 

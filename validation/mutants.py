@@ -72,7 +72,7 @@ MUTANTS = (
     ),
     Mutant(
         "order of saves",
-        "dvl_calib_ros/files/atomic.py",
+        "dvl_calib_ros/disk/atomic.py",
         "        os.fsync(handle)\n        yield temporary\n",
         "        yield temporary\n",
         (UNIT + "files/test_atomic.py",),

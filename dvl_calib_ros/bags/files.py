@@ -9,8 +9,8 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path, PurePath
 
+from ..disk.yaml_files import load_yaml
 from ..errors import InputError
-from ..files.yaml_files import load_yaml
 from .raw_file import open_recording
 
 if sys.version_info >= (3, 14):

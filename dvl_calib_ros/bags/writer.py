@@ -18,9 +18,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
 
+from ..disk.atomic import NO_SPACE
+from ..disk.yaml_files import load_yaml
 from ..errors import InputError
-from ..files.atomic import NO_SPACE
-from ..files.yaml_files import load_yaml
 from .attachments import attach
 from .channels import Channel
 from .definitions import Definition, DefinitionError, typestore

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
-    from ..files.atomic import backup_of, own_stream, save_all
+    from ..disk.atomic import backup_of, own_stream, save_all
     from ..files.mounting import load_calibrated_mounting
 
     calibrated = load_calibrated_mounting(arguments.result)
@@ -141,8 +141,8 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
 
 
 def _roll_back(arguments: argparse.Namespace) -> None:
+    from ..disk.atomic import backup_of, save_all
     from ..errors import InputError
-    from ..files.atomic import backup_of, save_all
 
     targets = _targets(arguments)
     if not targets:

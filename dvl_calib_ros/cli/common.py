@@ -138,8 +138,8 @@ def check_outputs(
     files, folders: options that name what is written. Every other path in the arguments, and what the parameters name,
     is read. also_read: what is read beside. also_written: files that are made beside, by how an error calls them.
     """
+    from ..disk.atomic import check_folder_writable, check_writable
     from ..errors import InputError
-    from ..files.atomic import check_folder_writable, check_writable
     from ..files.outputs import check_outputs as check_apart
 
     given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
@@ -216,7 +216,7 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def write_json(path: Path, document: Any) -> None:
     """Write JSON, whole or not at all."""
-    from ..files.atomic import save_text
+    from ..disk.atomic import save_text
 
     save_text(path, as_json(document))
 

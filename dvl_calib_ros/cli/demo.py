@@ -90,7 +90,7 @@ def _latency(speed: float) -> str:
 def _show_live(out: Any, bag: Path, speed: float) -> None:
     from rich.live import Live
 
-    from ..node.watch import Watcher
+    from ..demo.watch import Watcher
 
     watcher = Watcher([bag], _truth())
     out.print(f"[bold]1. Live[/]: node and player are two processes, ROS domain {os.environ['ROS_DOMAIN_ID']}")
@@ -124,8 +124,8 @@ def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
 def _compare(out: Any, saved: Path, offline: Result) -> bool:
     import numpy as np
 
+    from ..disk.yaml_files import load_yaml
     from ..files.result_file import load_result
-    from ..files.yaml_files import load_yaml
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     _, live = load_result(saved)

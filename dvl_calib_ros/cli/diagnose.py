@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.recordings import recording_names
     from ..diagnosis.results import diagnosis_document
-    from ..files.atomic import save_all
-    from ..simulation.twin_bags import write_twins
+    from ..diagnosis.twin_bags import write_twins
+    from ..disk.atomic import save_all
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
@@ -119,8 +119,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
     """Parameter files of the day, by recording, of several; beside the one that is named. Raises InputError."""
+    from ..disk.atomic import own_stream
     from ..errors import InputError
-    from ..files.atomic import own_stream
 
     if path is None or len(names) < 2:
         return {}
@@ -131,8 +131,8 @@ def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]
 
 def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
     """Raise InputError if a twin is there already, before work is done."""
+    from ..diagnosis.twin_bags import twin_paths
     from ..errors import InputError
-    from ..simulation.twin_bags import twin_paths
 
     if folder is None:
         return

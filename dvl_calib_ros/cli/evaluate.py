@@ -50,11 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
     from ..calibration.models import MODELS
+    from ..disk.atomic import save_text
     from ..errors import InputError
     from ..evaluation.documents import evaluation_csv, evaluation_document
     from ..evaluation.evaluate import DEFAULTS, EVALUATED, evaluate
     from ..evaluation.protocol import SETS
-    from ..files.atomic import save_text
     from ..parallel import Workers
 
     are_bags = _are_bags(arguments.paths)

@@ -32,10 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Read, write both files, print."""
     from .. import __version__
+    from ..disk.atomic import own_stream, save_all
     from ..export.description import load_description
     from ..export.simulator import export, export_document
     from ..export.simulators import SIMULATORS
-    from ..files.atomic import own_stream, save_all
 
     missing = None
     if own_stream(arguments.output) is None:

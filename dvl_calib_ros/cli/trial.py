@@ -58,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Run what is left of the trial, score it, print the tables and write them to the folder."""
     from .. import __version__
+    from ..disk.atomic import save_text
     from ..errors import InputError
-    from ..files.atomic import save_text
     from ..trial.motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
     from ..trial.plan import KINDS, Family, plan
     from ..trial.recorded import NO_RECORDINGS, has_ins, recordings_folder
@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _run_pairs(arguments: argparse.Namespace) -> None:
     """Compare what is left of the pairs, print the figures and what was not right, write both to the folder."""
-    from ..files.atomic import save_text
+    from ..disk.atomic import save_text
     from ..trial.pairs_run import by_row, figures, misses, run_pairs, score_pair
 
     with common.progress("pairs") as on_progress:

@@ -12,12 +12,12 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import rotation_from_rpy, rpy_from_rotation
+from ..disk.reading import read_file
 from ..effects.base import ActsOn, AnyEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
 from ..files.mounting import POSITION_UNKNOWN, load_calibrated_mounting
 from ..files.parameter_files import load_parameters
-from ..files.reading import read_file
 from ..files.result_file import FORMAT
 
 Three = tuple[float, float, float]

@@ -11,8 +11,8 @@ from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
+from ..disk.atomic import backups_of, own_stream
 from ..errors import InputError
-from .atomic import backups_of, own_stream
 
 # What SQLite keeps beside a recording, and reads with it
 _BESIDE = ("-wal", "-shm", "-journal")

@@ -9,9 +9,9 @@ from typing import Any
 import yaml
 
 from ..calibration.parameters import Parameters
+from ..disk.yaml_files import compose_yaml
 from ..errors import InputError
 from .parameter_files import load_parameters, section_is_ours
-from .yaml_files import compose_yaml
 
 
 def as_yaml(value: Any) -> str:

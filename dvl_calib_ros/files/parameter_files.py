@@ -14,9 +14,9 @@ import yaml
 
 from ..calibration.models import MODELS
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
+from ..disk.yaml_files import load_yaml, parse_scalar
 from ..errors import InputError
 from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type
-from .yaml_files import load_yaml, parse_scalar
 
 NODE_NAME = "dvl_calibration"
 # rclpy's own parameters, which a file for the node may hold as well

@@ -26,9 +26,9 @@ from ..calibration.observability import Convergence
 from ..calibration.parameters import FLU, FRD, Parameters
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
+from ..disk.atomic import own_stream, save_bytes
+from ..disk.yaml_files import load_yaml
 from ..errors import InputError, printable
-from .atomic import own_stream, save_bytes
-from .yaml_files import load_yaml
 
 _ANY_FORMAT = "dvl_calib_ros result"
 FORMAT = f"{_ANY_FORMAT} 1"

@@ -11,8 +11,8 @@ from xml.parsers import expat
 import numpy as np
 
 from ..calibration.frames import Array, rotation_from_rpy, rpy_from_rotation
+from ..disk.reading import read_file
 from ..errors import InputError
-from .reading import read_file
 
 # Those with meshes written out in them have some MB
 LARGEST_FILE = 1 << 26

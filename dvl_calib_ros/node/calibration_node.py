@@ -34,8 +34,8 @@ from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample, VelocityFrame
 from ..discovery.placement import Frames, not_default, placement
+from ..disk.atomic import check_writable
 from ..errors import InputError
-from ..files.atomic import check_writable
 from ..files.outputs import check_outputs
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (

@@ -27,7 +27,7 @@ from ..calibration.comparison import (
 )
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.frames import Array, rpy_from_rotation
-from ..files.atomic import save_bytes
+from ..disk.atomic import save_bytes
 from .page import Table, signed, write_page
 from .style import INK, Picture, drawing, new_figure, picture
 

@@ -18,7 +18,7 @@ import jinja2
 from markupsafe import Markup
 
 from .. import __version__
-from ..files.atomic import save_text
+from ..disk.atomic import save_text
 from .style import MODEL_STYLES
 
 # Class of a cell that holds a verdict

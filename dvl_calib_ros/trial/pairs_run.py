@@ -20,8 +20,8 @@ from typing import Any
 from scipy.stats import binomtest
 
 from ..calibration.parameters import Parameters
+from ..disk.atomic import save_text
 from ..errors import InputError
-from ..files.atomic import save_text
 from ..recordings.recording import open_recording
 from ..recordings.topics import Topics
 from .pairs import make_pair, pair_id

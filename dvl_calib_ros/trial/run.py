@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from ..calibration.parameters import Parameters
+from ..disk.atomic import save_text
 from ..errors import InputError
-from ..files.atomic import save_text
 from ..parallel import outcomes_on_cores
 from .cases import NotDrawnError
 from .generator import record

@@ -9,8 +9,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from ..disk.atomic import save_text
 from ..errors import InputError
-from ..files.atomic import save_text
 
 
 class Category(str, Enum):

@@ -15,8 +15,8 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from dvl_calib_ros.disk.atomic import backup_of, check_writable, save_bytes
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.atomic import backup_of, check_writable, save_bytes
 from dvl_calib_ros.files.outputs import check_outputs
 from dvl_calib_ros.files.result_file import result_document
 

@@ -2,48 +2,22 @@
 
 from __future__ import annotations
 
-import ast
+import json
 import subprocess
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
 from conftest import ROOT
 
-PACKAGE = ROOT / "dvl_calib_ros"
+from validation import rooms
+from validation.__main__ import main
+
 FOREIGN = ("rclpy", "rosbags", "mcap", "apsw", "lz4", "yaml", "rich", "matplotlib", "jinja2", "joblib")
-# what a package may import of its siblings; one that is not listed may import all but commands and node
-MAY_IMPORT = {
-    "calibration": {"errors"},
-    "effects": {"calibration", "errors"},
-    "bags": {"files", "errors"},
-    "messages": {"bags", "calibration", "errors"},
-    "recordings": {"bags", "messages", "calibration", "errors"},
-    "files": {"bags", "messages", "calibration", "errors"},
-    "diagnosis": {"recordings", "messages", "effects", "calibration", "errors"},
-    "export": {"files", "effects", "calibration", "errors"},
-    "unpaired": {"diagnosis", "recordings", "messages", "effects", "calibration", "errors"},
-    "report": {"unpaired", "diagnosis", "evaluation", "replay", "files", "effects", "calibration", "errors"},
-}
-WIRING = {"cli", "node", "demo"}
-
-
-@cache
-def siblings_imported_by(path: Path) -> set[str]:
-    """Packages and modules of ours, beside the one that the file is in, which it imports, also within functions."""
-    inside = path.relative_to(PACKAGE).parent.parts
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            above = inside[: len(inside) - (node.level - 1)]
-            full = [*above, *(node.module.split(".") if node.module else [])]
-            found |= {full[0]} if full else {alias.name for alias in node.names if alias.name != "__version__"}
-    return found - set(inside[:1])
 
 
 def files_of(package: str) -> list[Path]:
-    return sorted((PACKAGE / package).rglob("*.py"))
+    return sorted((rooms.PACKAGE / package).rglob("*.py"))
 
 
 @pytest.mark.parametrize("package", ["calibration", "effects"])
@@ -61,18 +35,60 @@ def test_the_core_takes_numpy_and_scipy_and_nothing_else(package):
     assert loaded.intersection(FOREIGN) == set()
 
 
-@pytest.mark.parametrize("package", MAY_IMPORT)
-def test_a_package_imports_only_those_below_it(package):
-    imported = {each for path in files_of(package) for each in siblings_imported_by(path)}
-    assert imported - MAY_IMPORT[package] == set()
+def test_each_room_is_known_and_imports_only_what_the_table_says():
+    """Within functions and for types alone as well."""
+    assert {rooms.room_of(path) for path in rooms.modules()} == set(rooms.ROOMS)
+    beyond = {
+        (room, other): sorted(str(path.relative_to(rooms.PACKAGE)) for path in files)
+        for (room, other), files in rooms.arrows().items()
+        if other not in rooms.ROOMS[room] and (room, other) not in rooms.UP
+    }
+    assert beyond == {}
 
 
-def test_nothing_but_the_wiring_imports_commands_and_node():
-    packages = {path.parent.name for path in PACKAGE.glob("*/__init__.py")} - WIRING
-    assert len(packages) > 10
-    for package in packages:
-        for path in files_of(package):
-            assert siblings_imported_by(path).intersection(WIRING) == set(), path
+def test_no_arrow_of_the_table_goes_up_so_that_there_is_no_circle():
+    below: set[str] = set()
+    for room, may_import in rooms.ROOMS.items():
+        assert set(may_import) <= below, room
+        below.add(room)
+    assert set(rooms.arrows_up()) == rooms.UP
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"),
+    [
+        ("attic/box.py", "from ..bags import reader", ("attic", "bags")),
+        ("bags/new.py", "if TYPE_CHECKING:\n    from ..recordings import look", ("bags", "recordings")),
+        ("calibration/delay/new.py", "def f():\n    from ...bags import reader", ("calibration", "bags")),
+        ("disk/new.py", "from .. import api", ("disk", "api")),
+    ],
+)  # fmt: skip
+def test_an_arrow_up_and_an_unknown_room_are_seen(tmp_path, monkeypatch, name, text, what):
+    for known in ("bags/reader.py", "disk/atomic.py"):
+        (tmp_path / known).parent.mkdir(exist_ok=True)
+        (tmp_path / known).write_text("from ..errors import InputError\n")
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text(text)
+    monkeypatch.setattr(rooms, "PACKAGE", tmp_path)
+    assert what in rooms.arrows_up()
+    (tmp_path / name).unlink()
+    assert rooms.arrows_up() == []
+
+
+def test_the_size_is_printed_with_arrows(capsys):
+    assert main(["size"]) == 0
+    *_, lines, arrows = capsys.readouterr().out.splitlines()
+    n_modules, n_rooms = len(list(rooms.modules())), len(rooms.ROOMS)
+    assert lines.split() == f"{rooms.sizes().total()} lines of code in {n_modules} modules and {n_rooms} rooms".split()
+    assert arrows.split() == f"{len(rooms.arrows())} arrows between rooms, 1 up: replay -> api".split()
+    assert main(["size", "--json"]) == 0
+    counts = json.loads(capsys.readouterr().out)
+    assert counts["lines"] == rooms.sizes().total() and counts["arrows_up"] == 1
+
+
+def test_blank_lines_comments_and_docstrings_are_no_code():
+    text = '"""Of the\n\nmodule."""\n# why\nimport a  # b\n\ndef f():\n    """Docs."""\n    return (\n"x"\n    )\n'
+    assert rooms.lines_of_code(text) == 5
 
 
 @pytest.mark.parametrize(

@@ -24,10 +24,10 @@ from rosbags.serde import SerdeError
 from dvl_calib_ros.bags.definitions import Definition, DefinitionError, typestore
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.disk.atomic import check_writable, save_text
+from dvl_calib_ros.disk.yaml_files import _Loader, load_yaml
 from dvl_calib_ros.errors import InputError, printable
-from dvl_calib_ros.files.atomic import check_writable, save_text
 from dvl_calib_ros.files.result_file import check_in_folder
-from dvl_calib_ros.files.yaml_files import _Loader, load_yaml
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
 
 SOURCES = sorted((ROOT / "dvl_calib_ros").rglob("*.py"))

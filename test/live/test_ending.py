@@ -19,7 +19,7 @@ from ros import PATIENCE_S, World, until
 from stress_ending import stress
 
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.files.yaml_files import load_yaml
+from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.node.ending import ENDING, Ending
 from dvl_calib_ros.node.main import parameter_files
 from dvl_calib_ros.simulation.scenario import Scenario, simulate

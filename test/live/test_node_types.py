@@ -20,8 +20,8 @@ from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here,
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.yaml_files import load_yaml
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
 from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.node import calibration_node

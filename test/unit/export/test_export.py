@@ -16,10 +16,10 @@ from other_simulators import READERS, mt19937_doubles
 from scipy.spatial.transform import Rotation
 from yaml_text import parsed, written
 
+from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.export.description import DvlDescription, Other, load_description
 from dvl_calib_ros.export.simulator import export
 from dvl_calib_ros.export.simulators import SIMULATORS
-from dvl_calib_ros.files.yaml_files import load_yaml
 
 STD = (0.0103, 0.0103, 0.00266)  # of beams 20 degrees from vertical with 5 mm/s each
 FOUND = DvlDescription(

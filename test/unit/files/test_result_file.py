@@ -22,8 +22,8 @@ from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
+from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.atomic import save_text
 from dvl_calib_ros.files.result_file import (
     NothingUsedError,
     load_initial_calibration,

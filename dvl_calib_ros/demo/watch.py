@@ -21,11 +21,11 @@ from rich.console import Group
 from rich.table import Table
 
 from ..calibration.correction import NOT_ESTIMATED
-from ..demo.player import BagPlayer
 from ..files.parameter_files import NODE_NAME
+from ..node.answering import AnsweringNode
+from ..node.calibration_node import QUEUE
 from ..recordings.topics import Topics
-from .answering import AnsweringNode
-from .calibration_node import QUEUE
+from .player import BagPlayer
 
 # place in ~/estimate's covariance diagonal, factor to what people read
 SHOWN = {

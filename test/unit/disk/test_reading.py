@@ -13,8 +13,8 @@ from io_fixtures import run, write_bag
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.disk.reading import LARGEST_FILE, read_file
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.reading import LARGEST_FILE, read_file
 
 # Every option and argument that takes a file which is read whole
 USES = [

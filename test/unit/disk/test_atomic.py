@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from dvl_calib_ros.disk import atomic
+from dvl_calib_ros.disk.atomic import check_writable, save_bytes, save_text
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files import atomic
-from dvl_calib_ros.files.atomic import check_writable, save_bytes, save_text
 
 
 def _disk_is_full(*_):
@@ -97,7 +97,7 @@ def test_a_disk_that_is_really_full_is_said(tmp_path):
     """A file size limit makes write() itself fail, as a full disk does."""
     script = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from dvl_calib_ros.files.atomic import save_text\n"
+        "from dvl_calib_ros.disk.atomic import save_text\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
         "save_text(Path(sys.argv[1]), 'x' * 100_000)"
     )
@@ -318,7 +318,7 @@ def test_a_device_a_pipe_or_a_socket_is_never_replaced_by_a_file(special, tmp_pa
 
 def test_what_is_written_to_a_stream_of_the_process_itself_goes_there_after_what_was_printed(tmp_path):
     script = (
-        "from pathlib import Path; from dvl_calib_ros.files.atomic import check_writable, save_text\n"
+        "from pathlib import Path; from dvl_calib_ros.disk.atomic import check_writable, save_text\n"
         "print('before')\n"
         "for name in ('/dev/stdout', '/proc/self/fd/1', '/dev/null', 'link'):\n"
         "    check_writable(Path(name)); save_text(Path(name), f'{name}\\n')\n"

@@ -9,8 +9,8 @@ import numpy as np
 from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
-from ..diagnosis.twin import Twin
 from ..messages.encode import SampleWriter
+from .twin import Twin
 
 
 def twin_paths(folder: Path, name: str) -> tuple[Path, Path]:
