@@ -11,31 +11,33 @@ question that is asked of it is a method.)
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from .alignment import Aligner
-from .assembly import gate_of, nis_bounds, prior
-from .bank import Group, ModelCounts, groups_of
+from .assembly import nis_bounds
+from .bank import Group, groups_of
 from .days import day_covariance
-from .delay.filter import DelayFilter
 from .delay.hold_out import Recording, Terms
 from .delay.workers import Worker
+from .estimator import Estimator, Given, LinearEstimator, kind_of
 from .frames import Array, Vector
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
-from .models import LINEAR_MODELS, MODELS, Model, Needs
+from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
 from .observability import convergence, observability
 from .observations import Observations
 from .observe import Observer
 from .parameters import ParameterError, Parameters
-from .results import DAYS_OF, Day, Estimate, Result
+from .results import Day, Estimate, Result
 from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
-from .verification import Verification, held_out_error, verify
+from .verification import Verification, verify
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
@@ -47,6 +49,9 @@ _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.ATTITUDE: lambda block: block.oriented,
     Needs.REFERENCE: lambda block: block.paired,
 }
+
+# Imported now, for no live message waits for an import.
+_KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estimator}
 
 
 class _Seen(NamedTuple):
@@ -91,11 +96,13 @@ class Calibrator:
         worker: Worker | None = None,
         models: Collection[str] = tuple(MODELS),
     ) -> None:
+        if BROKEN:
+            raise ParameterError(BROKEN[0])
         if parameters.prior_source == "reference" and prior_sway_heave is None:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
         self.parameters = parameters
         self._models = tuple(name for name in MODELS if name in models)
-        self._extends = [base for name in self._models if (base := MODELS[name].extends) is not None]
+        self._extended = [base for name in self._models if (base := MODELS[name].extends) is not None]
         self._initial = initial
         self._block_size = block_size
         self._on_event = on_event
@@ -119,32 +126,49 @@ class Calibrator:
     def _start(self) -> None:
         self._selection = Selection()
         self._n_selected = 0  # rows that the selection knows of
-        wanted = {*self._models, *self._extends}
+        wanted = {*self._models, *self._extended}
         if self._verified:  # every model is judged by the samples of one with a reference
             wanted.add(next((name for name in wanted if MODELS[name].aided), "M1"))
         linear = [model for model in LINEAR_MODELS if model.name in wanted]
         self._groups = groups_of(linear, self.parameters, self._initial, self._verified)
-        self._group_of = {name: group for group in self._groups for name in group.index}
-        extended = MODELS["G2"]
-        unknown = prior(extended, self.parameters)
-        self._delay = DelayFilter(
-            self.parameters,
-            self._aligner,
-            (self._initial or {}).get(extended.name) or unknown,
-            unknown,
-            gate_of(extended.n_measurement, self.parameters),
-            self._on_block,
-            self._verified,
-            self._worker,
-            1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK),
-        )
-        if self._extends:
-            self._delay.attach()
+        self._aligner.before_clearing = self._before_clearing
+        for track in (self._aligner.reference, self._aligner.imu):
+            track.needed_from.clear()
+        group_of = {name: group for group in self._groups for name in group.index}
+        self._estimators: dict[str, Estimator] = {
+            model.name: LinearEstimator(model, group_of[model.name], self._update) for model in linear
+        }
+        for name in self._models:
+            if MODELS[name].estimator:
+                self._estimators[name] = self._made(MODELS[name])
+        # those that are more than the linear filter
+        self._further = tuple(self._estimators[name] for name in self._models if MODELS[name].estimator)
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
         self._seen: dict[Needs, _Seen] = {}
         if self._trace is not None:
             self._trace.start(self._groups)
+
+    def _made(self, model: Model) -> Estimator:
+        """The estimator that a model names."""
+        together = 1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK)
+        return _KINDS[model.name](
+            Given(
+                model=model,
+                parameters=self.parameters,
+                aligner=self._aligner,
+                base=None if model.extends is None else self._estimators[model.extends],
+                initial=(self._initial or {}).get(model.name),
+                on_evidence=partial(self._on_evidence, model),
+                verified=self._verified,
+                worker=self._worker,
+                together=together,
+            )
+        )
+
+    def _before_clearing(self) -> None:
+        for each in self._further:
+            each.advance()
 
     def _restart(self, back_s: float) -> None:
         self.restarts += 1
@@ -184,10 +208,10 @@ class Calibrator:
     def _advance(self) -> None:
         """Let the selection know what is paired, and update the models if enough samples have come together."""
         aligner = self._aligner
-        if self._extends:
-            if aligner.partners.n_judged - self._delay.n_taken >= COPIED_AT_ONCE:
-                self._delay.take_rows()
-            self._delay.advance()
+        for each in self._further:
+            if aligner.partners.n_judged - each.n_taken >= COPIED_AT_ONCE:
+                each.take_rows()
+            each.advance()
         self._look_at_headings()
         if aligner.partners.n_paired > self._n_selected:
             self._select()
@@ -200,13 +224,13 @@ class Calibrator:
             self._forget_rows()
 
     def _select(self) -> None:
-        """Let the selection know what is paired, but for what may go by blocks that G2 has not solved."""
+        """Let the selection know what is paired, but for what may go by what is only gathered."""
         rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
-        until_ns = self._delay.told_until_ns
-        if until_ns is not None:
-            stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, until_ns))]
+        for each in self._further:
+            if each.told_until_ns is not None:
+                stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, each.told_until_ns))]
         if len(stamps_ns):
             paired = rows.pairing[first : first + len(stamps_ns)] == Pairing.PAIRED
             self._selection.update(stamps_ns, paired, self.parameters)
@@ -244,11 +268,13 @@ class Calibrator:
         for start, stop in pairwise(cuts):
             yield start, stop, start in own
 
-    def _on_block(self, from_ns: int) -> None:
-        """Let the selection, and the trace, know what G2 says after another block."""
-        self._selection.extend(from_ns, self._delay.evidence)
+    def _on_evidence(self, model: Model, from_ns: int) -> None:
+        """Let the selection, and the trace, know what an estimator says by now."""
+        estimator = self._estimators[model.name]
+        if model.extends is not None and EXTENDED_BY[model.extends] == model.name:
+            self._selection.extend(from_ns, estimator.evidence)
         if self._trace is not None:
-            self._delay.remember(from_ns)
+            estimator.remember(from_ns)
 
     # ------------------------------------------------------------------ models
 
@@ -310,7 +336,7 @@ class Calibrator:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
         done = min(self._n_selected, *(group.next_row for group in self._groups))
-        done = min(done, self._delay.n_taken) if self._extends else done
+        done = min(done, *(each.n_taken for each in self._further)) if self._further else done
         done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
@@ -322,7 +348,8 @@ class Calibrator:
 
         That may still wait for partners.
         """
-        self._delay.finish()
+        for each in self._further:
+            each.finish()
         for group in self._groups:
             self._update(group)
         rows = self._aligner.rows
@@ -367,8 +394,7 @@ class Calibrator:
         pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
         counts["calibration"] = {"restarts": self.restarts}
         for name in self._models:
-            tally = self._group_of[name].counts(name) if MODELS[name].extends is None else self._delay.counts
-            if restarted := tally.restarted:
+            if restarted := self._estimators[name].counts.restarted:
                 counts["calibration"][f"{name} restarted"] = restarted
         return counts
 
@@ -404,7 +430,8 @@ class Calibrator:
     @property
     def selection(self) -> Selection:
         """Which model is the one, over time."""
-        self._delay.settle()
+        for each in self._further:
+            each.settle()
         self._select()
         return self._selection
 
@@ -426,23 +453,11 @@ class Calibrator:
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model."""
-        model = MODELS[name]
-        if model.extends is not None:
-            return self._delay.state(self.state(model.extends))
-        group = self._group_of[name]
-        self._update(group)
-        return group.state(name)
+        return self._estimators[name].state()
 
     def inflation(self, name: str) -> Array:
         """By how much blocks of time raise σ of each state (n,) of one model above the filter's own."""
-        model = MODELS[name]
-        source = self._source(model)
-        if source is None:
-            return self._delay.inflation
-        factor = np.ones(model.n_state)
-        own = self._group_of[source].inflation(source)
-        factor[: len(own)] = own
-        return factor
+        return self._estimators[name].inflation
 
     def published(self, name: str) -> GaussianState:
         """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""
@@ -451,17 +466,7 @@ class Calibrator:
 
     def of_recording(self, name: str) -> GaussianState:
         """As `state`, with σ as of the same day: the larger of what the filter claims and what blocks of time show."""
-        state = self.state(name)
-        if self._source(MODELS[name]) is None:  # its own has been raised
-            return state
-        factor = self.inflation(name)
-        return state.raised(factor)
-
-    def _source(self, model: Model) -> str | None:
-        """The linear model whose estimate a model's is; None for a model of its own that claims more."""
-        if model.extends is None:
-            return model.name
-        return None if self._delay.claims else model.extends
+        return self._estimators[name].of_recording()
 
     def states_at(
         self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps
@@ -470,24 +475,13 @@ class Calibrator:
 
         Returns states x (E, n), P (E, n, n), samples used (E,), and the sum of νᵀS⁻¹ν over them (E,).
         """
-        model = MODELS[name]
-        base = model.extends or name
-        group = self._group_of[base]
-        standing = trace.standing(group, numbers)
-        state, (used, nis_sum) = group.states_at(base, standing), group.counts_at(base, standing)
-        if model.extends is None:
-            return state, used, nis_sum
-        return self._delay.remembered(stamps_ns, state, used, nis_sum)
-
-    def _counts(self, model: Model) -> ModelCounts:
-        source = self._source(model)
-        return self._delay.counts if source is None else self._group_of[source].counts(source)
+        return self._estimators[name].states_at(trace, numbers, stamps_ns)
 
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
         model = MODELS[name or self.selected]
         state, covariance = self.of_recording(model.name)
-        used, gated, mean_nis, rows, _ = self._counts(model)
+        used, gated, mean_nis, rows, _ = self._estimators[model.name].counts
         return Estimate(
             model=model.name,
             state=state,
@@ -508,29 +502,19 @@ class Calibrator:
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         judge = next(group for group in self._groups if group.needs is Needs.REFERENCE)
         self._update(judge)
-        source = self._source(model)
-        if source is None:
-            held_out = self._delay.held_out_error()
-        else:
-            held_out = held_out_error(
-                MODELS[source],
-                self._group_of[source].states_without_folds(source),
-                judge.moments,
-                self.parameters.rotation_dvl_from_body,
-            )
-        counts = (estimate.used, estimate.gated)
-        suggestion = self._delay.suggestion if model.aided else ""
+        estimator = self._estimators[name]
+        held_out = estimator.held_out_error(judge.moments, self.parameters.rotation_dvl_from_body)
         return verify(
             model,
             state,
             estimate.convergence,
             held_out,
             self.parameters,
-            counts,
-            suggestion,
-            self._delay.reference_claims,
-            self._delay.lever_arm_turns if model.aided else "",
-            source is None,
+            (estimate.used, estimate.gated),
+            self.suggestion if model.aided else "",
+            any(each.reference_claims for each in self._further),
+            next((each.doubt for each in self._further if each.doubt), "") if model.aided else "",
+            bool(model.estimator) and estimator.claims,
         )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
@@ -538,25 +522,30 @@ class Calibrator:
 
         Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
         """
-        source = self._source(MODELS[name])
-        if source is None:
-            return [[Terms.of_state(state.x) for state in states] for states in self._delay.without_folds()]
-        terms = MODELS[source].error_terms_from_state
-        states = self._group_of[source].states_without_folds(source)
-        return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * self._delay.n_days for state in states]
+        keeper = self._keeper
+        return self._estimators[name].held_out_terms(1 if keeper is None else keeper.n_days)
+
+    @property
+    def _keeper(self) -> Estimator | None:
+        """Who keeps all streams for verification, and knows of days."""
+        return next(iter(self._further), None)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
         """Which day (N,) stamps are of, from 0, as far as `recording` goes."""
-        return self._delay.day_of(stamps_ns)
+        keeper = self._keeper
+        return np.zeros(len(stamps_ns), dtype=np.intp) if keeper is None else keeper.day_of(stamps_ns)
 
     @property
     def recording(self) -> tuple[Recording, int] | None:
         """What was kept for verification of all streams, and the stamp (ns) of its time 0; None for nothing."""
-        return self._delay.recording
+        keeper = self._keeper
+        return None if keeper is None else keeper.recording
 
     def result(self) -> Result:
         """Everything that the samples so far tell, also where it takes effect only when later ones have come."""
-        with self._delay.settled():
+        with ExitStack() as settled:
+            for each in self._further:
+                settled.enter_context(each.settled())
             return self._result()
 
     def _result(self) -> Result:
@@ -572,32 +561,26 @@ class Calibrator:
             verifications={name: self.verification(name) for name in self._models} if self._verified else {},
             suggestion=self.suggestion,
             days=self.days,
+            days_of=next((name for name in self._models if self._days_of(name)), ""),
         )
+
+    def _days_of(self, name: str) -> tuple[Day, ...]:
+        return self._estimators[name].days_from((self.first_ns or 0, *self._aligner.day_starts_ns))
 
     @property
     def days(self) -> tuple[Day, ...]:
-        """What belongs to each day by G2, where there are several and it claims more than G1; else none."""
-        found = self._delay.days
-        names = MODELS[DAYS_OF].state_names
-        delay, *offset = (names.index(name) for name in ("time_offset", "reference_east", "reference_north"))
-        nominal = self.parameters.dvl_time_offset
-        days = []
-        for first_ns, (state, shown) in zip((self.first_ns or 0, *self._aligner.day_starts_ns), found, strict=False):
-            std = np.sqrt(np.diag(state.p))
-            (east, north), (east_std, north_std) = state.x[offset].tolist(), std[offset].tolist()
-            late, late_std = nominal + float(state.x[delay]), float(std[delay])
-            days.append(Day(first_ns, late, late_std, bool(shown[delay]), (east, north), (east_std, north_std)))
-        return tuple(days)
+        """What belongs to each day, where there are several and an estimator finds something of each; else none."""
+        return next((days for name in self._models if (days := self._days_of(name))), ())
 
     @property
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
-        return self._delay.suggestion
+        return next((each.suggestion for each in self._further if each.suggestion), "")
 
     @property
     def suggestion_so_far(self) -> str:
         """`suggestion`, live: what a look that is not made anew for every message says."""
-        return self._delay.suggestion_so_far
+        return next((each.suggestion_so_far for each in self._further if each.suggestion_so_far), "")
 
 
 def _own(block: AlignedBlock) -> AlignedBlock:

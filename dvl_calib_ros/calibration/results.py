@@ -97,10 +97,6 @@ class Estimate:
         return corrected_mounting(self.misalignment, rotation_dvl_from_body)
 
 
-# The model whose states `Day` are.
-DAYS_OF = "G2"
-
-
 @dataclass(frozen=True)
 class Day:
     """What belongs to one of several days, by the data of all.
@@ -147,7 +143,7 @@ class Result:
     first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
     `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values. verifications:
     by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit, where the one
-    given is grossly wrong, else ''. days: in order, none where there is one.
+    given is grossly wrong, else ''. days: in order, none where there is one; days_of: the model whose states they are.
     """
 
     selected: str
@@ -161,6 +157,7 @@ class Result:
     verifications: Mapping[str, Verification]
     suggestion: str = ""
     days: tuple[Day, ...] = ()
+    days_of: str = ""
 
     @property
     def estimate(self) -> Estimate:
@@ -177,7 +174,7 @@ class Result:
     @property
     def own_days(self) -> tuple[Day, ...]:
         """Days that the selected model found something of; none where there is one."""
-        return self.days if self.selected == DAYS_OF else ()
+        return self.days if self.selected == self.days_of else ()
 
     @property
     def delays(self) -> tuple[Delay, ...]:

@@ -176,8 +176,8 @@ class Track(Table):
         self.max_gap_ns = max_gap_ns
         self.max_latency_ns = max_latency_ns
         self.retention_ns = retention_ns
-        # stamp from which on nothing is forgotten before LONGEST_NS; None for no such wish
-        self.needed_from_ns: int | None = None
+        # by who wants it: stamp from which on nothing is forgotten before LONGEST_NS
+        self.needed_from: dict[object, int] = {}
 
     @property
     def newest_ns(self) -> int | None:
@@ -188,8 +188,8 @@ class Track(Table):
         """Forget what no time that may still be asked for needs."""
         if self.size > self.begin:
             oldest_ns = int(self.stamps_ns[self.size - 1]) - self.retention_ns - self.max_gap_ns
-            if self.needed_from_ns is not None:
-                wanted_ns = self.needed_from_ns
+            if self.needed_from:
+                wanted_ns = min(self.needed_from.values())
                 if self.size - self.begin > MOST_KEPT:
                     wanted_ns = max(wanted_ns, int(self.stamps_ns[self.size - 1]) - LONGEST_NS)
                 oldest_ns = min(oldest_ns, wanted_ns)

@@ -11,17 +11,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import ClassVar
 
 import numpy as np
 
-from ..alignment import Aligner
+from ..assembly import gate_of, prior
 from ..bank import ModelCounts
+from ..estimator import Estimator, Given
+from ..folds import Moments
 from ..frames import Array
+from ..history import Counts, Numbers, StateTrace
 from ..kalman import GaussianState
-from ..parameters import Parameters
+from ..results import Day
 from ..samples import Index, Stamps, Verdict
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..streams import LONG_AGO_NS, LONGEST_NS
@@ -29,10 +32,10 @@ from ..tables import Table
 from ..verification import HeldOutError
 from .bank import DayState, Posterior
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
-from .hold_out import Recording, held_out_error
+from .hold_out import Recording, Terms, held_out_error
 from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
 from .solver import BlockSolver, Outcome
-from .workers import AtOnce, Solved, Worker
+from .workers import AtOnce, Solved
 
 BLOCK_NS = 10_000_000_000
 LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
@@ -58,45 +61,31 @@ class _Dvl(Table):
     covariance: Array
 
 
-class DelayFilter:
-    """Feeds a `BlockSolver` from an aligner; tells the aligner which past of its tracks is still wanted.
+class DelayFilter(Estimator):
+    """Feeds a `BlockSolver` from an aligner; tells the aligner which past of its tracks is still wanted."""
 
-    n_taken: number of the first row of the aligner that it has not copied yet.
-    """
-
-    def __init__(
-        self,
-        parameters: Parameters,
-        aligner: Aligner,
-        prior: GaussianState,
-        unknown: GaussianState,
-        gate: float,
-        on_block: Callable[[int], None],
-        verified: bool,
-        worker: Worker | None = None,
-        together: int = 1,
-    ) -> None:
-        """Start from the prior of G2's states.
-
-        unknown: a prior without any calibration before it. gate: largest νᵀS⁻¹ν of a good sample. on_block:
-        told of each block, when its outcome takes effect, of the stamp from which on DVL samples may go by it.
-        verified: keep what hold-out needs. worker: solves the blocks; None: they are solved at once. together: so many
-        blocks are gathered before they are solved, unless somebody asks for what is known: on_block is told of them
-        late then, see `told_until_ns`.
-        """
+    def __init__(self, given: Given) -> None:
+        """Start from the prior of G2's states."""
+        assert given.base is not None  # its entry says what it extends
+        model, parameters, aligner = given.model, given.parameters, given.aligner
+        self._base = given.base
         self._parameters = parameters
         self._aligner = aligner
-        self._on_block = on_block
-        self._solver = BlockSolver(parameters, prior, unknown, gate, verified, live=worker is not None)
-        self._worker = AtOnce() if worker is None else worker
+        self._on_block = given.on_evidence
+        unknown, gate = prior(model, parameters), gate_of(model.n_measurement, parameters)
+        self._solver = BlockSolver(
+            parameters, given.initial or unknown, unknown, gate, given.verified, live=given.worker is not None
+        )
+        self._worker = AtOnce() if given.worker is None else given.worker
+        self._state_names = model.state_names
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _Dvl()
-        self.n_taken = 0  # rows of the aligner that have been looked at
+        self._n_taken = 0  # rows of the aligner that have been looked at
         self._block_ns: int | None = None  # start of the next block
         self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
         self._last_told = self._solver.outcome()
-        self._together = together
+        self._together = given.together
         self._gathered: list[Block] = []
         # by the stamp from which on they are told: those that are being solved, and the number of each among them
         self._coming: deque[tuple[int, Solved, int]] = deque()
@@ -105,12 +94,8 @@ class DelayFilter:
         self._suggested: tuple[Outcome, str] | None = None
         self._suggested_so_far: tuple[Outcome, str] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
-
-    def attach(self) -> None:
-        """Have the aligner keep what the blocks need, for who will `advance` with it."""
-        for track in (self._aligner.reference, self._aligner.imu):
-            track.needed_from_ns = LONG_AGO_NS  # until the first block is known
-        self._aligner.before_clearing = self.advance
+        for track in (aligner.reference, aligner.imu):
+            track.needed_from[self] = LONG_AGO_NS  # until the first block is known
 
     # ------------------------------------------------------------------ what is known
 
@@ -119,6 +104,11 @@ class DelayFilter:
         """The newest outcome whose time has come."""
         self.settle()
         return self._last_told
+
+    @property
+    def n_taken(self) -> int:
+        """Number of the first row of the aligner that it has not copied yet."""
+        return self._n_taken
 
     @property
     def told_until_ns(self) -> int | None:
@@ -134,7 +124,7 @@ class DelayFilter:
     @property
     def counts(self) -> ModelCounts:
         """Samples used, spikes and those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones."""
-        return self._told.counts
+        return self._told.counts if self.claims else self._base.counts._replace(restarted=self._told.counts.restarted)
 
     @property
     def posterior(self) -> Posterior | None:
@@ -150,14 +140,20 @@ class DelayFilter:
     def inflation(self) -> Array:
         """By how much blocks of time have raised σ of each state (n,); 1 of what is not claimed."""
         posterior = self.posterior
-        if posterior is None:
-            return np.ones(N_STATE)
+        if posterior is None or not self.claims:
+            factor, own = np.ones(N_STATE), self._base.inflation
+            factor[: len(own)] = own
+            return factor
         return np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
 
-    def state(self, base: GaussianState) -> GaussianState:
-        """The state, given that of the model that this extends."""
-        posterior = self.posterior
+    def state(self) -> GaussianState:
+        """The state; while nothing more is claimed that of the model that this extends."""
+        posterior, base = self.posterior, self._base.state()
         return posterior.state if posterior is not None and self.claims else self.extended(base)
+
+    def of_recording(self) -> GaussianState:
+        """As `state`, with σ as blocks of time show it: its own has been raised."""
+        return self.state() if self.claims else self.state().raised(self.inflation)
 
     def extended(self, base: GaussianState) -> GaussianState:
         """The state of the model that this one extends, with the prior of what it does not have."""
@@ -207,7 +203,7 @@ class DelayFilter:
         return Evidence(chi_square, f"does not explain the data, which show {shown}")
 
     @property
-    def lever_arm_turns(self) -> str:
+    def doubt(self) -> str:
         """How much of an angle is the lever arm's, in words; '' if the motion tells them apart.
 
         On a circle at one speed a DVL that sits elsewhere looks like a turned one, and σ of a model that takes the
@@ -220,17 +216,13 @@ class DelayFilter:
 
     def remember(self, from_ns: int) -> None:
         """Keep the state as of now, for `remembered`."""
-        used, _, mean_nis, _, _ = self.counts
+        used, _, mean_nis, _, _ = self._told.counts
         state = posterior.state if (posterior := self.posterior) is not None and self.claims else None
         self._remembered.append((from_ns, state, used, used * mean_nis if used else 0.0))
 
-    def remembered(
-        self, stamps_ns: Stamps, base: GaussianState, used: Stamps, nis_sum: Array
-    ) -> tuple[GaussianState, Stamps, Array]:
-        """The state at some stamps (E,); where nothing was claimed that of the model that this extends, extended.
-
-        base: x (E, n), P (E, n, n) of that, used and nis_sum (E,) its counts.
-        """
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
+        """As `Estimator`; where nothing was claimed the states of the model that this extends, extended."""
+        base, used, nis_sum = self._base.states_at(trace, numbers, stamps_ns)
         extended = [self.extended(GaussianState(*each)) for each in zip(*base, strict=True)]
         used, nis_sum = used.copy(), nis_sum.copy()
         at = np.searchsorted([row[0] for row in self._remembered], stamps_ns, side="right") - 1
@@ -358,12 +350,12 @@ class DelayFilter:
     def _tell_needed(self) -> None:
         assert self._block_ns is not None
         for track in (self._aligner.reference, self._aligner.imu):
-            track.needed_from_ns = self._block_ns - MARGIN_NS
+            track.needed_from[self] = self._block_ns - MARGIN_NS
 
     def take_rows(self) -> None:
         """Copy the DVL samples that are judged, before the aligner forgets them."""
         aligner, rows = self._aligner, self._aligner.rows
-        first, end = self.n_taken - rows.base, aligner.partners.n_judged - rows.base
+        first, end = self._n_taken - rows.base, aligner.partners.n_judged - rows.base
         if end <= first:
             return
         at = np.flatnonzero((rows.verdict[first:end] != Verdict.FROZEN) & ~rows.late[first:end]) + first
@@ -371,7 +363,7 @@ class DelayFilter:
         self._dvl.stamps_ns[slots] = rows.stamps_ns[at]
         self._dvl.velocity[slots] = rows.velocity_dvl[at]
         self._dvl.covariance[slots] = rows.covariance[at]
-        self.n_taken = aligner.partners.n_judged
+        self._n_taken = aligner.partners.n_judged
 
     def _dvl_is_silent(self, stamp_ns: int) -> bool:
         """Whether the DVL stops here for so long that tracks forget what was before."""
@@ -408,12 +400,27 @@ class DelayFilter:
             return []
         return [*self._idle_solver().bank.days(), DayState(self.posterior.state, self.posterior.shown)]
 
-    def without_folds(self) -> list[list[GaussianState]]:
-        """For every fold the states of every day had it not seen that fold."""
-        return self._idle_solver().bank.without_folds()
+    def days_from(self, first_ns: Sequence[int]) -> tuple[Day, ...]:
+        """As `Estimator`, where it claims more than the model that it extends."""
+        names, nominal, days = self._state_names, self._parameters.dvl_time_offset, []
+        delay, *offset = (names.index(name) for name in ("time_offset", "reference_east", "reference_north"))
+        for begins_ns, (state, shown) in zip(first_ns, self.days, strict=False):
+            std = np.sqrt(np.diag(state.p))
+            (east, north), (east_std, north_std) = state.x[offset].tolist(), std[offset].tolist()
+            late, late_std = nominal + float(state.x[delay]), float(std[delay])
+            days.append(Day(begins_ns, late, late_std, bool(shown[delay]), (east, north), (east_std, north_std)))
+        return tuple(days)
 
-    def held_out_error(self) -> HeldOutError | None:
+    def held_out_terms(self, n_days: int) -> list[list[Terms]]:
+        """For every fold what it corrects on every day, had it not seen that fold."""
+        if not self.claims:
+            return self._base.held_out_terms(n_days)
+        return [[Terms.of_state(state.x) for state in states] for states in self._idle_solver().bank.without_folds()]
+
+    def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
+        if not self.claims:
+            return self._base.held_out_error(judge, rotation_dvl_from_body)
         kept = self.recording
         if kept is None:
             return None

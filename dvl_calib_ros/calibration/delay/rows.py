@@ -16,11 +16,11 @@ import numpy as np
 
 from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
 from ..kalman import whitening
-from ..models import MODELS
 from ..models.own import g1_errors, g1_heave_errors
 from ..robust import median
 from ..samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
+from .model import G2
 from .parts import Near, Parts, places
 
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
@@ -49,7 +49,7 @@ BEYOND = slice(N_G1, N_STATE)  # what G1 has not
 OF_DELAY: Index = np.array([0, 1, 2, 3, 4, DELAY])
 OF_NONE: Index = np.array([6, 7, 8, 9, 10])
 # What belongs to the day, not to the vehicle: the constant error of the reference, and the delay.
-OF_DAY: Index = MODELS["G2"].of_day
+OF_DAY: Index = G2.of_day
 
 
 class DvlColumns(NamedTuple):

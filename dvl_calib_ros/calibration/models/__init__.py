@@ -1,27 +1,36 @@
 """The calibration models as data (models.md, "The models").
 
-A model is one entry of a table, in `published` or `own`; nothing outside its definition branches on its name. What an
-entry says is `base.Model`.
+A model is one entry of a table, in `published`, `own`, `calibration.delay` or another package (`plugged`); nothing
+outside its definition branches on its name. What an entry says is `base.Model`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+from ..delay.model import G2
 from .base import N_MEASUREMENT, Linearised, Model, Needs, Nuisance
 from .own import OWN
+from .plugged import plugged_models
 from .published import PUBLISHED
 
 __all__ = [
-    "EXTENDED_BY", "LINEAR_MODELS", "MODELS", "N_MEASUREMENT", "WITH_HEADINGS", "Linearised", "Model", "Needs",
-    "Nuisance",
+    "BROKEN", "EXTENDED_BY", "LINEAR_MODELS", "MODELS", "N_MEASUREMENT", "WITH_HEADINGS", "Linearised", "Model",
+    "Needs", "Nuisance",
 ]  # fmt: skip
 
-MODELS: Mapping[str, Model] = {model.name: model for model in (*PUBLISHED, *OWN)}
+_G1, *_WITHOUT_REFERENCE = OWN
+_OWN = {model.name: model for model in (*PUBLISHED, _G1, G2, *_WITHOUT_REFERENCE)}
+_PLUGGED, _PROBLEMS = plugged_models(_OWN)
+MODELS: Mapping[str, Model] = _OWN | _PLUGGED
+# What is wrong with models of other packages that cannot be used.
+BROKEN: tuple[str, ...] = tuple(_PROBLEMS)
 # Those that are filtered sample by sample.
-LINEAR_MODELS: tuple[Model, ...] = tuple(model for model in MODELS.values() if model.extends is None)
-# The model that extends another, by the name of that.
-EXTENDED_BY: Mapping[str, str] = {model.extends: name for name, model in MODELS.items() if model.extends is not None}
+LINEAR_MODELS: tuple[Model, ...] = tuple(model for model in MODELS.values() if not model.estimator)
+# The model that `auto` takes for another where the data call for it, by the name of that: the first that extends it.
+EXTENDED_BY: Mapping[str, str] = {
+    model.extends: model.name for model in reversed([*MODELS.values()]) if model.extends is not None
+}
 # The model that takes another's place once headings show the current, by the name of that.
 WITH_HEADINGS: Mapping[str, str] = {
     model.instead_of: name for name, model in MODELS.items() if model.instead_of is not None

@@ -65,7 +65,8 @@ class Model:
     rows are those of the body, else those of the DVL. motion_is_noise: its noise is the vehicle's motion, so samples
     count by `Observations.motion_weight`. in_correction_parameters: its filter's first
     five states are those of the correction, see `correction_parameters`. extends: the model whose states its own begin
-    with, and which it equals while the data show nothing more; such a model is filtered by `DelayFilter`.
+    with, and which it equals while the data show nothing more. estimator: "module:class" of the `Estimator` that finds
+    its states, '' for the linear filter.
     sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
     for none. uses_height: it wants `Observations.height`. instead_of: the model that `auto` leaves for this one once
     headings show the current (headings.py).
@@ -88,6 +89,7 @@ class Model:
     rows_in_body: bool = False
     in_correction_parameters: bool = False
     extends: str | None = None
+    estimator: str = ""
     instead_of: str | None = None
     sideslip_std: float = 0.0
     uses_height: bool = False

@@ -1,6 +1,6 @@
-"""G1, G2, F1 and A1, our own models; derivations are in the docstrings of `linearise_g1`, `_f1` and `_a1`.
+"""G1, F1 and A1, our own linear models; derivations are in the docstrings of `linearise_g1`, `_f1` and `_a1`.
 
-G2 is G1 with more states; it is filtered by `calibration.delay`. All hold in any right-handed frame with x ahead.
+G2, G1 with more states, is in `calibration.delay`. All hold in any right-handed frame with x ahead.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ def _shown(v: Array) -> Array:
     return np.where(np.abs(v) > SCALE_SHOWN_FROM, v, 0.0)
 
 
-def _noise_in_body(seen: Observations) -> Array:
+def noise_in_body(seen: Observations) -> Array:
+    """R in the body's frame."""
     return seen.noise_in_body
 
 
@@ -158,53 +159,26 @@ def _a1_noise(seen: Observations) -> Array:
     return noise
 
 
-_SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
+SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
 # A constant heave, and by what the reference is wrong all along.
-_G1_NUISANCE = (
+G1_NUISANCE = (
     Nuisance("heave", "m/s", "heave_offset_std"),
     Nuisance("reference_east", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
     Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
 )
 _SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
-# What shows the states that only G2 has, by name.
-_SHOWN_TO_G2 = {
-    "lever_arm_x": "turns to both sides, or of different sharpness (needs angular velocity)",
-    "lever_arm_y": "turns to both sides, or of different sharpness (needs angular velocity)",
-    "lever_arm_z": "rolling and pitching: waves, or dives (needs angular velocity)",
-    "time_offset": "speeding up and slowing down, entering and leaving turns (needs angular velocity)",
-}
-
 OWN = (
     Model(
         "G1", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS,
         assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
         wrong_when="trimmed by more than heave_offset_std, or heaving for minutes beyond motion_std",
-        scale_axes=_SCALE_PER_AXIS,
-        nuisance=_G1_NUISANCE,
-        noise=_noise_in_body,
+        scale_axes=SCALE_PER_AXIS,
+        nuisance=G1_NUISANCE,
+        noise=noise_in_body,
         heave=g1_heave,
         vertical_from_reference=True,
         rows_in_body=True,
         in_correction_parameters=True,
-    ),
-    Model(
-        "G2", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS | _SHOWN_TO_G2,
-        assumes="as G1, with a DVL anywhere on the vehicle whose stamps are off by up to 3 s; needs angular velocity",
-        wrong_when="the delay changes along the run; a vehicle that bends",
-        scale_axes=_SCALE_PER_AXIS,
-        nuisance=(
-            *_G1_NUISANCE,
-            Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
-            Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
-            Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
-            Nuisance("time_offset", "s", "initial_std_time_offset", of_the_day=True),
-        ),
-        noise=_noise_in_body,
-        heave=g1_heave,
-        vertical_from_reference=True,
-        rows_in_body=True,
-        in_correction_parameters=True,
-        extends="G1",
     ),
     Model(
         "F1", Needs.NOTHING, 2, _f1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},

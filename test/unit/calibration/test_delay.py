@@ -153,7 +153,7 @@ def test_on_a_circle_at_changing_speed_auto_takes_the_model_whose_sigma_knows_of
 @pytest.mark.parametrize("times_more", [20.0, 40.0])
 def test_why_g2_is_stayed_with_is_said_in_whole_sentences(times_more):
     calibrator = calibrate(straight(yaw_rate=0.15, changing=0.03), NOISE)
-    filtered = calibrator._delay
+    filtered = calibrator._estimators["G2"]
     x, p = filtered.posterior.state
     nothing = replace(filtered.posterior, state=GaussianState(0.1 * x, p), by_lever_arm=np.zeros(3))
     filtered._posterior = replace(nothing, by_lever_arm=np.array([0.0, 0.0, times_more]))

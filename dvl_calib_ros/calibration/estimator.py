@@ -1,0 +1,234 @@
+"""What finds the states of one model, whatever filters them: the linear filter, G2's blocks of time, another package's.
+
+`Calibrator` has one for each model and asks all alike. One that is more than the linear filter is told of the aligned
+rows by `advance`, after whatever was fed, and may hold rows back until it has copied them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from .alignment import Aligner
+from .bank import Group, ModelCounts
+from .delay.hold_out import Recording, Terms
+from .delay.workers import Worker
+from .folds import Moments
+from .frames import Array
+from .history import Counts, Numbers, StateTrace
+from .kalman import GaussianState
+from .models import Model
+from .models.plugged import load
+from .parameters import ParameterError, Parameters
+from .results import Day
+from .samples import Index, Stamps
+from .selection import NO_EVIDENCE, Evidence
+from .verification import HeldOutError, held_out_error
+
+NEVER = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class Given:
+    """What an estimator of a model is made with.
+
+    base: the estimator of the model that this one extends; None where it extends none. initial: a state to start from,
+    of the model. on_evidence: to be told, once something new takes effect, of the stamp from which on DVL samples may
+    go by it. verified: keep what hold-out needs. worker: does what would hold up live messages; None: at once.
+    together: how many blocks of time may be gathered before they are looked at, unless somebody asks.
+    """
+
+    model: Model
+    parameters: Parameters
+    aligner: Aligner
+    base: Estimator | None
+    initial: GaussianState | None
+    on_evidence: Callable[[int], None]
+    verified: bool
+    worker: Worker | None
+    together: int
+
+
+class Estimator(ABC):
+    """The states of one model; what is not abstract is for those that know more than the linear filter."""
+
+    @property
+    def claims(self) -> bool:
+        """Whether the estimate is its own, else it is that of the model that it extends."""
+        return True
+
+    @property
+    def n_taken(self) -> int:
+        """Number of the first aligned row that it has not copied."""
+        return NEVER
+
+    @property
+    def n_days(self) -> int:
+        """Number of days so far."""
+        return 1
+
+    @property
+    def reference_claims(self) -> bool:
+        """Whether it is the reference's messages that say how noisy it is, and no parameter."""
+        return False
+
+    @property
+    def doubt(self) -> str:
+        """What is known against models that take for granted what this one finds, in words; ''."""
+        return ""
+
+    @property
+    def suggestion(self) -> str:
+        """What configuration the data fit, in words, where the one given is grossly wrong; ''."""
+        return ""
+
+    @property
+    def suggestion_so_far(self) -> str:
+        """`suggestion` as it was seen a little ago, which nobody has to wait for."""
+        return self.suggestion
+
+    @property
+    def evidence(self) -> Evidence:
+        """How much speaks for it against the model that it extends."""
+        return NO_EVIDENCE
+
+    @property
+    def told_until_ns(self) -> int | None:
+        """Stamp of the first DVL sample that may go by something that is only gathered; None."""
+        return None
+
+    @property
+    def recording(self) -> tuple[Recording, int] | None:
+        """What it kept of all streams for verification, and the stamp (ns) of its time 0; None for nothing."""
+        return None
+
+    @abstractmethod
+    def state(self) -> GaussianState:
+        """x (n,) and P (n, n) by all rows so far."""
+
+    @property
+    @abstractmethod
+    def inflation(self) -> Array:
+        """By how much blocks of time raise σ of each state (n,) above the filter's own, at least 1."""
+
+    @property
+    @abstractmethod
+    def counts(self) -> ModelCounts:
+        """What it did with the samples given to it."""
+
+    @abstractmethod
+    def of_recording(self) -> GaussianState:
+        """As `state`, with σ as blocks of time show it."""
+
+    @abstractmethod
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
+        """After E rows of a trace, with their stamps (E,): x (E, n), P (E, n, n), samples used (E,), and the sum of
+        νᵀS⁻¹ν over them (E,)."""
+
+    @abstractmethod
+    def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
+        """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
+
+    @abstractmethod
+    def held_out_terms(self, n_days: int) -> list[list[Terms]]:
+        """For every fold what it corrects on every day, had it not seen that fold."""
+
+    def advance(self) -> None:
+        """Rows may have been added, or decided."""
+        return None
+
+    def take_rows(self) -> None:
+        """Copy the rows that are judged, before they are forgotten."""
+        return None
+
+    def settle(self) -> None:
+        """Let take effect what is only gathered."""
+        return None
+
+    @contextmanager
+    def settled(self) -> Iterator[None]:
+        """All that is complete has taken effect, in here."""
+        yield
+
+    def finish(self) -> None:
+        """No samples come any more."""
+        return None
+
+    def remember(self, from_ns: int) -> None:
+        """Keep the state as of now, for `states_at`."""
+        return None
+
+    def day_of(self, stamps_ns: Stamps) -> Index:
+        """Which day (N,) stamps are of, from 0."""
+        return np.zeros(len(stamps_ns), dtype=np.intp)
+
+    def days_from(self, first_ns: Sequence[int]) -> tuple[Day, ...]:
+        """What belongs to each of several days, by the stamps that they begin with; none where there is one."""
+        return ()
+
+
+class LinearEstimator(Estimator):
+    """A model of a group of linear filters."""
+
+    def __init__(self, model: Model, group: Group, update: Callable[[Group], None]) -> None:
+        """update: gives the group the rows that it has not had."""
+        self._model, self._group, self._update = model, group, update
+
+    def state(self) -> GaussianState:
+        """As `Estimator`."""
+        self._update(self._group)
+        return self._group.state(self._model.name)
+
+    @property
+    def inflation(self) -> Array:
+        """As `Estimator`."""
+        return self._group.inflation(self._model.name)
+
+    @property
+    def counts(self) -> ModelCounts:
+        """As `Estimator`."""
+        return self._group.counts(self._model.name)
+
+    def of_recording(self) -> GaussianState:
+        """As `Estimator`."""
+        return self.state().raised(self.inflation)
+
+    def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
+        """As `Estimator`."""
+        standing = trace.standing(self._group, numbers)
+        name = self._model.name
+        used, nis_sum = self._group.counts_at(name, standing)
+        return self._group.states_at(name, standing), used, nis_sum
+
+    def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
+        """As `Estimator`."""
+        states = self._group.states_without_folds(self._model.name)
+        return held_out_error(self._model, states, judge, rotation_dvl_from_body)
+
+    def held_out_terms(self, n_days: int) -> list[list[Terms]]:
+        """As `Estimator`."""
+        terms = self._model.error_terms_from_state
+        states = self._group.states_without_folds(self._model.name)
+        return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in states]
+
+
+def kind_of(model: Model) -> Callable[[Given], Estimator]:
+    """What makes the estimator that a model names; what another package does wrong is raised when one is made."""
+    name = model.estimator
+    try:
+        kind = load(name)
+        if not (isinstance(kind, type) and issubclass(kind, Estimator)):
+            raise TypeError(f"{name} is no subclass of Estimator")
+    except Exception as error:  # whatever a foreign package does wrong
+        says = f"model {model.name}: its estimator {name} cannot be used ({type(error).__name__}: {error}); mend or "
+
+        def refuse(_: Given) -> Estimator:
+            raise ParameterError(f"{says}uninstall that package")
+
+        return refuse
+    make: Callable[[Given], Estimator] = kind
+    return make

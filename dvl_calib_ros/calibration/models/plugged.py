@@ -1,0 +1,87 @@
+"""Models that other packages bring.
+
+A package brings one by an entry point of the group `dvl_calib_ros.models` that names a `Model`:
+
+    [project.entry-points."dvl_calib_ros.models"]
+    W1 = "my_vehicle.models:W1"
+
+Such a model is filtered with the package's own; or it names an `Estimator` of that package which finds its states. The
+estimator is in another module than the entry: entries are looked for while this package is still being imported.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+
+from ...errors import InputError
+from .base import Model
+
+ENTRY_POINTS = "dvl_calib_ros.models"
+
+
+def plugged_models(own: Mapping[str, Model]) -> tuple[dict[str, Model], list[str]]:
+    """By name the models of other packages, and what is wrong with those that cannot be used, in words.
+
+    own: those that there are already.
+    """
+    models: dict[str, Model] = {}
+    problems = []
+    for name, value in _points():
+        try:
+            models.update(_loaded(name, value, {**own, **models}))
+        except InputError as error:
+            problems.append(str(error))
+    return models, problems
+
+
+def load(name: str) -> object:
+    """What "module:attribute" names. Raises whatever the import raises."""
+    from importlib import import_module
+
+    module, _, attribute = name.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Model]:
+    try:
+        model = load(value)
+        if not isinstance(model, Model):
+            raise TypeError(f"{value} is no Model")
+        if model.name in known:
+            raise ValueError(f"there is a model {model.name!r} already; give it another name")
+        if model.extends is not None and model.extends not in known:
+            raise ValueError(f"it extends {model.extends!r}, which there is not")
+    except Exception as error:  # whatever a foreign package does wrong
+        raise InputError(
+            f"model {name!r} of an installed package: cannot be used ({type(error).__name__}: {error}); mend or "
+            "uninstall that package"
+        ) from error
+    return {model.name: model}
+
+
+def _points() -> Iterator[tuple[str, str]]:
+    """Name and value of each entry point."""
+    if any(_names_the_group(folder) for folder in sys.path):
+        from importlib.metadata import entry_points  # takes longer than all else here
+
+        for point in entry_points(group=ENTRY_POINTS):
+            yield point.name, point.value
+
+
+def _names_the_group(folder: str) -> bool:
+    """Whether a package that is installed in a folder of the path brings a model."""
+    try:
+        with os.scandir(folder or ".") as entries:
+            found = [entry.path for entry in entries if entry.name.endswith((".dist-info", ".egg-info"))]
+    except OSError:
+        return False
+    for path in found:
+        try:
+            with open(os.path.join(path, "entry_points.txt"), "rb") as file:
+                if ENTRY_POINTS.encode() in file.read():
+                    return True
+        except OSError:
+            continue
+    return False
