@@ -24,7 +24,8 @@ import numpy as np
 from .calibration.findings import Finding
 from .calibration.frames import Array, rpy_from_rotation
 from .calibration.models import MODELS
-from .calibration.observability import body_angle_std, scale_std_ahead
+from .calibration.mounting_pose import rpy_std
+from .calibration.observability import scale_std_ahead
 from .calibration.parameters import ParameterError, Parameters
 from .diagnosis.results import Diagnosis
 from .discovery.discover import Discovery, Given, discover
@@ -168,7 +169,7 @@ class Calibration:
         offset_std = estimate.std_of("time_offset")
         return Mounting(
             _triple(np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(rotation)))),
-            _triple(np.degrees(body_angle_std(estimate.covariance, parameters))),
+            _triple(np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))),
             _triple(np.degrees(parameters.mounting_rpy)),
             _triple(estimate.lever_arm(parameters.lever_arm)),
             _triple(np.full(3, math.nan) if arm_std is None else arm_std),

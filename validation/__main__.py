@@ -18,6 +18,7 @@ COMMANDS = {
     "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
     "mutants": "faults put into ten rules, each of which the tests must see",
     "size": "lines of code, modules, arrows between the rooms of the package",
+    "stacks": "bags as real stacks record them, each with its truth, judged through the command line",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from .correction import NOT_ESTIMATED, lever_arm
 from .error_model import corrected_mounting
-from .frames import FLU_FROM_FRD, Array
+from .frames import FLU_FROM_FRD, Array, rpy_from_rotation
 from .kalman import GaussianState
 from .models import Model
 from .observability import observability, scale_std_ahead
@@ -85,6 +85,30 @@ def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, tu
     return MountingPose(
         (math.nan,) * 3 if position is None else position, rotation @ FLU_FROM_FRD if turned else rotation, covariance
     )
+
+
+# Turn (rad) over which the angles of a URDF are differentiated: their second derivatives are of order one.
+_SMALL_TURN = 1e-5
+
+
+def rpy_std(misalignment: Array, covariance: Array, parameters: Parameters) -> Array:
+    """Standard deviations (3,) rad of roll, pitch, yaw of the corrected mounting, as a URDF's origin has them.
+
+    Not those of turns about the body's axes: of a DVL at 45 degrees, a roll of the body that the motion does not show
+    is as much pitch as roll.
+
+    Parameters
+    ----------
+    misalignment: φ (3,) rad, DVL frame.
+    covariance: (n, n) of a model's state, which begins with φ.
+    parameters: Nominal mounting.
+
+    """
+    t = parameters.rotation_dvl_from_body
+    rpy = rpy_from_rotation(corrected_mounting(misalignment, t))
+    turned = [rpy_from_rotation(corrected_mounting(misalignment + each, t)) for each in _SMALL_TURN * np.eye(3)]
+    jacobian = np.array([(each - rpy + np.pi) % (2.0 * np.pi) - np.pi for each in turned]).T / _SMALL_TURN
+    return np.sqrt(np.diag(jacobian @ covariance[:3, :3] @ jacobian.T))
 
 
 class ScaleAndDelay(NamedTuple):

@@ -99,20 +99,22 @@ def _table(replayed: Replayed) -> Table:
     from ..calibration.comparison import date
     from ..calibration.frames import rpy_from_rotation
     from ..calibration.models import MODELS
-    from ..calibration.observability import body_angle_std, scale_std_ahead
+    from ..calibration.mounting_pose import rpy_std
+    from ..calibration.observability import OBSERVED_SHARE, scale_std_ahead
     from ..calibration.parameters import Parameters
 
     result = replayed.result
     estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
     nominal = np.degrees(parameters.mounting_rpy) + 0.0
     corrected = np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)))
-    std = np.degrees(body_angle_std(estimate.covariance, parameters))
+    std = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
     unseen = {entry.axis for entry in estimate.observability if not entry.observed}
+    unknown = OBSERVED_SHARE * math.degrees(parameters.initial_std_misalignment)
     table = Table(box=box.SIMPLE_HEAD)
     for column in ("", "nominal", "corrected", "±1σ"):
         table.add_column(column, justify="right", no_wrap=True)
     for index, name in enumerate(("roll", "pitch", "yaw")):
-        mark = " ?" if name in unseen else ""
+        mark = " ?" if std[index] > unknown else ""
         table.add_row(name, _angle(nominal[index]), _angle(corrected[index]), f"{std[index]:.2f}°{mark}")
     model = MODELS[estimate.model]
     scale_std = scale_std_ahead(model, estimate.covariance, parameters)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import math
 
+import numpy as np
 import pytest
 from conftest import ROOT
 
 from validation import mutants, repeat
 from validation.__main__ import COMMANDS, main
+from validation.stacks import mounting_errors
 
 
 def test_every_command_is_listed_and_there(capsys):
@@ -79,3 +82,23 @@ def test_a_mutant_that_survives_is_said_by_the_exit_code_and_the_copy_alone_is_c
     assert mutants.main([]) == 1
     assert "nothing               SURVIVED" in capsys.readouterr().out
     assert (ROOT / path).read_text() == before
+
+
+def test_stacks_without_the_shared_folder_are_skipped_with_a_reason(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("DVL_CALIB_SHARED", str(tmp_path))
+    assert main(["stacks"]) == 0
+    assert "skipped" in capsys.readouterr().out
+
+
+def test_the_judge_of_stacks_sees_an_angle_a_position_and_a_delay_that_are_wrong():
+    mounting = {
+        "corrected_rpy": [0.0, 0.0, 0.02],
+        "pose_covariance": (1e-6 * np.eye(6)).tolist(),
+        "scale_error_ahead": 0.0, "scale_error_ahead_std": 0.001,
+        "position": [0.7, 0.0, -0.6], "dvl_time_offset": 0.3, "dvl_time_offset_std": 0.01,
+    }  # fmt: skip
+    truth = {"scale": 0.0, "arm": [0.4, 0.0, -0.2], "late": 0.3}
+    (wrong,) = mounting_errors(mounting, truth, (0.0, 0.0, math.degrees(0.02)))
+    assert "position" in wrong
+    errors = mounting_errors({**mounting, "position": None}, {"late": 0.0}, (0.0, 0.0, 2.5))
+    assert [each.split()[0] for each in errors] == ["yaw", "late"]

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dvl_calib_ros.calibration.error_model import corrected_mounting
+from dvl_calib_ros.calibration.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.mounting_pose import mounting_pose, scale_and_delay
+from dvl_calib_ros.calibration.mounting_pose import mounting_pose, rpy_std, scale_and_delay
 from dvl_calib_ros.calibration.parameters import Parameters
 
 PARAMETERS = Parameters(
@@ -81,3 +83,20 @@ def test_scale_and_delay_are_what_was_set_and_what_was_found(rng):
     assert beside.time_offset == pytest.approx(0.25 + state.x[-1])
     assert beside.scale == pytest.approx(state.x[4])  # the DVL's y looks ahead
     assert beside.scale_std == pytest.approx(np.sqrt(state.p[4, 4]))
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, np.pi / 4), (0.3, -0.2, 2.1), (np.pi, 0.0, -np.pi / 2)])
+def test_the_std_of_roll_pitch_and_yaw_is_that_of_angles_drawn_from_the_state(rng, rpy):
+    """Of a DVL at 45 degrees, a roll of the body that is not known is as much pitch as roll."""
+    parameters, model = Parameters(mounting_rpy=rpy), MODELS["G1"]
+    t = parameters.rotation_dvl_from_body
+    p = np.zeros((model.n_state, model.n_state))
+    p[:3, :3] = t @ np.diag([0.02, 0.001, 0.002]) ** 2 @ t.T
+    found = rpy_std(np.zeros(3), p, parameters)
+    drawn = [
+        rpy_from_rotation(corrected_mounting(phi, t)) for phi in rng.multivariate_normal(np.zeros(3), p[:3, :3], 4000)
+    ]
+    spread = np.angle(np.exp(1j * (np.array(drawn) - rpy))).std(axis=0)
+    np.testing.assert_allclose(found, spread, rtol=0.05)
+    if rpy[2] == np.pi / 4:
+        assert found[1] > 0.014
