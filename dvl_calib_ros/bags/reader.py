@@ -46,12 +46,9 @@ class BagReader:
         self.decoder = Decoder(known)
         self._stack = ExitStack()
         self._sources: list[Source] = []
-        self._n_sources: list[int] = []  # of each path
         try:
             for path in paths:
-                opened = self._open(path)
-                self._sources += opened
-                self._n_sources.append(len(opened))
+                self._sources += self._open(path)
         except BaseException:
             self._stack.close()
             raise
@@ -106,19 +103,8 @@ class BagReader:
 
     @property
     def file_spans_ns(self) -> list[tuple[int, int]]:
-        """First and last log time of each file."""
-        return [source.span_ns for source in self._sources]
-
-    @property
-    def span_of_each_ns(self) -> list[tuple[int, int] | None]:
-        """First and last log time at each of the paths that were given; None where there is no message."""
-        at = 0
-        spans: list[tuple[int, int] | None] = []
-        for count in self._n_sources:
-            own = [source.span_ns for source in self._sources[at : at + count] if source.counts]
-            spans.append((min(start for start, _ in own), max(end for _, end in own)) if own else None)
-            at += count
-        return spans
+        """First and last log time of each file that holds a message."""
+        return [source.span_ns for source in self._sources if sum(source.counts.values())]
 
     def messages(self, topics: Iterable[str]) -> Iterator[DecodedMessage]:
         """Messages of these topics."""

@@ -288,8 +288,7 @@ class _Search:
 
     def _turned_by_message(self, dvl: Look) -> bool:
         """Whether the calibration turns the DVL's data if nobody tells it: by the frame's name, else by the type."""
-        suffix = dvl.frame_id.lower().rpartition("_")[2]
-        return suffix == "frd" or (VELOCITY_TYPES[dvl.msgtype].points_down and suffix != "flu")
+        return VELOCITY_TYPES[dvl.msgtype].is_turned(dvl.frame_id)
 
     def _declared_turned(self, dvl: Look, placed: Placed | None) -> bool:
         """Whether the DVL's data are forward-right-down, by parameter, frame, transform and type."""

@@ -163,8 +163,7 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
     """The DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
-    suffix = "" if look is None else look.frame_id.lower().rpartition("_")[2]
-    by_message = suffix == "frd" or (VELOCITY_TYPES[dvl.msgtype].points_down and suffix != "flu")
+    by_message = VELOCITY_TYPES[dvl.msgtype].is_turned("" if look is None else look.frame_id)
     turned = by_message if parameters.dvl_axes == FROM_MESSAGE else parameters.dvl_axes == FRD
     flu = values @ FLU_FROM_FRD if turned else values
     return flu @ rotation_from_rpy(parameters.mounting_rpy).T

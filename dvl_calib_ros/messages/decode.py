@@ -255,8 +255,7 @@ class MessageDecoder:
         axes = self.parameters.dvl_axes
         if axes != FROM_MESSAGE:
             return axes == FRD
-        suffix = (self.dvl_frame or "").lower().rpartition("_")[2]
-        return suffix == "frd" or (self.dvl_type.points_down and suffix != "flu")
+        return self.dvl_type.is_turned(self.dvl_frame or "")
 
     def note_axes(self) -> None:
         """Ask about a DVL whose data are turned upside down, and its mounting as well; its frame is known by now."""

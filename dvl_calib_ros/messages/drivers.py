@@ -86,6 +86,11 @@ class VelocityType:
     definitions: tuple[str, ...] = ()
     install: str = ""
 
+    def is_turned(self, frame_id: str) -> bool:
+        """Whether velocities in this frame are forward-right-down: by the end of its name, else by the type's axes."""
+        suffix = frame_id.lower().rpartition("_")[2]
+        return suffix == "frd" or (self.points_down and suffix != "flu")
+
     def broken_rule(self, message: Any, parameters: Parameters) -> Rule | None:
         """The first rule that a message breaks."""
         for rule in self.rules:

@@ -39,11 +39,10 @@ Span = tuple[int, int]
 class Recording:
     """One recording, or several as one.
 
-    paths: of it. types: topic -> message type, of all topics; held: topic -> all the types and whether a definition is
-    lacking, of those that are kept. counts: topic -> number of messages. file_spans_ns: of each file. span_ns: of all,
-    (0, 0) without any. notes: what the user should know of what was read (damage). columns: of the topics that are
-    kept, a part for each path. transforms, descriptions: as `Survey` has them. each: the recordings that it is made
-    of, by themselves; itself, if it is one.
+    paths: of it. types: topic -> message type, of all topics; held: topic -> what it holds. counts: topic -> number of
+    messages. file_spans_ns: of each file that holds a message. notes: what the user should know of what was read
+    (damage). columns: of the topics that are kept, a part for each path. transforms: of tf_static; descriptions: of
+    robot_description. parts: the recordings that it is made of; none, if it is one.
     """
 
     paths: tuple[Path, ...]
@@ -51,7 +50,6 @@ class Recording:
     held: Mapping[str, Held]
     counts: Mapping[str, int]
     file_spans_ns: tuple[Span, ...]
-    path_spans_ns: tuple[Span | None, ...]
     notes: tuple[str, ...]
     columns: Mapping[str, tuple[TopicColumns, ...]]
     transforms: tuple[Any, ...] = ()
@@ -70,8 +68,14 @@ class Recording:
 
     @property
     def span_ns(self) -> Span:
-        """First and last log time."""
-        return min(start for start, _ in self.file_spans_ns), max(end for _, end in self.file_spans_ns)
+        """First and last log time; (0, 0) without messages."""
+        starts, ends = zip(*(self.file_spans_ns or [(0, 0)]), strict=True)
+        return min(starts), max(ends)
+
+    @property
+    def path_spans_ns(self) -> tuple[Span | None, ...]:
+        """First and last log time at each path; None where there is no message."""
+        return tuple(one.span_ns if one.file_spans_ns else None for one in self.each)
 
     @property
     def recorded_spans_ns(self) -> list[Span]:
@@ -87,8 +91,7 @@ class Recording:
     @cached_property
     def survey(self) -> Survey:
         """A first look at all that may be of use."""
-        start_ns = self.span_ns[0] if self.types else 0
-        spans_ns = self.recorded_spans_ns if self.types else [(0, 0)]
+        start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         looks = {
             topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
                            spans_ns)
@@ -174,7 +177,6 @@ def together(each: Sequence[Recording]) -> Recording:
         },
         counts,
         tuple(span for one in each for span in one.file_spans_ns),
-        tuple(span for one in each for span in one.path_spans_ns),
         tuple(note for one in each for note in one.notes),
         _renumbered(each, names),
         tuple(transform for one in each for transform in one.transforms),
@@ -249,7 +251,6 @@ def _opened(
             {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types},
             counts,
             tuple(bag.file_spans_ns),
-            tuple(bag.span_of_each_ns),
             tuple(bag.notes),
             {topic: (collector.columns(),) for topic, collector in collectors.items()},
             tuple(transforms),

@@ -1,0 +1,75 @@
+"""A look takes the same messages as one that decides at each of them."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+from conftest import searched
+from hypothesis import given
+from hypothesis import strategies as st
+from io_fixtures import run, write_bag
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.recordings.look import BURST_EVERY_NS, BURST_NS, BURSTS, in_bursts
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.same import hold_the_same
+
+
+class Topic:
+    """What `in_bursts` asks of a topic's columns."""
+
+    def __init__(self, arrival, log_ns) -> None:
+        self.arrivals = np.array(arrival, dtype=np.int64), np.array(log_ns, dtype=np.int64)
+
+
+def one_by_one(log_ns: list[int], spans_ns: list[tuple[int, int]]) -> list[int]:
+    starts = [start for start, _ in spans_ns]
+    before = np.cumsum([0, *(end - start for start, end in spans_ns)]).tolist()
+    period = max(before[-1] // BURSTS, BURST_NS)
+    taken, next_ns = [], 0
+    for place, now in enumerate(log_ns):
+        if now < next_ns:
+            continue
+        span = max(bisect_right(starts, now) - 1, 0)
+        since = (now - starts[span] + before[span]) % period
+        next_ns = now + (BURST_EVERY_NS if since < BURST_NS else period - since)
+        if since < BURST_NS:
+            taken.append(place)
+    return taken
+
+
+@searched(60)
+@given(
+    st.lists(st.tuples(st.integers(0, 10**12), st.integers(1, 10**12)), min_size=1, max_size=4),
+    st.lists(st.floats(0.0, 1.0), max_size=200),
+    st.booleans(),
+)
+def test_bursts_are_those_that_are_decided_one_by_one(gaps, places, in_two):
+    """gaps: time before each stretch and its length, ns. places: of messages, as shares of all that was recorded."""
+    spans, at = [], 0
+    for before, length in gaps:
+        spans.append((at + before, at + before + length))
+        at += before + length
+    log_ns = sorted(int(spans[0][0] + share * (at - spans[0][0])) for share in places)
+    arrival = np.arange(len(log_ns)) * 3
+    parts = [Topic(arrival, log_ns)]
+    if in_two:
+        parts = [Topic(arrival[at::2], log_ns[at::2]) for at in (0, 1)]
+    assert in_bursts(parts, spans).tolist() == arrival[one_by_one(log_ns, spans)].tolist()
+
+
+def test_recordings_are_the_same_that_share_half_of_their_velocities_at_the_same_stamps(tmp_path):
+    samples = run(20.0)
+    later = [each._replace(stamp_ns=each.stamp_ns + 10**12) for each in samples]
+    other = [each._replace(velocity=(1.0, 2.0, 0.5)) if hasattr(each, "velocity") else each for each in samples]
+    bags = {"whole": samples, "part": samples[len(samples) // 3 :], "later": later, "other": other, "none": []}
+    bags["mostly later"] = sorted([*samples[: len(samples) // 4], *later], key=lambda each: each.stamp_ns)
+    recorded = {}
+    for name, content in bags.items():
+        recording = open_recording([write_bag(tmp_path / name, content)])
+        if "dvl/twist" in recording.types:
+            recorded[name] = recording.recorded("dvl/twist", Parameters())
+    whole = recorded["whole"]
+    same = {name for name, each in recorded.items() if hold_the_same(whole, each)}
+    assert same == {name for name, each in recorded.items() if hold_the_same(each, whole)} == {"whole", "part"}
