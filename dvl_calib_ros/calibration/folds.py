@@ -25,6 +25,54 @@ def folds_of(stamps_ns: Stamps, parameters: Parameters) -> NDArray[np.int64]:
     return stamps_ns // round(parameters.verification_block * 1e9) % FOLDS
 
 
+class FoldSums:
+    """Sums over samples, of each fold by itself: arrays of some shapes, as Λ (K, n, n) and Λx (K, n)."""
+
+    def __init__(self, *shapes: tuple[int, ...]) -> None:
+        self._each = [np.zeros((FOLDS, *shape)) for shape in shapes]
+        self._total: tuple[Array, ...] | None = None
+
+    def add(self, fold: int | slice, *more: Array | float) -> None:
+        """Add to one fold, or to several (F, ...)."""
+        self._total = None
+        for sums, own in zip(self._each, more, strict=True):
+            sums[fold] += own
+
+    def of(self, fold: int) -> tuple[Array, ...]:
+        """Those of one fold; not to be written to."""
+        return tuple(sums[fold] for sums in self._each)
+
+    @property
+    def total(self) -> tuple[Array, ...]:
+        """Over all folds; not to be written to."""
+        if self._total is None:
+            self._total = tuple(sums.sum(axis=0) for sums in self._each)
+        return self._total
+
+    def without(self, fold: int) -> tuple[Array, ...]:
+        """Over all folds but one."""
+        others = np.arange(FOLDS) != fold
+        return tuple(sums[others].sum(axis=0) for sums in self._each)
+
+    def taken(self, number: int) -> Array:
+        """Give the caller one kind of sums (FOLDS, ...), who has them from now on: here they are none."""
+        self._total = None
+        sums = self._each[number]
+        self._each[number] = np.zeros_like(sums)
+        return sums
+
+    def chosen(self, number: int, source: NDArray[np.intp]) -> None:
+        """Let each of K have one kind of sums (FOLDS, K, ...) from others. source: (K,) from which of the K."""
+        self._total = None
+        self._each[number] = self._each[number][:, source].copy()
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._total = None
+        for sums in self._each:
+            sums[:] = 0.0
+
+
 class FoldInformation:
     """What each fold told K models: its part of Λ (FOLDS, K, n, n) and of Λx (FOLDS, K, n)."""
 
@@ -34,8 +82,7 @@ class FoldInformation:
         # of each fold, what those without it started from
         self._prior = np.broadcast_to(np.linalg.inv(start.p), (FOLDS, k, n, n)).copy()
         self._prior_state = (self._prior @ start.x[:, :, None])[..., 0]
-        self._information = np.zeros((FOLDS, k, n, n))
-        self._information_state = np.zeros((FOLDS, k, n))
+        self._told = FoldSums((k, n, n), (k, n))
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples, as far as models used them (K, N)."""
@@ -48,20 +95,17 @@ class FoldInformation:
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
             told = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
-            self._information[fold] += told[:, :-1, :-1]
-            self._information_state[fold] += told[:, :-1, -1]
+            self._told.add(fold, told[:, :-1, :-1], told[:, :-1, -1])
 
     def add_told(self, told: Array) -> None:
         """Add what rows (H, z) of each fold told (FOLDS, K, n+1, n+1)."""
-        self._information += told[..., :-1, :-1]
-        self._information_state += told[..., :-1, -1]
+        self._told.add(slice(None), told[..., :-1, :-1], told[..., :-1, -1])
 
     def without(self, fold: int, index: int) -> GaussianState:
         """The filter's x (n,) and P (n, n) of one model, had it not seen a fold."""
-        others = np.arange(FOLDS) != fold
-        p = np.linalg.inv(self._prior[fold, index] + self._information[others, index].sum(axis=0))
-        state = self._prior_state[fold, index] + self._information_state[others, index].sum(axis=0)
-        return GaussianState(p @ state, p)
+        information, vector = (sums[index] for sums in self._told.without(fold))
+        p = np.linalg.inv(self._prior[fold, index] + information)
+        return GaussianState(p @ (self._prior_state[fold, index] + vector), p)
 
     def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
         """Go on from what is known, but of the states of the day (u,) from `start`, x (K, n), P (K, n, n)."""
@@ -73,8 +117,7 @@ class FoldInformation:
                 prior[fold, index] = np.linalg.inv(p)
                 prior_state[fold, index] = prior[fold, index] @ x
         self._prior, self._prior_state = prior, prior_state
-        self._information[:] = 0.0
-        self._information_state[:] = 0.0
+        self._told.clear()
 
 
 def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np.intp]) -> GaussianState:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .folds import FOLDS, folds_of
+from .folds import FoldSums, folds_of
 from .frames import Array, product
 from .kalman import GaussianState
 from .parameters import Parameters
@@ -54,6 +54,10 @@ class HeaveSums(NamedTuple):
         return HeaveSums(*(np.stack(each) for each in zip(*sums, strict=True)))
 
 
+# Places of two of them.
+_TOLD, _SCATTER = 0, 1
+
+
 class HeaveRows:
     """Takes samples in order of their stamps, for K hypotheses or models with n states, and makes rows of them.
 
@@ -64,9 +68,8 @@ class HeaveRows:
     def __init__(self, k: int, n: int, parameters: Parameters) -> None:
         self._parameters = parameters
         size = k, n + 1, n + 1
-        self._folds = HeaveSums(np.zeros((FOLDS, *size)), np.zeros((FOLDS, *size)), np.zeros((FOLDS, 1)))
+        self._folds = FoldSums(size, size, (1,))  # of `HeaveSums`
         self._sum = np.zeros((k, n + 1))
-        self._total = HeaveSums(*(np.zeros_like(kept[0]) for kept in self._folds))  # over folds
         self._sums: dict[int | None, HeaveSums] = {}  # as asked for since the last change
         self._start()
         self._last_ns: int | None = None
@@ -128,9 +131,7 @@ class HeaveRows:
         """End the block: what comes is another one's."""
         fold, row = self._open()
         if row is not None:
-            for kept, total, more in zip(self._folds, self._total, row, strict=True):
-                kept[fold] += more
-                total += more
+            self._folds.add(fold, *row)
         self._start()
 
     def _open(self) -> tuple[int, HeaveSums | None]:
@@ -149,14 +150,10 @@ class HeaveRows:
         """The rows so far, the one of the block that is not ended among them; without a fold, if one is named."""
         if without not in self._sums:
             fold, row = self._open()
-            ended = self._total
-            if without is not None:
-                others = np.arange(FOLDS) != without
-                ended = HeaveSums(*(kept[others].sum(axis=0) for kept in self._folds))
-            if row is None or fold == without:
-                self._sums[without] = HeaveSums(*(each.copy() for each in ended))
-            else:
-                self._sums[without] = HeaveSums(*(each + more for each, more in zip(ended, row, strict=True)))
+            ended = self._folds.total if without is None else self._folds.without(without)
+            if row is not None and fold != without:
+                ended = tuple(each + more for each, more in zip(ended, row, strict=True))
+            self._sums[without] = HeaveSums(*ended)
         return self._sums[without]
 
     def absorb(self) -> tuple[HeaveSums, Array]:
@@ -165,16 +162,12 @@ class HeaveRows:
         Returns the rows, and what they tell by folds (FOLDS, K, n+1, n+1).
         """
         self._sums.clear()
-        sums, told = HeaveSums(*(each.copy() for each in self._total)), self._folds.told
-        self._folds = self._folds._replace(told=np.zeros_like(told))
-        self._total = self._total._replace(told=np.zeros_like(sums.told))
-        return sums, told
+        return HeaveSums(*self._folds.total), self._folds.taken(_TOLD)
 
     def learn_from(self, source: Index) -> None:
         """Take what rows so far scatter by from others. source: (K,) from which of the K each takes it."""
         self._sums.clear()
-        self._folds = self._folds._replace(scatter=self._folds.scatter[:, source].copy())
-        self._total = self._total._replace(scatter=self._total.scatter[source].copy())
+        self._folds.chosen(_SCATTER, source)
 
 
 def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tuple[GaussianState, Array]:

@@ -18,6 +18,11 @@ def median(values: Array) -> Array:
     return np.asarray(0.5 * (ordered[(len(values) - 1) // 2] + ordered[len(values) // 2]))
 
 
+def steps(values: Array) -> Array:
+    """(N - 1, ...) from each of (N, ...) to the next: `numpy.diff` without what it asks first, as of `median`."""
+    return np.asarray(values[1:] - values[:-1])
+
+
 def robust_std(values: Array) -> Array:
     """(...) standard deviation of normal values (N, ...), by the median distance from the median; nan of none."""
     if not len(values):

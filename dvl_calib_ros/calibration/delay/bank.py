@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..correction_parameters import PriorOnErrors, to_correction
-from ..folds import FOLDS, folds_of, with_states_of
+from ..folds import FOLDS, FoldSums, folds_of, with_states_of
 from ..frames import Array
 from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState, distance_squared
@@ -144,10 +144,8 @@ class DelayBank:
         self.used = self.gated = 0
         self._nis_sum = 0.0
         self.blocks = TimeBlocks()
-        self._folds: tuple[Array, Array] | None = None
-        if verified:
-            k = len(DELAYS_S)
-            self._folds = np.zeros((FOLDS, k, N_STATE, N_STATE)), np.zeros((FOLDS, k, N_STATE))
+        k = len(DELAYS_S)
+        self._folds = FoldSums((k, N_STATE, N_STATE), (k, N_STATE)) if verified else None
 
     def _begin_day(self) -> None:
         """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
@@ -182,9 +180,9 @@ class DelayBank:
         self._begin_day()
         self._information, self._vector = begins[0]
         if self._folds is not None:
+            self._folds.clear()
             for fold, (information, vector) in enumerate(begins[1:]):
-                self._folds[0][fold] = self._information - information
-                self._folds[1][fold] = self._vector - vector
+                self._folds.add(fold, self._information - information, self._vector - vector)
         x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
         self._square = found.misfit[best] + np.einsum("ki,ki->k", self._vector, x)
         self._log_det = np.linalg.slogdet(self._information)[1]
@@ -196,11 +194,6 @@ class DelayBank:
         """Mean νᵀS⁻¹ν of the samples used, against the hypothesis that explained each best; nan if none."""
         return self._nis_sum / self.used if self.used else float("nan")
 
-    @property
-    def likeliest_delay(self) -> float:
-        """Of the hypotheses, s."""
-        return float(DELAYS_S[int(np.argmax(self._shares()[1]))])
-
     def add(self, rows: DelayedRows, stamps_ns: Stamps, seconds: float) -> Mask:
         """Take the rows of a block of time; which (J,) of them it used. stamps_ns: (J,) of each row. seconds: of it."""
         if self._process_rate is not None:
@@ -210,15 +203,13 @@ class DelayBank:
             return np.zeros(0, dtype=bool)
         use = self._gated(rows)
         folds = folds_of(stamps_ns, self._parameters)
-        total, total_vector = np.zeros_like(self._information), np.zeros_like(self._vector)
-        square, by_fold = np.zeros_like(self._square), []
         # by folds also where nobody verifies: sums in one order are the same to the last bit
-        for fold in sorted(set(folds[use].tolist())):
-            told = _told(rows, use & (folds == fold))
-            by_fold.append((fold, told))
-            total += told[0]
-            total_vector += told[1]
-            square += told[2]
+        by_fold = [(fold, _told(rows, use & (folds == fold))) for fold in sorted(set(folds[use].tolist()))]
+        if not by_fold:
+            by_fold = [(0, _told(rows, use))]
+        (total, total_vector, square), *others = (told for _, told in by_fold)
+        for information, vector, one in others:
+            total, total_vector, square = total + information, total_vector + vector, square + one
         if not (np.isfinite(total).all() and np.isfinite(total_vector).all() and np.isfinite(square).all()):
             return np.zeros(len(rows), dtype=bool)  # it goes on as before these rows
         self._solved = None
@@ -231,8 +222,7 @@ class DelayBank:
         self._learn_heave()
         if self._folds is not None:
             for fold, (information, vector, _) in by_fold:
-                self._folds[0][fold] += information
-                self._folds[1][fold] += vector
+                self._folds.add(fold, information, vector)
         return use
 
     def misfits(self, rows: DelayedRows) -> tuple[Array, Array]:
@@ -267,8 +257,9 @@ class DelayBank:
         sums, by_fold = self._heave.absorb()
         told = sums.told / self._heave_variance
         if self._folds is not None:
-            self._folds[0][:] += by_fold[..., :N_STATE, :N_STATE] / self._heave_variance
-            self._folds[1][:] += by_fold[..., :N_STATE, N_STATE] / self._heave_variance
+            of_all = slice(None)
+            weighed = by_fold / self._heave_variance
+            self._folds.add(of_all, weighed[..., :N_STATE, :N_STATE], weighed[..., :N_STATE, N_STATE])
         self._information += told[:, :N_STATE, :N_STATE]
         self._vector += told[:, :N_STATE, N_STATE]
         self._square += told[:, N_STATE, N_STATE]
@@ -311,7 +302,8 @@ class DelayBank:
         information, vector = self._information, self._vector
         if without is not None:
             assert self._folds is not None
-            information, vector = information - self._folds[0][without], vector - self._folds[1][without]
+            told, told_vector = self._folds.of(without)
+            information, vector = information - told, vector - told_vector
         heave = self._heave.sums(without).told / self._heave_variance
         information, vector = information + heave[:, :N_STATE, :N_STATE], vector + heave[:, :N_STATE, N_STATE]
         log_det = np.linalg.slogdet(information)[1] - self._log_det

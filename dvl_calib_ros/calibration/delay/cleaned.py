@@ -11,7 +11,7 @@ import numpy as np
 
 from ..frames import ENU_FROM_NED, Array
 from ..parameters import Parameters
-from ..robust import median
+from ..robust import median, steps
 from ..samples import FRAME_CODES, Index, Mask, Stamps, VelocityFrame
 from ..spikes import without_spikes
 from .blocks import Block, ImuSamples, ReferenceSamples
@@ -131,8 +131,10 @@ def _reference(
     own: places of them in the block. raw: themselves.
     """
     around = block.reference
-    measured = (around.unmeasured[:, None] & _BITS) == 0
-    good = _good(around.stamps_ns, np.where(measured, around.values[:, :3], 0.0))[own]
+    velocity = around.values[:, :3]
+    if around.unmeasured.any():
+        velocity = np.where((around.unmeasured[:, None] & _BITS) == 0, velocity, 0.0)
+    good = _good(around.stamps_ns, velocity)[own]
     stamps_ns, values, frames, unmeasured = raw if good.all() else raw.part(np.flatnonzero(good))
     noise = values[:, 3:12].reshape(-1, 3, 3)
     given = ~np.isnan(noise[:, 0, 0]) & p.use_message_covariance
@@ -159,7 +161,10 @@ def _own(block: Block) -> Index:
 
 def is_slow(times: Array) -> bool:
     """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
-    return len(times) > 1 and float(median(np.diff(times))) > SLOW_S
+    if len(times) < 2:
+        return False
+    apart = steps(times)
+    return float(apart.max()) > SLOW_S and float(median(apart)) > SLOW_S
 
 
 def _good(stamps_ns: Stamps, velocity: Array) -> Mask:

@@ -11,6 +11,7 @@ from ..error_model import CORRECTION_JACOBIAN, correction_matrix
 from ..folds import folds_of
 from ..frames import Array, cross, skew
 from ..parameters import Parameters
+from ..robust import steps
 from ..samples import Index, Mask, Stamps
 from ..verification import HeldOutError, held_out_from_sums
 from .bank import DelayBank
@@ -198,17 +199,21 @@ def thinned(stamps_ns: Stamps) -> Index:
 
 
 def _thinned_seconds(times: Array) -> Index:
-    if len(times) < 2 or np.diff(times).min() >= KEPT_EVERY_S:
+    if len(times) < 2 or steps(times).min() >= KEPT_EVERY_S:
         return np.arange(len(times))
     bins = np.floor(times / KEPT_EVERY_S)
-    return np.flatnonzero(np.diff(bins, prepend=bins[0] - 1.0))
+    return np.append(0, np.flatnonzero(steps(bins)) + 1)
 
 
 def _mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
     """Means (M, c) of the finite values (N, c) within reach (s) of each time (M,) s; nan where there is none."""
-    first, end = np.searchsorted(times, at - reach), np.searchsorted(times, at + reach, side="right")
-    finite = np.isfinite(values)
-    sums = np.pad(np.cumsum(np.where(finite, values, 0.0), axis=0), ((1, 0), (0, 0)))
-    counts = np.pad(np.cumsum(finite, axis=0), ((1, 0), (0, 0)))
-    number = counts[end] - counts[first]
+    first, end = times.searchsorted(at - reach), times.searchsorted(at + reach, side="right")
+    sums, finite = np.zeros((len(times) + 1, values.shape[1])), np.isfinite(values)
+    if finite.all():
+        np.cumsum(values, axis=0, out=sums[1:])
+        number = (end - first)[:, None]
+    else:
+        np.cumsum(np.where(finite, values, 0.0), axis=0, out=sums[1:])
+        counts = np.pad(np.cumsum(finite, axis=0), ((1, 0), (0, 0)))
+        number = counts[end] - counts[first]
     return np.where(number > 0, (sums[end] - sums[first]) / np.maximum(number, 1), np.nan)

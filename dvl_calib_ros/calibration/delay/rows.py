@@ -17,7 +17,7 @@ import numpy as np
 from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
 from ..kalman import whitening
 from ..models.own import g1_errors, g1_heave_errors
-from ..robust import median
+from ..robust import median, steps
 from ..samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
 from .model import G2
@@ -362,11 +362,11 @@ def _moving(motion: Motion, white: Array, body_from_dvl: Array) -> Array:
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     """Means of times (N,) s and columns (N, ...) over bins of BIN_S, of those bins that hold any;
     as they are if they come no faster than FASTER_THAN_S."""
-    if len(times) < 2 or median(np.diff(times)) >= FASTER_THAN_S:
+    if len(times) < 2 or median(steps(times)) >= FASTER_THAN_S:
         return times, *columns
-    bins = np.floor(times / BIN_S).astype(np.int64)
-    starts = np.flatnonzero(np.diff(bins, prepend=bins[:1] - 1))
-    count = np.diff(np.append(starts, len(times)))
+    bins = np.floor(times / BIN_S)
+    starts = np.append(0, np.flatnonzero(steps(bins)) + 1)
+    count = steps(np.append(starts, len(times)))
     return tuple(
         np.add.reduceat(column, starts, axis=0) / count.reshape(-1, *[1] * (column.ndim - 1))
         for column in (times, *columns)
@@ -418,10 +418,10 @@ def _noise_of(times: Array, values: Array) -> Array:
 
     A vehicle that rolls in waves has second differences of its own if it is looked at once a second.
     """
-    if len(times) < 8 or median(np.diff(times)) > NOISE_FROM_S:
+    if len(times) < 8 or median(steps(times)) > NOISE_FROM_S:
         return np.zeros(values.shape[1])
-    bent: Array = median(np.diff(values, 2, axis=0) ** 2) / (6.0 * 0.455)  # 0.455: median of chi-square
-    return bent
+    bent = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    return median(bent**2) / (6.0 * 0.455)  # 0.455: median of chi-square
 
 
 class InBody(NamedTuple):
