@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from runs import START_NS, calibrate, feed, shifted
+from runs import START_NS, calibrate, feed, feed_columns, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.correction import lever_arm
@@ -209,6 +209,38 @@ def test_how_samples_are_gathered_changes_nothing(block_size):
     np.testing.assert_allclose(a.state, b.state, rtol=0, atol=1e-12)
     np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)
     assert [s.model for s in one.result().segments] == [s.model for s in other.result().segments]
+
+
+def spoilt(samples, seed):
+    """The same with gaps in every stream, of up to 9 s, and spikes in those of velocities."""
+    rng = np.random.default_rng(seed)
+    end_ns = samples[-1].stamp_ns
+    gaps = {
+        kind: [(begin, begin + rng.uniform(0.3, longest) * 1e9) for begin in rng.uniform(START_NS, end_ns, 6)]
+        for kind, longest in ((DvlSample, 9.0), (ReferenceSample, 9.0), (ImuSample, 2.0))
+    }
+    for sample in samples:
+        if any(begin < sample.stamp_ns < end for begin, end in gaps[type(sample)]):
+            continue
+        if not isinstance(sample, ImuSample) and rng.random() < 0.01:
+            sample = sample._replace(velocity=tuple(np.add(sample.velocity, rng.normal(0.0, 3.0, 3)).tolist()))
+        yield sample
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_blocks_that_are_gathered_see_no_more_than_each_by_itself(seed):
+    """Neighbours hold margins of each other: a sample that is a spike in one is none in another."""
+    samples = list(spoilt(late(-1.4, duration=240.0), seed))
+    alone = calibrate(samples, NOISE, block_size=1, verified=True)
+    together = feed_columns(Calibrator(NOISE, block_size=2048, verified=True), samples)
+    a, b = alone.result(), together.result()
+    assert a.segments == b.segments and a.suggestion == b.suggestion
+    one, other = a.estimates["G2"], b.estimates["G2"]
+    assert (one.used, one.gated) == (other.used, other.gated) and one.gated
+    np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
+    held_out, beside = (each.verifications["G2"].held_out for each in (a, b))
+    assert held_out.samples == beside.samples and held_out.corrected == pytest.approx(beside.corrected, rel=1e-9)
 
 
 class Lazy:
