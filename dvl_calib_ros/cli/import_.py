@@ -3,7 +3,8 @@
 A file holds rows of time and three values; a folder holds recordings NAME_dvl.csv, each with NAME_gnss.csv and
 NAME_attitude.csv where there are such, and becomes one bag per recording. Units are SI and radians; velocities are
 forward-right-down (frd) unless said otherwise and become ROS's forward-left-up; attitude is roll, pitch, yaw of the
-forward-right-down body in north-east-down.
+forward-right-down body in north-east-down. Files whose header names speed and course (over ground, from true north), or
+heading (of a compass, with pitch and roll or without), are read by their columns; units are in the names (_deg, knots).
 
 A log of Water Linked's JSON reports or of RDI's PD0 ensembles is known by its content. It has its own times: give
 --start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.

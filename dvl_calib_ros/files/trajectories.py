@@ -12,6 +12,7 @@ import math
 import os
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -76,8 +77,8 @@ def _read_npy(path: Path) -> Array:
         raise InputError(f"{path}: not a NumPy array file of numbers ({error})") from error
 
 
-def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
-    """Rows of numbers, NaN where there is none, and what is said of the file."""
+def cells(path: Path) -> tuple[list[list[str]], list[str]]:
+    """Rows of a CSV file that are not empty, and what is said of the file. Raises InputError."""
     try:
         text = path.read_text(encoding="utf-8-sig").rstrip("\0")  # what a power cut leaves may end in zeros
         rows = [row for row in csv.reader(io.StringIO(text)) if row]
@@ -86,18 +87,30 @@ def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
     left_out = []
     if len(rows) > 1 and not text.endswith("\n"):
         left_out.append(f"{path}: its last line is not finished, and left out: {','.join(rows.pop())[:SHOWN]}")
+    return rows, left_out
+
+
+def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
+    """Rows of numbers, NaN where there is none, and what is said of the file."""
+    rows, left_out = cells(path)
     if rows and not _is_number(rows[0][0]):
         _check_header(path, rows.pop(0), unit)
+    return numbers_of(path, rows, range(N_COLUMNS), N_COLUMNS), left_out
+
+
+def numbers_of(path: Path, rows: Sequence[Sequence[str]], at: Sequence[int], n_columns: int) -> Array:
+    """Columns `at` of rows (N, k), nan where there is no value. Raises InputError naming file and row."""
     values = []
     for number, row in enumerate(rows, start=1):
-        if len(row) != N_COLUMNS:
-            raise InputError(f"{path}: data row {number} has {len(row)} columns, expected {EXPECTED}")
+        if len(row) != n_columns:
+            expected = EXPECTED if n_columns == N_COLUMNS else f"{n_columns}, as the header has"
+            raise InputError(f"{path}: data row {number} has {len(row)} columns, expected {expected}")
         try:
-            values.append([math.nan if cell.strip().lower() in NO_VALUE else _number(cell) for cell in row])
+            values.append([math.nan if row[i].strip().lower() in NO_VALUE else _number(row[i]) for i in at])
         except ValueError:
             shown = ",".join(row)[:SHOWN]
             raise InputError(f"{path}: data row {number} is not all numbers: {shown}; expected {EXPECTED}") from None
-    return np.array(values, dtype=float).reshape(-1, N_COLUMNS), left_out
+    return np.array(values, dtype=float).reshape(-1, len(at))
 
 
 def _number(text: str) -> float:
@@ -122,7 +135,7 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
     for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
         if found and found.group(1).strip().lower() != expected:
             raise InputError(f"{path}: column {cell[:SHOWN]!r} is not in {expected}; convert it first")
-    if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp"):
+    if "time" not in header[0].lower() and header[0].strip().lower() not in ("t", "s", "stamp", "t_s"):
         raise InputError(f"{path}: the first column is {header[0][:SHOWN]!r}, expected time")
     for position, cell in enumerate(header[1:]):
         words = set(re.findall("[a-z]+", re.sub(r"[\[(].*", "", cell.lower())))
@@ -249,8 +262,16 @@ def import_recording(
         dvl_samples, left_out = read_dvl_log(dvl)
     else:
         dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes)
-    references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std, notes) if gnss else []
-    attitudes = read_attitude(attitude, start_ns, notes) if attitude else []
+    from .course_and_heading import names_columns, read_course, read_heading  # which read by this module's functions
+
+    if gnss is not None and names_columns(gnss, "speed", "course"):
+        references = read_course(gnss, start_ns, options.gnss_std, notes)
+    else:
+        references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std, notes) if gnss else []
+    if attitude is not None and names_columns(attitude, "heading"):
+        attitudes = read_heading(attitude, start_ns, notes)
+    else:
+        attitudes = read_attitude(attitude, start_ns, notes) if attitude else []
     with BagWriter(output, options.storage, options.compression) as bag:
         SampleWriter(bag).recording(attitudes, references, dvl_samples)
     written = {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}

@@ -1,0 +1,91 @@
+"""Course and speed over ground, and headings of a compass: horizontal recordings, by the names of their columns.
+
+A receiver's course and speed have no vertical: it is written as exactly 0, which marks an axis as not measured. Units
+stand in a column's name (`_deg`, `[rad]`, `_mps`, `knots`); without one they are SI and radians.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..calibration.frames import Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
+from ..calibration.samples import ImuSample, ReferenceSample, VelocityFrame
+from ..errors import InputError
+from .trajectories import angular_velocities, cells, numbers_of, stamps_ns
+
+KNOT = 1852.0 / 3600.0
+# Units that a column's name may hold, with what takes them to SI
+_UNITS = {"deg": math.pi / 180.0, "rad": 1.0, "mps": 1.0, "m/s": 1.0, "knots": KNOT, "kn": KNOT, "km/h": 1.0 / 3.6}
+
+
+def names_columns(path: Path, *wanted: str) -> bool:
+    """Whether a file is a CSV with a header that names columns of all these words."""
+    if not path.is_file() or path.suffix == ".npy":
+        return False
+    header = _header(path)
+    return all(any(word in _words(cell) for cell in header) for word in wanted)
+
+
+def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list[ReferenceSample]:
+    """Speed m/s and course (from true north, clockwise) as velocities in ENU without a vertical. Raises InputError."""
+    time, values = _named(path, ("speed", "course"), notes)
+    speed, course = values.T
+    east, north = speed * np.sin(course), speed * np.cos(course)
+    covariance = np.eye(3) * std**2 if std else None
+    return [
+        ReferenceSample(at, (x, y, 0.0), covariance, VelocityFrame.ENU)
+        for at, x, y in zip(stamps_ns(path, time, start_ns), east.tolist(), north.tolist(), strict=True)
+    ]
+
+
+def read_heading(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
+    """Headings (from true north, clockwise), with pitch and roll of a forward-right-down body where there are such."""
+    header = _header(path)
+    tilt = [name for name in ("pitch", "roll") if any(name in _words(cell) for cell in header)]
+    time, values = _named(path, ("heading", *tilt), notes)
+    rpy = np.zeros((len(time), 3))
+    rpy[:, 2] = values[:, 0]
+    for place, name in enumerate(tilt, start=1):
+        rpy[:, ("roll", "pitch").index(name)] = values[:, place]
+    rotations = attitude_enu_flu_from_ned_frd(rpy)
+    rates = angular_velocities(time, rotations)
+    return [
+        ImuSample(at, quaternion_from_rotation(rotation), (x, y, z))
+        for at, rotation, (x, y, z) in zip(stamps_ns(path, time, start_ns), rotations, rates.tolist(), strict=True)
+    ]
+
+
+def _header(path: Path) -> list[str]:
+    rows, _ = cells(path)
+    return rows[0] if rows else []
+
+
+def _words(cell: str) -> set[str]:
+    return set(re.findall(r"[a-z]+", cell.lower()))
+
+
+def _named(path: Path, names: Sequence[str], notes: list[str]) -> tuple[Array, Array]:
+    """Time (N,) s and columns (N, k) in SI, those with a finite number everywhere."""
+    (header, *rows), left_out = cells(path)
+    notes += left_out
+    at = [next(i for i, cell in enumerate(header) if name in _words(cell)) for name in names]
+    table = numbers_of(path, rows, [0, *at], len(header))
+    good = np.isfinite(table).all(axis=1)
+    if not good.any():
+        raise InputError(f"{path}: no row with a number in every column")
+    if not good.all():
+        notes.append(f"{path}: {int((~good).sum())} of {len(table)} rows hold no finite number somewhere, left out")
+    table = table[good]
+    if (np.diff(table[:, 0]) <= 0.0).any():
+        raise InputError(f"{path}: time does not increase at row {int(np.argmax(np.diff(table[:, 0]) <= 0.0)) + 2}")
+    return table[:, 0], table[:, 1:] * [_factor(header[i]) for i in at]
+
+
+def _factor(cell: str) -> float:
+    text = cell.lower()
+    return next((factor for unit, factor in _UNITS.items() if unit in text), 1.0)
