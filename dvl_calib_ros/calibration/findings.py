@@ -368,6 +368,14 @@ _KINDS = (
         Severity.ERROR,
     ),
     FindingKind(
+        "HEADING_DEVIATION",
+        "the heading is off by an amount that changes {course}: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at "
+        "{most_at:.0f}° and {least:+.1f}° at {least_at:.0f}°; {cost:.0f} m per km",
+        "A compass deviates with the heading, a gyro drifts; no mounting does either. The DVL's yaw is found against "
+        "the IMU's heading, so it holds the mean of that error over the headings driven.",
+        "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
+    ),
+    FindingKind(
         "LEVER_ARM_CONTRADICTED",
         "the data show another lever arm than the one that was given: {axes}",
         "The place that was given is wrong, or something else is that looks like it: heading, turn rates or clock of "

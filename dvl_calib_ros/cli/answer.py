@@ -39,6 +39,7 @@ def print_answer(out: Console, replayed: Replayed) -> None:
     """One paragraph, one table, the mounting in the form to paste."""
     from rich.markup import escape
 
+    from ..calibration.samples import VelocityFrame
     from ..calibration.verification import Word
 
     result = replayed.result
@@ -56,6 +57,10 @@ def print_answer(out: Console, replayed: Replayed) -> None:
     rejected = verification.verdict is Word.REJECT
     out.print(f"[dim]Not to be used: {escape(_headline(replayed))}[/]" if rejected else escape(_headline(replayed)))
     out.print(_table(replayed), style="dim" if rejected else None)
+    if replayed.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
+        out.print(
+            "Yaw is against the IMU's heading: a constant error of the heading is in it, and harmless with that IMU."
+        )
     _print_navigation(out, replayed)
     for sentence in _not_shown(replayed):
         out.print(escape(sentence), soft_wrap=False)

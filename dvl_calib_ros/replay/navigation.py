@@ -22,6 +22,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.robust import median
 from ..calibration.samples import Index
 from ..calibration.verification import Word
+from .heading_deviation import HeadingDeviation, heading_deviation
 
 # Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
@@ -78,6 +79,8 @@ class Navigation:
         (P,) time, and m along the track, of the points kept.
     reference, track_before, track_after
         (P, 2) m from the start.
+    deviation
+        By what the heading is off as it changes; None where that does not show.
     """
 
     distance_m: float
@@ -93,6 +96,7 @@ class Navigation:
     reference: Array
     track_before: Array
     track_after: Array
+    deviation: HeadingDeviation | None = None
 
 
 def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) -> Navigation | None:
@@ -123,7 +127,7 @@ def dead_reckoned(
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
     n = len(recording.dvl.times)
-    before, after = (_Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool)) for _ in range(2))
+    before, after = (_Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n)) for _ in range(2))
     before.fill(recording, np.arange(n), NO_TERMS, parameters)
     for k, each in enumerate(terms):
         after.fill(recording, np.flatnonzero(folds == k), each, parameters)
@@ -155,16 +159,22 @@ def dead_reckoned(
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
+        deviation=heading_deviation(
+            recording.dvl.times[use], after.yaw[use], after.velocity[use, :2], after.error[use, :2]
+        )
+        if on_a_map
+        else None,
     )
 
 
 class _Level(NamedTuple):
     """Of N samples (N, 4) m/s ahead and to port, and east and north where that is known: reference velocity, and error
-    of the DVL's; and whether that is known (N,)."""
+    of the DVL's; whether that is known (N,), and yaw (N,) rad."""
 
     velocity: Array
     error: Array
     oriented: NDArray[np.bool_]
+    yaw: Array
 
     def fill(self, recording: Recording, at: Index, terms: Terms, parameters: Parameters) -> None:
         """Write those of some samples, corrected by these terms."""
@@ -173,6 +183,8 @@ class _Level(NamedTuple):
             some = at[start : start + COMPARED_AT_ONCE]
             seen = recording.compared(some, terms, parameters)
             self.oriented[some] = seen.oriented
+            rotation = seen.rotation_enu_from_body
+            self.yaw[some] = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
             for level, body in ((self.velocity, seen.body), (self.error, seen.error)):
                 level[some, :2] = body[:, :2]
                 level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]

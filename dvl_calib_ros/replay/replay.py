@@ -37,6 +37,7 @@ from ..recordings.check import check_topics
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from .clocks import StreamClocks
+from .heading_deviation import FIRST, heading_advice
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 
@@ -135,8 +136,13 @@ def replay(
     found += told
     history = recorder.history(calibrator) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
+    if navigation is not None:
+        deviates = heading_advice(navigation.deviation)
+        found += deviates
     of_drift, of_clocks = objections(navigation), clocks.objections(parameters)
     of_clocks += [(Word.MARGINAL, each.says) for each in told]
+    if navigation is not None and navigation.deviation is not None and navigation.deviation.rms > FIRST:
+        of_clocks += [(Word.MARGINAL, each.says) for each in deviates]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_clocks += [] if result.counts["pairing"]["paired"] else [(Word.REJECT, NOTHING_COMPARED)]
     return Replayed(

@@ -18,6 +18,7 @@ from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
 from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate, Result
+from ..calibration.samples import VelocityFrame
 from ..calibration.verification import HeldOutError, Verification, Word
 from ..files.result_file import result_document
 from ..replay.recorder import ModelHistory, RunHistory
@@ -27,6 +28,8 @@ from .navigation_figures import navigation_section
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture
 from .time_axis import TimeAxis, fitting_unit
+
+EARTH = (VelocityFrame.ENU, VelocityFrame.NED)
 
 
 class Term(NamedTuple):
@@ -146,6 +149,7 @@ def _facts(replayed: Replayed, mounting: Mapping[str, Any], bags: Sequence[Path]
         ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
         ("Corrected mounting", _rpy(mounting["corrected_rpy"])),
         ("Nominal mounting", _rpy(mounting["nominal_rpy"])),
+        *([("Yaw", "against the IMU's heading")] if replayed.reference_frame in EARTH else []),
         *_place_and_clock(result),
         ("Recorded", _when(result)),
         ("DVL data", replayed.dvl_data),
