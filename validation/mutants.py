@@ -38,8 +38,8 @@ MUTANTS = (
     Mutant(
         "sign of H",
         "dvl_calib_ros/calibration/models/own.py",
-        "h[:, 3:5] = -body_from_dvl",
-        "h[:, 3:5] = body_from_dvl",
+        "h[:, 3:] = -body_from_dvl",
+        "h[:, 3:] = body_from_dvl",
         (UNIT + "calibration/test_models.py::test_h_is_the_derivative_of_the_nonlinear_error_model",),
     ),
     Mutant(

@@ -205,9 +205,8 @@ class DelayBank:
         folds = folds_of(stamps_ns, self._parameters)
         # by folds also where nobody verifies: sums in one order are the same to the last bit
         by_fold = [(fold, _told(rows, use & (folds == fold))) for fold in sorted(set(folds[use].tolist()))]
-        if not by_fold:
-            by_fold = [(0, _told(rows, use))]
-        (total, total_vector, square), *others = (told for _, told in by_fold)
+        nothing = np.zeros_like(self._information), np.zeros_like(self._vector), np.zeros_like(self._square)
+        (total, total_vector, square), *others = (told for _, told in by_fold) if by_fold else (nothing,)
         for information, vector, one in others:
             total, total_vector, square = total + information, total_vector + vector, square + one
         if not (np.isfinite(total).all() and np.isfinite(total_vector).all() and np.isfinite(square).all()):
