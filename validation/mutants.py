@@ -58,9 +58,9 @@ MUTANTS = (
     ),
     Mutant(
         "pairing by stamps",
-        "dvl_calib_ros/calibration/alignment.py",
-        "values = track.values[before] + (values - track.values[before]) * fraction",
-        "values = track.values[before] + (values - track.values[before]) * (1.0 - fraction)",
+        "dvl_calib_ros/calibration/partners.py",
+        "earlier + (later - earlier) * fraction[:, None]",
+        "earlier + (later - earlier) * (1.0 - fraction[:, None])",
         (UNIT + "calibration/test_alignment.py",),
     ),
     Mutant(

@@ -144,6 +144,27 @@ def check_same(one: Calibrator, one_rows: Kept, other: Calibrator, other_rows: K
         np.testing.assert_allclose(a.covariance, b.covariance, rtol=OF_SIGMA, atol=STATES_EQUAL, err_msg=name)
 
 
+def test_what_others_say_at_a_row_is_where_it_lies_between_their_samples():
+    at = START_NS + np.array([0, 1, 2, 3, 4]) * SECOND
+    rows_ns = START_NS + np.array([SECOND // 4, SECOND, 2 * SECOND + 3 * SECOND // 4])
+    reference = np.column_stack([1.0 + np.arange(5.0) ** 2, np.zeros(5), np.zeros(5)])
+    yaw = 0.1 * np.arange(5.0)
+    imu = np.column_stack([np.zeros(5), np.zeros(5), np.sin(yaw / 2), np.cos(yaw / 2), *[np.zeros(5)] * 2, 2.0 * yaw])
+    streams = Streams(
+        sample_block(Stream.DVL, rows_ns, np.array([[1.5, 0.1, 0.0]] * 3) + 0.01 * np.arange(3)[:, None]),
+        sample_block(Stream.REFERENCE, at, reference),
+        sample_block(Stream.IMU, at, imu),
+    ).arriving_by_stamp()
+    for size in (None, 1, 100):
+        rows = Kept()
+        parameters = Parameters(gnss_timeout=2.0, imu_timeout=2.0)
+        fed(Calibrator(parameters, on_rows=rows, block_size=1), streams, size).finish()
+        np.testing.assert_allclose(rows.column("reference")[:, 0], [1.25, 2.0, 5.0 + 0.75 * 5.0], rtol=1e-12)
+        attitude = rows.column("attitude")
+        np.testing.assert_allclose(2.0 * np.arctan2(attitude[:, 2], attitude[:, 3]), [0.025, 0.1, 0.275], rtol=1e-9)
+        np.testing.assert_allclose(attitude[:, 6], [0.05, 0.2, 0.55], rtol=1e-12)
+
+
 OPTIONS = (
     {},
     {"max_turn_rate": 0.1, "lever_arm": (1.0, -0.5, 0.3)},
