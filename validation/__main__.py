@@ -19,6 +19,7 @@ COMMANDS = {
     "mutants": "faults put into ten rules, each of which the tests must see",
     "size": "lines of code, modules, arrows between the rooms of the package",
     "stacks": "bags as real stacks record them, each with its truth, judged through the command line",
+    "surveys": "surveys drawn at random, by physics of their own: usable and wrong, right and rejected",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from validation import mutants, repeat
+from validation import mutants, repeat, surveys
 from validation.__main__ import COMMANDS, main
 from validation.stacks import mounting_errors
 
@@ -102,3 +102,26 @@ def test_the_judge_of_stacks_sees_an_angle_a_position_and_a_delay_that_are_wrong
     assert "position" in wrong
     errors = mounting_errors({**mounting, "position": None}, {"late": 0.0}, (0.0, 0.0, 2.5))
     assert [each.split()[0] for each in errors] == ["yaw", "late"]
+
+
+def test_a_survey_is_the_same_for_a_seed_and_its_judge_sees_what_is_wrong(tmp_path):
+    drawn = surveys.draw(7)
+    assert drawn == surveys.draw(7) != surveys.draw(8)
+    truth = surveys.write_survey(drawn, tmp_path / "bag")
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
+    right = {
+        **truth,
+        "seed": 7,
+        "verdict": "reject",
+        "reason": "",
+        "model": "G1",
+        "off_deg": [9.0, 0.6, 0.4],
+        "std_deg": [0.1] * 3,
+    }
+    yaw = {**right, "verdict": "accept", "off_deg": [0.0, 0.0, 0.6]}
+    pitch = {**right, "verdict": "marginal", "off_deg": [0.0, 0.8, 0.0]}
+    unsure = {**yaw, "std_deg": [0.1, 0.1, 0.3]}
+    assert [surveys.is_wrong(each) for each in (right, yaw, pitch, unsure)] == [False, True, True, False]
+    said = surveys.summary([right, yaw, pitch, unsure])
+    assert said[0].startswith("usable and wrong: 2 of 3") and said[1].startswith("rejected though right: 1 of 4")
+    assert surveys.share(0, 0) == "0 of 0" and "bounds 0.0 to 3.6" in surveys.share(0, 100)
