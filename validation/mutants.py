@@ -75,7 +75,7 @@ MUTANTS = (
         "dvl_calib_ros/disk/atomic.py",
         "        os.fsync(handle)\n        yield temporary\n",
         "        yield temporary\n",
-        (UNIT + "files/test_atomic.py",),
+        (UNIT + "disk/test_atomic.py",),
     ),
     Mutant(
         "unit",
