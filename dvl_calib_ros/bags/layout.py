@@ -63,10 +63,10 @@ class Layout:
 
     def shared(self, rows: Rows) -> Mask:
         """(N,) which rows are laid out so, with nothing but ASCII in their strings."""
-        shared: Mask = (rows[_KIND] == np.frombuffer(self.kind, np.uint8)).all(axis=1)
+        shared: Mask = rows[_KIND] == int.from_bytes(self.kind, "little")
         for path, length in self.lengths.items():
             shared &= (rows[_LENGTH + path] == length + 1) & (rows[_END + path] == 0)
-            if length:
+            if length and len(rows) and rows[path].max() >= 0x80:  # of all at once is a tenth of row by row
                 shared &= (rows[path] < 0x80).all(axis=1)
         return shared
 
@@ -137,7 +137,7 @@ class _Walk:
         self._store, self._data = store, data
         self._order = "<" if data[1] else ">"
         self.at = ENCAPSULATION
-        self.fields: dict[str, tuple[Any, int]] = {_KIND: (("u1", (2,)), 0)}
+        self.fields: dict[str, tuple[Any, int]] = {_KIND: ("<u2", 0)}
         self.lengths: dict[str, int] = {}
         self.flags: list[str] = []
 
