@@ -31,9 +31,8 @@ class Database:
             self._channels = _channels(connection)
             rows = _rows(
                 connection,
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp), coalesce(max(length(data)), 0) "
-                "FROM messages GROUP BY topic_id",
-                (int, int, int, int, int),
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id",
+                (int, int, int, int),
             )
         self.counts: dict[Channel, int] = dict.fromkeys(self._channels.values(), 0)
         self.astray = 0
@@ -43,20 +42,17 @@ class Database:
             else:
                 self.astray += count
         known = [row for row in rows if row[0] in self._channels]
-        self._longest = {number: longest for number, *_, longest in rows}
         self.span_ns = (min((row[2] for row in known), default=0), max((row[3] for row in known), default=0))
 
     def batches(self, topics: Collection[str]) -> Iterator[Batch]:
         """Messages of these topics in order of log time; those before what is raised come before it."""
         numbers = [number for number, channel in self._channels.items() if channel.topic in topics]
-        query = (
-            "SELECT timestamp, topic_id, data FROM messages "
-            f"WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD} "
-            "ORDER BY timestamp"
-        )
-        longest = max((self._longest.get(number, 0) for number in numbers), default=0)
-        at_once = max(1, min(MOST_MESSAGES, MOST_BYTES // max(longest, 1)))
+        own = f"FROM messages WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD}"
+        query = f"SELECT timestamp, topic_id, data {own} ORDER BY timestamp"
         with closing(self._connection()) as connection:
+            # grouped by topic, SQLite would sort the messages themselves
+            ((longest,),) = connection.execute(f"SELECT max(length(data)) {own}", numbers)
+            at_once = max(1, min(MOST_MESSAGES, MOST_BYTES // max(longest or 1, 1)))
             cursor = connection.execute(query, numbers)
             error: Exception | None = None
             while error is None:
@@ -65,18 +61,18 @@ class Database:
                     rows.extend(islice(cursor, at_once))
                 except sqlite3.Error as raised:  # what was read before it is in the list
                     error = raised
-                sound = _sound(rows)
-                if sound:
-                    yield self._batch(rows[:sound])
-                if sound < len(rows):
-                    raise DamagedError("a message is none")
                 if not rows:
                     break
+                log_ns, number, data = zip(*rows, strict=True)
+                sound = _sound(log_ns, data)
+                if sound:
+                    yield self._batch(log_ns[:sound], number[:sound], data[:sound])
+                if sound < len(rows):
+                    raise DamagedError("a message is none")
             if error is not None:
                 raise error
 
-    def _batch(self, rows: Sequence[tuple[int, int, bytes]]) -> Batch:
-        log_ns, number, data = zip(*rows, strict=True)
+    def _batch(self, log_ns: Sequence[int], number: Sequence[int], data: Sequence[bytes]) -> Batch:
         end = np.cumsum([*map(len, data)], dtype=np.intp)
         start = np.concatenate([[0], end[:-1]]).astype(np.intp)
         return Batch(times(log_ns), np.array(number, dtype=np.intp), start, end, b"".join(data), self._channels)
@@ -87,13 +83,10 @@ class Database:
         return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
 
-def _sound(rows: Sequence[tuple[Any, Any, Any]]) -> int:
-    """How many of the rows, from the first on, are messages."""
-    if not rows:
-        return 0
-    log_ns, _, data = zip(*rows, strict=True)
+def _sound(log_ns: Sequence[Any], data: Sequence[Any]) -> int:
+    """How many rows, from the first on, are messages."""
     if set(map(type, log_ns)) == {int} and set(map(type, data)) == {bytes} and min(log_ns) >= 0:
-        return len(rows)
+        return len(log_ns)
     are = (type(at) is int and at >= 0 and type(content) is bytes for at, content in zip(log_ns, data, strict=True))
     return sum(1 for _ in takewhile(bool, are))
 
