@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError
-from .raw_file import open_recording
+from .raw_file import open_raw
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -74,7 +74,7 @@ def decompressed(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
     target = new_folder() / (path.stem if path.suffix == ".zstd" else path.name)
     most = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
     try:
-        with open_recording(path) as raw, zstd.open(raw, "rb") as packed, target.open("wb") as unpacked:
+        with open_raw(path) as raw, zstd.open(raw, "rb") as packed, target.open("wb") as unpacked:
             while piece := packed.read1():  # as it comes: what precedes damage must be out before the damage
                 unpacked.write(piece)
                 if unpacked.tell() > most:

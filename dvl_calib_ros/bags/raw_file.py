@@ -87,7 +87,7 @@ class _RawFile(io.RawIOBase):
         )
 
 
-def open_recording(path: Path) -> io.BufferedReader:
+def open_raw(path: Path) -> io.BufferedReader:
     """Open a file to be read past unreadable places, which `holes_in` tells. Raises OSError."""
     return io.BufferedReader(_RawFile(path), _BUFFER)
 

@@ -18,7 +18,7 @@ from ..errors import InputError
 from .batches import Batch, batched
 from .channels import Channel, definition_of
 from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
-from .raw_file import open_recording, unreadable
+from .raw_file import open_raw, unreadable
 from .salvage.damage import DamagedError, Salvaged
 from .salvage.mcap_file import MCAP_MAGIC, bytes_at_once, indexed_messages, read_summary, salvage_mcap
 from .salvage.sqlite_file import SQLITE_MAGIC, salvage_sqlite
@@ -73,7 +73,7 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
         raise InputError(f"{shown}: not a file; remove it from the bag")
     if path.stat().st_size == 0:
         raise InputError(f"{shown}: the file is empty; nothing was recorded")
-    with open_recording(path) as file:
+    with open_raw(path) as file:
         magic = file.read(16)
         is_known = magic != bytes(16) and not unreadable(file)
     if magic.startswith(ZSTD_MAGIC) and path == shown:

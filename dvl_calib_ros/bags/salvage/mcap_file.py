@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..batches import Batch, one_batch, times
 from ..channels import Channel
-from ..raw_file import holes_in, open_recording
+from ..raw_file import holes_in, open_raw
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 from .mcap_chunks import RECORD_HEAD, is_chunk, open_chunk
 from .mcap_records import (
@@ -58,7 +58,7 @@ _FOOTER = struct.Struct("<QQI8s")
 
 def read_summary(path: Path) -> Summary | None:
     """The index at the end of the file if there is one that leads to messages; DamagedError if it is damaged."""
-    with open_recording(path) as file:
+    with open_raw(path) as file:
         if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise DamagedError("its beginning is damaged")
         summary = _summary(file)
@@ -122,7 +122,7 @@ def indexed_messages(
     """
     tables = Tables(summary)
     size = path.stat().st_size
-    with open_recording(path) as file:
+    with open_raw(path) as file:
         for group in _overlapping(summary.chunk_indexes, channels):
             read = (_whole_chunk(file, size, index, tables, channels) for index in group)
             found = _merged(group, read) if len(group) > 1 and in_order else read
@@ -201,7 +201,7 @@ def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | N
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
     """All whole messages, in file order; then DamagedError, unless the recording is whole."""
-    with open_recording(path) as file:
+    with open_raw(path) as file:
         yield from salvage_mcap_stream(file, path.stat().st_size)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from ..raw_file import holes_in, open_recording
+from ..raw_file import holes_in, open_raw
 from .damage import LARGEST_RECORD, DamagedError, Salvaged
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -31,7 +31,7 @@ class _Row(NamedTuple):
 
 def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
     """All whole messages in the order they were written; then DamagedError, unless none is missing."""
-    with open_recording(path) as file:
+    with open_raw(path) as file:
         yield from salvage_sqlite_stream(file, path.stat().st_size)
 
 

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from dvl_calib_ros.bags import sources
-from dvl_calib_ros.bags.raw_file import SECTOR, holes_in, open_recording, unreadable
+from dvl_calib_ros.bags.raw_file import SECTOR, holes_in, open_raw, unreadable
 from dvl_calib_ros.bags.sqlite import Database
 from dvl_calib_ros.cli.main import main
 
@@ -207,7 +207,7 @@ def test_any_unreadable_sectors_never_give_a_message_that_was_not_recorded(tmp_p
 def test_what_is_told_of_unreadable_bytes_is_exact(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(bytes(range(256)) * 64)
-    with failing(bad=[1, 2]), open_recording(path) as file:
+    with failing(bad=[1, 2]), open_raw(path) as file:
         content = file.read()
         whole = path.read_bytes()
         assert content == whole[:SECTOR] + bytes(2 * SECTOR) + whole[3 * SECTOR :]
