@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from itertools import islice
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..bags.columns import windows
+from ..bags.reader import BagReader
 from ..calibration.parameters import Parameters
 from ..calibration.samples import SampleBlock, Stamps, Stream, Streams, no_samples
 from ..messages.decode import MessageDecoder
@@ -149,12 +151,14 @@ def open_recording(
     """
     parameters = parameters or Parameters()
     each = []
-    for index, path in enumerate(paths):
+    with ExitStack() as stack:
+        bags = [stack.enter_context(open_bags([path])) for path in paths]  # what is wrong with the last is said first
+        for index, (path, bag) in enumerate(zip(paths, bags, strict=True)):
 
-        def progress(share: float, index: int = index) -> None:
-            on_progress((index + share) / len(paths))
+            def progress(share: float, index: int = index) -> None:
+                on_progress((index + share) / len(paths))
 
-        each.append(_opened(path, topics, parameters, progress))
+            each.append(_read(path, bag, topics, parameters, progress))
     return together(each)
 
 
@@ -213,49 +217,48 @@ def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, 
 _NOTHING = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 
-def _opened(
-    path: Path, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
+def _read(
+    path: Path, bag: BagReader, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
 ) -> Recording:
-    with open_bags([path]) as bag:
-        types = bag.topics
-        moving = {topic for topic, kind in types.items() if is_kept(kind)}
-        static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
-        if topics is not None:
-            found = topics.found_in(types)
-            moving, static = moving & {found.dvl, found.gnss, found.imu}, set()
-        one_by_one = static | {topic for topic in moving if not _is_read_in_columns(types[topic])}
-        counts = bag.message_counts
-        collectors = {
-            topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
-        }
-        left = dict.fromkeys(static, MOST_STATIC)
-        transforms: list[Any] = []
-        descriptions: list[str] = []
-        start_ns, end_ns = bag.span_ns
-        for window in windows(bag, moving | static, one_by_one):
-            for part in window.parts:
-                topic = part.channel.topic
-                if topic in collectors:
-                    collectors[topic].take(part)
-                    continue
-                for message, _ in islice(part.messages(), left[topic]):
-                    left[topic] -= 1
-                    if message is not None and types[topic] == TF_TYPE:
-                        transforms += list(message.transforms)
-                    elif message is not None:
-                        descriptions.append(message.data)
-            on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
-        return Recording(
-            (path,),
-            types,
-            {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types},
-            counts,
-            tuple(bag.file_spans_ns),
-            tuple(bag.notes),
-            {topic: (collector.columns(),) for topic, collector in collectors.items()},
-            tuple(transforms),
-            tuple(dict.fromkeys(descriptions)),
-        )
+    types = bag.topics
+    moving = {topic for topic, kind in types.items() if is_kept(kind)}
+    static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
+    if topics is not None:
+        found = topics.found_in(types)
+        moving, static = moving & {found.dvl, found.gnss, found.imu}, set()
+    one_by_one = static | {topic for topic in moving if not _is_read_in_columns(types[topic])}
+    counts = bag.message_counts
+    collectors = {
+        topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
+    }
+    left = dict.fromkeys(static, MOST_STATIC)
+    transforms: list[Any] = []
+    descriptions: list[str] = []
+    start_ns, end_ns = bag.span_ns
+    for window in windows(bag, moving | static, one_by_one):
+        for part in window.parts:
+            topic = part.channel.topic
+            if topic in collectors:
+                collectors[topic].take(part)
+                continue
+            for message, _ in islice(part.messages(), left[topic]):
+                left[topic] -= 1
+                if message is not None and types[topic] == TF_TYPE:
+                    transforms += list(message.transforms)
+                elif message is not None:
+                    descriptions.append(message.data)
+        on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
+    return Recording(
+        (path,),
+        types,
+        {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types},
+        counts,
+        tuple(bag.file_spans_ns),
+        tuple(bag.notes),
+        {topic: (collector.columns(),) for topic, collector in collectors.items()},
+        tuple(transforms),
+        tuple(dict.fromkeys(descriptions)),
+    )
 
 
 def _is_read_in_columns(kind: str) -> bool:

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from command_line import succeed
+from command_line import fail, succeed
 from io_fixtures import run, storage_file, write_bag
 
 from dvl_calib_ros.bags import sources
@@ -71,3 +71,8 @@ def test_a_replay_from_an_initial_calibration_reads_once_though_it_runs_twice(ba
     passes.clear()
     succeed(capsys, "replay", bags["OTHER"], "-p", f"initial_calibration:={saved}")
     assert set(passes.values()) == {1}
+
+
+def test_what_is_wrong_with_the_last_is_said_before_the_first_is_read(bags, passes, tmp_path, capsys):
+    assert "no such file" in fail(capsys, "replay", bags["BAG"], tmp_path / "none")
+    assert not any(what.startswith("read") for what in passes)
