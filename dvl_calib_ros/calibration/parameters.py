@@ -236,15 +236,15 @@ class Parameters:
         0.0,
         "Positive: DVL stamps are late. Taken off before pairing.",
         unit="s",
-        low=-10.0,
-        high=10.0,
+        low=-60.0,
+        high=60.0,
     )
     reference_time_offset: float = _parameter(
         0.0,
         "Positive: reference (GNSS) stamps are late. Taken off before pairing.",
         unit="s",
-        low=-10.0,
-        high=10.0,
+        low=-60.0,
+        high=60.0,
     )
     reference_velocity_offset: tuple[float, ...] = _parameter(
         (0.0, 0.0),
@@ -258,8 +258,8 @@ class Parameters:
         0.0,
         "Positive: IMU stamps (attitude and angular velocity) are late. Taken off before pairing.",
         unit="s",
-        low=-10.0,
-        high=10.0,
+        low=-60.0,
+        high=60.0,
     )
     dvl_clock_drift: float = _parameter(
         0.0,

@@ -26,6 +26,7 @@ from ..recordings.look import Look, Survey
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from . import choose
+from .clocks import FoundClocks, find_clocks, in_time
 from .fit import (
     CLEARLY,
     FITS,
@@ -75,7 +76,8 @@ class Discovery:
     """What to calibrate with.
 
     found: what was found and where; notes: what was passed over; contradictions: where the recording's data do not
-    bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`. fit: how
+    bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`, beside
+    `clocks.offsets`, which a calibration takes off and a diagnosis names. fit: how
     well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
     knows_imu: whether it is known in which axes the IMU measures.
     """
@@ -89,6 +91,7 @@ class Discovery:
     fit: Fit | None = None
     reference_frame: VelocityFrame | None = None
     knows_imu: bool = False
+    clocks: FoundClocks | None = None
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -107,7 +110,34 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         recording = open_recording(recording, parameters=parameters)
     if not recording.types:
         raise InputError(f"{recording.where}: the bag is empty, it has no topics; record it again")
-    return _Search(recording.survey, parameters, given or Given(), recording.where).run()
+    named = given or Given()
+    found = _Search(recording.survey, parameters, named, recording.where).run()
+    clocks = _clocks(recording, found, named)
+    if clocks is None:
+        return found
+    if clocks.registration.offsets:
+        # frames are told by velocities of one time
+        seen = in_time(recording, found.topics, clocks.registration)
+        seen = replace(seen, topics=recording.survey.topics, counts=recording.survey.counts)
+        topics = found.topics
+        all_named = replace(named, dvl_topic=topics.dvl, gnss_topic=topics.gnss, imu_topic=topics.imu)
+        again = _Search(seen, parameters, all_named, recording.where).run()
+        if again.values != found.values:
+            found, clocks = again, _clocks(recording, again, named) or clocks
+        else:
+            found = again
+    return replace(
+        found,
+        parameters=found.parameters.replace(**{n: getattr(parameters, n) + s for n, s in clocks.offsets.items()}),
+        found=(*found.found, *clocks.says()),
+        contradictions=(*found.contradictions, *([clocks.far.says] if clocks.far else [])),
+        clocks=clocks,
+    )
+
+
+def _clocks(recording: Recording, found: Discovery, given: Given) -> FoundClocks | None:
+    knows_mounting = "mounting_rpy" in {*found.values, *given.parameters}
+    return find_clocks(recording, found.topics, found.parameters, knows_mounting=knows_mounting, given=given.parameters)
 
 
 def _in_time_of(dvl: Look, other: Look | None) -> Look | None:

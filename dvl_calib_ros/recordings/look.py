@@ -85,15 +85,21 @@ class Survey:
 
 
 def look_of(
-    parts: Sequence[TopicColumns], count: int, start_ns: int, spans_ns: Sequence[tuple[int, int]]
+    parts: Sequence[TopicColumns],
+    count: int,
+    start_ns: int,
+    spans_ns: Sequence[tuple[int, int]],
+    *,
+    whole: bool = False,
 ) -> Look | None:
     """A look at a topic, of which each recording has a part; None where no message of it can be read.
 
-    start_ns: first log time of the recordings. spans_ns: from and to when was recorded, in order.
+    start_ns: first log time of the recordings. spans_ns: from and to when was recorded, in order. whole: all of its
+    messages, and no bursts.
     """
     topic, msgtype = parts[0].topic, parts[0].msgtype
     numbers = _Numbers(msgtype)
-    taken = in_bursts(parts, spans_ns)
+    taken = np.sort(np.concatenate([part.arrivals[0] for part in parts])) if whole else in_bursts(parts, spans_ns)
     for part in parts:
         numbers.add_columns(part, _places(part.laid.arrival, taken))
     singly = sorted(

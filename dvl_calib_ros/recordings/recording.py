@@ -93,11 +93,19 @@ class Recording:
     @cached_property
     def survey(self) -> Survey:
         """A first look at all that may be of use."""
+        return self._surveyed(self.columns, whole=False)
+
+    def whole(self, topics: Topics) -> Survey:
+        """All messages of three topics, for who has to compare streams whose clocks are far apart."""
+        named = (topics.dvl, topics.gnss, topics.imu)
+        return self._surveyed({name: self.columns[name] for name in named if name in self.columns}, whole=True)
+
+    def _surveyed(self, columns: Mapping[str, tuple[TopicColumns, ...]], *, whole: bool) -> Survey:
         start_ns, spans_ns = self.span_ns[0], self.recorded_spans_ns or [(0, 0)]
         looks = {
             topic: look_of([part for part in parts if part.msgtype == self.types[topic]], self.counts[topic], start_ns,
-                           spans_ns)
-            for topic, parts in self.columns.items()
+                           spans_ns, whole=whole)
+            for topic, parts in columns.items()
         }  # fmt: skip
         seen = {topic: look for topic, look in looks.items() if look is not None}
         return Survey(self.types, self.counts, seen, self.transforms, self.descriptions)

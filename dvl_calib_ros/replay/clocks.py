@@ -44,8 +44,10 @@ class StreamClocks:
             ahead_ns = self._ahead[stream].kept
             if not len(ahead_ns):
                 continue
-            ahead_s = float(median(1e-9 * ahead_ns)) - offsets[stream] + parameters.dvl_time_offset
-            if abs(ahead_s) <= LONGEST_DELAY_S + parameters.position_window:
+            # as stamped, and as corrected: samples that are old when they are stamped arrive by neither clock's fault
+            stamped_s = float(median(1e-9 * ahead_ns))
+            ahead_s = stamped_s - offsets[stream] + parameters.dvl_time_offset
+            if min(abs(stamped_s), abs(ahead_s)) <= LONGEST_DELAY_S + parameters.position_window:
                 continue
             known = WELL_KNOWN.get(round(abs(ahead_s)))
             side = "ahead of" if ahead_s > 0.0 else "behind"

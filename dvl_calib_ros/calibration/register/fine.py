@@ -107,16 +107,21 @@ class _Rows(NamedTuple):
 
 
 class Fit:
-    """Least squares of one motion from one place of the clocks."""
+    """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
+
+    rows: references that are looked at.
+    """
 
     def __init__(self, motion: Motion, lever_arm: Array, most: int = MOST_ROWS) -> None:
         """lever_arm: (3,) m, that is known. most: references that are looked at."""
         self._motion, self._lever_arm = motion, lever_arm
+        self.is_turned = motion.in_earth and motion.has_attitude
         m = motion
         moving = np.flatnonzero((m.reference**2).sum(axis=1) >= SLOW_MPS**2)
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self._times, self._velocity = m.reference_times[moving], m.reference[moving]
+        self.rows = len(moving)
         self._reach = np.clip(
             reach_at(spacing_at(m.dvl.times, self._times), LEAST_SLOPE_REACH_S, MOST_REACH_S), LEAST_SLOPE_REACH_S, None
         )
@@ -144,7 +149,7 @@ class Fit:
         x[APART], x[LATE] = apart, reference
         nominal = rotation
         solved = None
-        if not (self._motion.in_earth and self._motion.has_attitude):
+        if not self.is_turned:
             in_time = (*in_time, REFERENCE)
         for _ in range(ROUNDS):
             rows = self._rows(x, rotation)

@@ -15,7 +15,7 @@ import numpy as np
 from ..frames import Array
 from ..parameters import Parameters
 from .coarse import places
-from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, REFERENCE, SCALE, TURN, Fit, Fitted
+from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Fit, Fitted
 from .motion import Motion
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
@@ -24,6 +24,8 @@ SAID_FROM_S = 0.1
 # So many σ from which a clock is said to be off. In chi-square: what one more clock that is off has to gain, and by how
 # much the next explanation has to be worse to be ruled out.
 SIGMAS, ONE_MORE, TOLD_APART = 4.0, 12.0, 8.0
+# In chi-square: what clocks in time may cost for no other explanation to be tried.
+NO_DOUBT = 4.0
 # Stamps are late where something takes time; that they are early, by a clock that is ahead, is less likely by as much.
 EARLY = 6.0
 # Of places that explain the data about as well the nearest is taken: log evidence, of samples so far apart (s).
@@ -46,15 +48,17 @@ class Registration:
     """dvl, reference: their clocks beside the IMU's. imu: its own, where it alone is off.
 
     Without a reference that an attitude turns, which clock it is does not show: then the reference is in time. apart:
-    by how much the DVL's stamps are later than the reference's. rotation_body_from_dvl (3, 3), turn_std (3,) rad.
-    lever_arm, lever_arm_std (3,) m: of the DVL from the reference point. scale, scale_std: error of the DVL's,
-    dimensionless. left: what no registration explains, as a share of the speed; spread: the same, m/s per axis.
+    by how much the DVL's stamps are later than the reference's. is_turned: whether an attitude turns the reference.
+    rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the DVL from the reference
+    point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
+    speed; spread: the same, m/s per axis.
     """
 
     dvl: Clock
     reference: Clock
     imu: Clock
     apart: Clock
+    is_turned: bool
     rotation_body_from_dvl: Array
     turn_std: Array
     lever_arm: Array
@@ -69,6 +73,9 @@ class Registration:
         """By parameter, how late (s) the stamps are of the clocks that are shown to be off, beyond what it says."""
         if self.imu.is_shown:
             return {"imu_time_offset": self.imu.late}
+        if not self.is_turned and self.apart.is_shown and self.apart.late < 0.0:
+            # which of the two it is does not show, but stamps are late more often than early
+            return {"reference_time_offset": -self.apart.late}
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference}
         return {name: clock.late for name, clock in clocks.items() if clock.is_shown}
 
@@ -89,33 +96,41 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
 
     rotation_body_from_dvl: (3, 3) the mounting, None where it is not known. lever_arm: (3,) m, what is known of it.
     """
-    fit, quick = Fit(motion, lever_arm), Fit(motion, lever_arm, FEW_ROWS)
+    fit, quick = (Fit(motion, lever_arm, most) for most in (MOST_ROWS, FEW_ROWS))
     tried = [(place.reference, place.dvl - place.reference) for place in places(motion, rotation_body_from_dvl)]
     found = [quick(*place, rotation_body_from_dvl) for place in {*tried, (0.0, 0.0)}]
     fitted = [each for each in found if each is not None and np.isfinite(each.x).all()]
     if not fitted:
         return None
-    best = min(fitted, key=lambda each: each.level)
+    closest = min(fitted, key=lambda each: each.level)
     # legs that repeat agree at more than one delay
-    as_good = [each for each in fitted if _gain(motion, each, best) < GAIN]
-    best = min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
-    free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
-    return None if free is None else _explained(fit, free, rotation_body_from_dvl, lever_arm)
+    as_good = [each for each in fitted if _gain(motion, each, closest) < GAIN]
+    best: Fitted | None = min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
+    if best is None:
+        return None
+    in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
+    if in_time[1] * fit.rows / quick.rows < NO_DOUBT:  # all that there is would show nothing more
+        return _explained(quick, best, rotation_body_from_dvl, lever_arm)
+    best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
+    return None if best is None else _explained(fit, best, rotation_body_from_dvl, lever_arm)
 
 
 def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:
     """By the fewest clocks that are off: none, one of the three, or both of DVL and reference."""
     apart = float(free.x[APART])
     early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
-    tried = {
-        _Off.NONE: _held(fit, free, rotation, 0.0, 0.0, (DVL, REFERENCE)),
-        _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), ONE_MORE + early),
-        _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), ONE_MORE + too_early),
-        _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE),
-    }
+    tried = {_Off.NONE: _held(fit, free, rotation, 0.0, 0.0, (DVL, REFERENCE))}
+    if tried[_Off.NONE][1] >= NO_DOUBT:
+        tried |= {
+            _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), ONE_MORE + early),
+            _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), ONE_MORE + too_early),
+            _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE),
+        }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # that both are off holds either one, and is no other cause
-    is_told_apart = min(c for each, (_, c) in tried.items() if each is not likeliest) - cost > TOLD_APART
+    is_told_apart = (
+        min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost > TOLD_APART
+    )
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, is_told_apart = _Off.BOTH, free, True
     x, p = best.x, best.p
@@ -125,6 +140,7 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
         reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(best, LATE)),
         imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
         apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
+        is_turned=fit.is_turned,
         rotation_body_from_dvl=best.rotation_body_from_dvl,
         turn_std=std[TURN],
         lever_arm=lever_arm + x[ARM],

@@ -1,0 +1,172 @@
+"""Which clocks of a recording are off, by how much, and what a calibration has to take off for it.
+
+Frames are found by comparing velocities of one time, and clocks by turning velocities with the right frames. So clocks
+are registered with the frames found; where these leave much, with the others that there may be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import product
+
+import numpy as np
+
+from ..calibration.parameters import Parameters
+from ..calibration.register.far import Far, far_clocks
+from ..calibration.register.motion import Motion, motion_of
+from ..calibration.register.registration import Clock, Registration, register
+from ..calibration.samples import SampleBlock, Stream, Streams
+from ..messages.decode import MessageDecoder
+from ..recordings.look import Look, Survey
+from ..recordings.recording import Recording
+from ..recordings.topics import Topics
+
+OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
+# A registration that leaves less than this share of the speed is one (17 degrees of misalignment); another reading of
+# the frames is taken for it if it leaves less than this share of what the first one leaves.
+REGISTERED, CLEARLY = 0.3, 0.5
+# A DVL that is late by less is found by the calibration itself (G2), at whatever its stamps say, s.
+LEFT_TO_CALIBRATION_S = 2.5
+# Clocks of recordings of one calibration are one clock if they agree to this, s.
+ALIKE_S = 0.1
+# Of a stream one sample in so long is registered, ns.
+EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
+# Samples of the DVL that are compared to find frames: no more tell more.
+COMPARED = 1500
+
+
+@dataclass(frozen=True)
+class FoundClocks:
+    """registration: of the streams. offsets: by parameter, what is to be taken off, s, beside what it says already.
+
+    far: clocks too far apart to be registered. parameters: the frames that it holds with.
+    """
+
+    registration: Registration
+    offsets: Mapping[str, float]
+    parameters: Parameters
+    far: Far | None = None
+
+    def says(self) -> Iterator[str]:
+        """Of each clock that is off how late it is, and what comes of it; one sentence each."""
+        r = self.registration
+        clocks = {"dvl_time_offset": r.dvl, "reference_time_offset": r.reference, "imu_time_offset": r.imu}
+        if not r.is_turned and "reference_time_offset" in r.offsets:
+            clocks["reference_time_offset"] = replace(r.apart, late=-r.apart.late)
+        for name, late in r.offsets.items():
+            clock = clocks[name]
+            done = f"taken off ({name} {late:.2f})" if name in self.offsets else "for the calibration to find"
+            which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
+            yield f"{OFFSETS[name]} stamps are {_late(clock)}{which}: {done}"
+        if r.apart.is_shown and not r.offsets:
+            yield (
+                f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; whose clock is "
+                "off does not show: drive turns at two speeds"
+            )
+
+
+def _late(clock: Clock) -> str:
+    return f"{abs(clock.late):.2f} ± {clock.std:.2f} s {'late' if clock.late > 0.0 else 'early'}"
+
+
+def find_clocks(
+    recording: Recording, topics: Topics, parameters: Parameters, *, knows_mounting: bool, given: frozenset[str]
+) -> FoundClocks | None:
+    """How the clocks stand; None where the recording does not show it, or they differ from one recording to another.
+
+    knows_mounting: whether mounting_rpy is more than a guess. given: parameters that the user named, which stand.
+    """
+    if topics.gnss not in recording.columns or topics.dvl not in recording.columns:
+        return None
+    each = [_found(one, topics, parameters, knows_mounting, given) for one in recording.each]
+    first = each[0]
+    if first is None or any(one is None for one in each):
+        return None
+    for one in each[1:]:
+        assert one is not None
+        names = {*first.offsets, *one.offsets}
+        if any(abs(first.offsets.get(name, 0.0) - one.offsets.get(name, 0.0)) > ALIKE_S for name in names):
+            return None
+    return first
+
+
+def _found(
+    recording: Recording, topics: Topics, parameters: Parameters, knows_mounting: bool, given: frozenset[str]
+) -> FoundClocks | None:
+    best: tuple[Registration, Parameters] | None = None
+    for hypothesis in _hypotheses(parameters, given):
+        motion = _motion(recording, topics, hypothesis)
+        if motion is None:
+            continue
+        rotation = hypothesis.rotation_dvl_from_body
+        is_first = hypothesis is parameters
+        if is_first and (far := far_clocks(motion, rotation)) is not None:
+            nothing = register(motion, rotation.T, np.array(hypothesis.lever_arm))
+            return None if nothing is None else FoundClocks(nothing, {}, parameters, far)
+        mounting = rotation.T if knows_mounting or is_first else None
+        found = register(motion, mounting, np.array(hypothesis.lever_arm))
+        if found is not None and (best is None or found.left < CLEARLY * best[0].left):
+            best = found, hypothesis
+        if is_first and found is not None and found.left < REGISTERED:
+            break
+    if best is None or best[0].left >= REGISTERED:
+        return None
+    registration, hypothesis = best
+    offsets = {name: round(late, 3) for name, late in registration.offsets.items() if not given.intersection(OFFSETS)}
+    if offsets.keys() == {"dvl_time_offset"} and abs(offsets["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S:
+        offsets = {}
+    return FoundClocks(registration, offsets, hypothesis)
+
+
+def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:
+    """The frames found, then the others that nobody named."""
+    yield parameters
+    frames = (parameters.gnss_frame,) if "gnss_frame" in given else ("enu", "ned", "body")
+    imus = [(parameters.imu_rpy, parameters.imu_frame)]
+    if not given.intersection({"imu_rpy", "imu_frame"}):
+        imus += [((0.0, 0.0, 0.0), "enu"), ((np.pi, 0.0, 0.0), "ned")]
+    for frame, (rpy, world) in product(frames, imus):
+        yield parameters.replace(gnss_frame=frame, imu_rpy=rpy, imu_frame=world)
+
+
+def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> Motion | None:
+    """What is registered: of fast streams so much that memory does not grow with their rates."""
+    own = recording.of_types(topics, parameters)
+    named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
+    parts = [
+        Streams(*(_some(block) for block in stretch.streams))
+        for stretch in recording.stretches(named, MessageDecoder(own))
+    ]
+    return (
+        motion_of(Streams(*(reduce(SampleBlock.joined, each) for each in zip(*parts, strict=True))), own)
+        if parts
+        else None
+    )
+
+
+def _some(block: SampleBlock) -> SampleBlock:
+    """The first sample of every so many seconds."""
+    bins = block.stamps_ns // EVERY_NS[block.stream]
+    return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
+
+
+def in_time(recording: Recording, topics: Topics, found: Registration) -> Survey:
+    """The three streams as they would be stamped by the IMU's clock."""
+    seen = recording.whole(topics)
+    looks = dict(seen.looks)
+    late = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
+    for name, seconds in late.items():
+        if name in looks:
+            look = looks[name]
+            looks[name] = replace(look, stamps_s=look.stamps_s - seconds)
+    if topics.dvl in looks:
+        looks[topics.dvl] = _thinned(looks[topics.dvl])
+    return replace(seen, looks=looks)
+
+
+def _thinned(look: Look) -> Look:
+    step = -(-len(look.stamps_s) // COMPARED)
+    rates = None if look.rates is None else look.rates[::step]
+    return replace(look, stamps_s=look.stamps_s[::step], values=look.values[::step], rates=rates)
