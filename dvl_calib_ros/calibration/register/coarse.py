@@ -21,7 +21,7 @@ from .motion import Motion
 LONGEST_S = 60.0
 # Steps of the grid, s, and how many times it has at most: a vehicle's turns last longer, and a quadrupled recording
 # takes four times as long.
-STEP_S, LONG_STEP_S, MANY, MOST = 0.5, 1.0, 2400, 7200
+STEP_S, LONG_STEP_S, MANY, MOST = 0.5, 1.0, 500, 7200
 # Samples further apart than so many of their intervals leave a hole in the grid, and than this, s.
 HOLE_INTERVALS, HOLE_S = 2.6, 2.5
 # Of the shorter stream so much has to overlap, and so many seconds.

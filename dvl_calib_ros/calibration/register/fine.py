@@ -15,11 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..delay.local_motion import local_fit, reach_at, spacing_at
+from ..delay.local_motion import REACH_INTERVALS, local_fit, reach_at, spacing_at
 from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at, attitude_at
 from ..extrinsics import rotation_of, turn_between
 from ..frames import Array, cross, skew
 from ..robust import median
+from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
 from .motion import Motion
 
@@ -37,6 +38,8 @@ HELD_STD_S = 1e-4
 LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
 # References that are looked at, evenly spread: more tell little more, and take longer; fewer tell places apart.
 MOST_ROWS, FEW_ROWS = 4000, 800
+# Curves are smoothed on a grid of this step, s, and of a long recording of so many times.
+GRID_S, MOST_GRID = 0.1, 18_000
 # Rounds at most, and the step (s, m, rad) from which on another one changes nothing.
 ROUNDS, SETTLED_S = 12, 5e-4
 # A delay moves no further in one round, s: slopes hold that far.
@@ -106,15 +109,60 @@ class _Rows(NamedTuple):
     speed: float
 
 
+class Curves:
+    """Velocity and slope of the DVL, and turn rates, on a fine grid of time, each smoothed once for all places."""
+
+    def __init__(self, motion: Motion) -> None:
+        """Of all streams of a motion."""
+        times = motion.dvl.times
+        length = float(times[-1] - times[0])
+        self._step, self._start = max(GRID_S, length / MOST_GRID), float(times[0])
+        self._grid = self._start + self._step * np.arange(int(length / self._step) + 2)
+        typical = float(median(np.diff(times)))
+        reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
+        reach = np.clip(reach, LEAST_SLOPE_REACH_S, None)
+        reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(REACH_INTERVALS * typical, MOST_REACH_S))
+        fit = local_fit(times, motion.dvl.velocity, self._grid, reach)
+        self._velocity = np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]])
+        self._found = fit.found
+        self._turns, self._turns_start = np.zeros((2, 3)), 0.0
+        if len(motion.turns.times) > 1:
+            grid = np.arange(motion.turns.times[0], motion.turns.times[-1] + self._step, self._step)
+            self._turns_start = float(grid[0])
+            self._turns = np.nan_to_num(angular_velocity_at(motion.turns, grid, GAP_S)[0])
+
+    def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
+        """At times (J,) s: velocity (J, 3), slope (J, 3), noise gain of the slope (J,), and whether there is one."""
+        before, share, inside = self._places(at, self._start, len(self._grid))
+        both = _between(self._velocity, before, share)
+        return both[:, :3], both[:, 3:6], both[:, 6], inside & self._found[before] & self._found[before + 1]
+
+    def rates(self, at: Array) -> Array:
+        """(J, 3) rad/s, zero where they are not known."""
+        before, share, inside = self._places(at, self._turns_start, len(self._turns))
+        return np.where(inside[:, None], _between(self._turns, before, share), 0.0)
+
+    def _places(self, at: Array, start: float, n: int) -> tuple[Index, Array, Mask]:
+        place = (at - start) / self._step
+        before = np.clip(place, 0, n - 2).astype(np.intp)
+        return before, (place - before)[:, None], (place >= 0.0) & (place <= n - 1)
+
+
+def _between(values: Array, before: Index, share: Array) -> Array:
+    left = values[before]
+    found: Array = left + share * (values[before + 1] - left)
+    return found
+
+
 class Fit:
     """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
 
     rows: references that are looked at.
     """
 
-    def __init__(self, motion: Motion, lever_arm: Array, most: int = MOST_ROWS) -> None:
-        """lever_arm: (3,) m, that is known. most: references that are looked at."""
-        self._motion, self._lever_arm = motion, lever_arm
+    def __init__(self, motion: Motion, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
+        """lever_arm: (3,) m, that is known. curves: of the motion. most: references that are looked at."""
+        self._motion, self._lever_arm, self._curves = motion, lever_arm, curves
         self.is_turned = motion.in_earth and motion.has_attitude
         m = motion
         moving = np.flatnonzero((m.reference**2).sum(axis=1) >= SLOW_MPS**2)
@@ -122,13 +170,8 @@ class Fit:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self._times, self._velocity = m.reference_times[moving], m.reference[moving]
         self.rows = len(moving)
-        self._reach = np.clip(
-            reach_at(spacing_at(m.dvl.times, self._times), LEAST_SLOPE_REACH_S, MOST_REACH_S), LEAST_SLOPE_REACH_S, None
-        )
         # of the DVL, (m/s)²: where hardly anything changes, what seems to is its noise
         self._noise = float(_noise(m.dvl.velocity))
-        typical = float(median(np.diff(m.dvl.times))) if len(m.dvl.times) > 1 else 1.0
-        self._reach[np.isnan(self._reach)] = max(LEAST_SLOPE_REACH_S, min(2.6 * typical, MOST_REACH_S))
 
     def __call__(
         self,
@@ -178,20 +221,19 @@ class Fit:
         the slope (J,)."""
         m = self._motion
         own = self._times - reference
-        fit = local_fit(m.dvl.times, m.dvl.velocity, self._times + apart, self._reach)
-        known = fit.found
-        rotation, oriented = attitude_at(m.imu, own, GAP_S)
         if m.in_earth and not m.has_attitude:
             return None
+        velocity, slope, gain, known = self._curves.velocity(self._times + apart)
+        needed = m.in_earth or not all(m.measured)
+        rotation, oriented = attitude_at(m.imu, own, GAP_S) if needed else (np.zeros((len(own), 3, 3)), known)
         if m.in_earth:
             known = known & oriented
-        rates = np.nan_to_num(angular_velocity_at(m.turns, own, GAP_S)[0])
         if np.count_nonzero(known) < ENOUGH:
             return None
         at = np.flatnonzero(known)
-        velocity, rotation = self._velocity[at], rotation[at]
-        body = np.einsum("nji,nj->ni", rotation, velocity) if m.in_earth else velocity
-        return body, rates[at], fit.value[at], fit.slope[at], rotation, self._times[at], fit.slope_gain[at]
+        seen, rotation = self._velocity[at], rotation[at]
+        body = np.einsum("nji,nj->ni", rotation, seen) if m.in_earth else seen
+        return body, self._curves.rates(own[at]), velocity[at], slope[at], rotation, self._times[at], gain[at]
 
     def _best_rotation(self, reference: float, apart: float) -> Array | None:
         """C (3, 3) that fits best without a lever arm, by singular values."""

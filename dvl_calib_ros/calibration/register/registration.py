@@ -15,7 +15,7 @@ import numpy as np
 from ..frames import Array
 from ..parameters import Parameters
 from .coarse import places
-from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Fit, Fitted
+from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Curves, Fit, Fitted
 from .motion import Motion
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
@@ -25,7 +25,9 @@ SAID_FROM_S = 0.1
 # much the next explanation has to be worse to be ruled out.
 SIGMAS, ONE_MORE, TOLD_APART = 4.0, 12.0, 8.0
 # In chi-square: what clocks in time may cost for no other explanation to be tried.
-NO_DOUBT = 4.0
+NO_DOUBT = 3.0
+# Places whose misfit is so much more than the best one's are none: of it, and a share of the squares.
+WORSE = 3.0, 0.02
 # Stamps are late where something takes time; that they are early, by a clock that is ahead, is less likely by as much.
 EARLY = 6.0
 # Of places that explain the data about as well the nearest is taken: log evidence, of samples so far apart (s).
@@ -96,8 +98,11 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
 
     rotation_body_from_dvl: (3, 3) the mounting, None where it is not known. lever_arm: (3,) m, what is known of it.
     """
-    fit, quick = (Fit(motion, lever_arm, most) for most in (MOST_ROWS, FEW_ROWS))
-    tried = [(place.reference, place.dvl - place.reference) for place in places(motion, rotation_body_from_dvl)]
+    curves = Curves(motion)
+    fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
+    likely = places(motion, rotation_body_from_dvl)
+    enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
+    tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
     found = [quick(*place, rotation_body_from_dvl) for place in {*tried, (0.0, 0.0)}]
     fitted = [each for each in found if each is not None and np.isfinite(each.x).all()]
     if not fitted:
@@ -109,7 +114,7 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
     if best is None:
         return None
     in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
-    if in_time[1] * fit.rows / quick.rows < NO_DOUBT:  # all that there is would show nothing more
+    if in_time[1] < NO_DOUBT:  # all that there is would show nothing more
         return _explained(quick, best, rotation_body_from_dvl, lever_arm)
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
     return None if best is None else _explained(fit, best, rotation_body_from_dvl, lever_arm)
