@@ -1,0 +1,92 @@
+"""One cause, one answer: doctor, replay and diagnose name the same clock and by how much it is late."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from dvl_calib_ros.bags.writer import Compression, Storage
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.discovery.discover import Given, discover
+from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.simulation.injection import injection
+from dvl_calib_ros.simulation.scenario import Scenario, write_bag
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+ARM = -0.6
+OFFSETS = {
+    "dvl_time_offset": "the DVL's",
+    "reference_time_offset": "the reference's",
+    "attitude_time_offset": "the IMU's",
+}
+
+
+def bag_of(folder, late, trajectory="free", **scenario):
+    effects = [injection(f"lever_arm:x_m={ARM}"), *(injection(f"{n}:seconds={s}") for n, s in late.items())]
+    errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)
+    made = Scenario(trajectory, 300.0, 3, errors, gnss_std=0.05, effects=tuple(effects), **scenario)
+    write_bag(made, folder / "late", Storage.MCAP, Compression.NONE)
+    return folder / "late"
+
+
+def said(command, bag, tmp_path, capsys):
+    """What a command prints, and its JSON."""
+    main([command, str(bag), "--json", str(tmp_path / f"{command}.json")])
+    return " ".join(capsys.readouterr().out.split()), json.loads((tmp_path / f"{command}.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "late",
+    [
+        {"reference_time_offset": 0.8},
+        {"reference_time_offset": 5.0},
+        {"reference_time_offset": 30.0},
+        {"dvl_time_offset": 7.5},
+        {"attitude_time_offset": 2.0},
+        {"dvl_time_offset": 5.0, "reference_time_offset": 2.5},
+    ],
+    ids=lambda late: ", ".join(f"{name[:3]} {seconds}" for name, seconds in late.items()),
+)
+def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
+    """By 2.5 s one said yes, one 1.2 s or more, and one was exact; by 5 s a scale was 6 % off."""
+    bag = bag_of(tmp_path, late)
+    doctor, examined = said("doctor", bag, tmp_path, capsys)
+    _, diagnosed = said("diagnose", bag, tmp_path, capsys)
+    assert examined["verdict"] == "yes"
+    found = discover([bag], Parameters())
+    for name, seconds in late.items():
+        near = pytest.approx(seconds, abs=0.05 + 0.03 * seconds)
+        parameter = name.replace("attitude", "imu")
+        assert getattr(found.parameters, parameter) == near
+        sentence = next(each for each in found.found if each.startswith(f"{OFFSETS[name]} stamps are"))
+        assert " ".join(sentence.split()) in doctor
+        effects = {each["name"]: each["parameters"] for each in diagnosed["effects"]}
+        assert effects[name]["seconds"]["value"] == near
+    replayed = replay([bag], found.parameters, found.topics)
+    verification = replayed.result.verifications[replayed.result.selected]
+    assert verification.verdict.value == "accept", verification.reasons
+    assert replayed.result.estimate.state[8] == pytest.approx(ARM, abs=0.15)
+
+
+def test_a_reference_in_the_body_is_calibrated_with_and_the_other_reading_is_said(tmp_path):
+    bag = bag_of(tmp_path, {"reference_time_offset": 5.0}, gnss_frame=VelocityFrame.BODY)
+    found = discover([bag], Parameters())
+    assert found.parameters.reference_time_offset == pytest.approx(5.0, abs=0.2)
+    assert any("or the DVL's as much early" in each for each in found.found)
+
+
+@pytest.mark.parametrize("trajectory", ["free", "straight"])
+def test_clocks_in_time_or_not_shown_are_left_alone(trajectory, tmp_path):
+    found = discover([bag_of(tmp_path, {}, trajectory)], Parameters())
+    assert not any("stamps are" in each for each in found.found)
+    assert found.clocks is None or found.clocks.offsets == {}
+
+
+def test_what_the_user_gives_stands(tmp_path):
+    bag = bag_of(tmp_path, {"reference_time_offset": 5.0})
+    given = Given(parameters=frozenset({"reference_time_offset"}))
+    parameters = Parameters().replace(reference_time_offset=5.0)
+    assert discover([bag], parameters, given).parameters.reference_time_offset == 5.0
