@@ -430,9 +430,10 @@ class Calibrator:
     @property
     def selection(self) -> Selection:
         """Which model is the one, over time."""
-        for each in self._further:
-            each.settle()
-        self._select()
+        if self._worker is None:  # else nothing is gathered, and other threads may look
+            for each in self._further:
+                each.settle()
+            self._select()
         return self._selection
 
     @property

@@ -284,18 +284,26 @@ class DelayFilter(Estimator):
     def _submit(self, block_ns: int) -> None:
         """Have a block solved, by itself or with some more."""
         block = self._copied(block_ns)
+        from_ns = block.end_ns + self._wait_ns + SOLVED_WITHIN_NS
+        if self._together == 1:  # live, where other threads may look at what is known meanwhile
+            self._solve([block], [from_ns])
+            return
         self._gathered.append(block)
-        self._gathered_ns.append(block.end_ns + self._wait_ns + SOLVED_WITHIN_NS)
+        self._gathered_ns.append(from_ns)
         if len(self._gathered) >= self._together:
             self._solve_gathered()
 
     def _solve_gathered(self) -> None:
-        if not self._gathered:
-            return
-        solver, blocks = self._solver, self._gathered
+        if self._gathered:
+            blocks, told_ns = self._gathered, self._gathered_ns
+            self._gathered, self._gathered_ns = [], []
+            self._solve(blocks, told_ns)
+
+    def _solve(self, blocks: list[Block], told_ns: list[int]) -> None:
+        """Have blocks solved. told_ns: stamps from which on each is told."""
+        solver = self._solver
         solved = self._worker.submit(lambda: solver.solve(blocks))
-        self._coming.extend((from_ns, solved, number) for number, from_ns in enumerate(self._gathered_ns))
-        self._gathered, self._gathered_ns = [], []
+        self._coming.extend((from_ns, solved, number) for number, from_ns in enumerate(told_ns))
 
     def _let_take_effect(self, reached_ns: int) -> None:
         if not self._coming or self._coming[0][0] > reached_ns:
