@@ -132,7 +132,8 @@ def replay(
     result = calibrator.result()
     result = replace(result, days=_named(result.days, recording))
     found += _warnings(result, topics, decoder)
-    told = told_arm_advice(result.estimates, calibrator.parameters)
+    # a configuration that is wrong, such as a late reference, is why the arm is another
+    told = [] if result.suggestion else told_arm_advice(result.estimates, calibrator.parameters)
     found += told
     history = recorder.history(calibrator) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
