@@ -505,7 +505,11 @@ class _Search:
                 as_it_is, turned = (explained(delayed, hypothesis, mounting) for mounting in (np.eye(3), None))
                 if turned.left < CLEARLY * as_it_is.left:
                     agree = "where DVL and reference agree best"
-                    self._mounting_found(nominal_rpy(turned.rotation_dvl_from_body.T), agree)
+                    rpy = nominal_rpy(turned.rotation_dvl_from_body.T)
+                    # a roll that a level vehicle hardly shows is none, unless the data need it
+                    level = (0.0, *rpy[1:])
+                    as_level = explained(delayed, hypothesis, rotation_from_rpy(level).T)
+                    self._mounting_found(level if BETTER * as_level.left <= turned.left else rpy, agree)
         elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
             self._contradictions.append(
                 f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "

@@ -11,8 +11,11 @@ from command_line import fail, succeed
 from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.verification import Word
+from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.replay.navigation import Drift, Navigation, objections
+from validation.surveys.physics import draw, write_survey
 
 
 def vehicle(told: Told, frame: str = "map", antenna=(0.0, 0.0, 0.0), std: float = 0.03) -> None:
@@ -125,3 +128,10 @@ def test_positions_that_claim_metres_and_show_centimetres_are_no_filter_of_the_d
     run = dc.replay(told.write(tmp_path / "bag"))
     assert run.discovery.parameters.use_message_covariance == taken
     assert run.verdict != "reject", run.reasons
+
+
+def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_path):
+    """Survey 23032: 73 degrees of roll were found where there are none, and the pitch came out 2.6 degrees off."""
+    write_survey(draw(23032), tmp_path / "bag")
+    found = discover([tmp_path / "bag"], Parameters())
+    np.testing.assert_allclose(np.abs(found.parameters.mounting_rpy), (0.0, 0.0, math.pi), atol=1e-9)
