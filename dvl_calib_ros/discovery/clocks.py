@@ -155,12 +155,14 @@ def _some(block: SampleBlock) -> SampleBlock:
 def in_time(recording: Recording, topics: Topics, found: Registration) -> Survey:
     """The three streams as they would be stamped by the IMU's clock."""
     seen = recording.whole(topics)
-    looks = dict(seen.looks)
     late = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
-    for name, seconds in late.items():
-        if name in looks:
-            look = looks[name]
-            looks[name] = replace(look, stamps_s=look.stamps_s - seconds)
+    if not found.is_turned:
+        late = {topics.dvl: found.apart.late}
+    # what the log says of their clocks does not count any more
+    looks = {
+        name: replace(look, stamps_s=look.stamps_s - late.get(name, 0.0), ahead_s=0.0)
+        for name, look in seen.looks.items()
+    }
     if topics.dvl in looks:
         looks[topics.dvl] = _thinned(looks[topics.dvl])
     return replace(seen, looks=looks)

@@ -174,7 +174,8 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     found: list[Finding] = []
     for topic in streams.values():
         found += checks.stamp_findings(topic) + checks.gap_findings(topic)
-    if not _has_error(found):
+    # where velocities and turns show how the clocks stand, it does not matter when messages arrived
+    if not _has_error(found) and not _are_clocks_known(discovery):
         found += checks.clock_findings(streams)
     found += checks.velocity_findings(dvl, True)
     if reference is not None:
@@ -201,6 +202,10 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     elif reference is not None:
         found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
     return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
+
+
+def _are_clocks_known(discovery: Discovery) -> bool:
+    return discovery.clocks is not None and discovery.clocks.registration.are_known
 
 
 def _has_error(found: Sequence[Finding]) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 import json
 
 import pytest
+from io_fixtures import rewrite
 
+import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
@@ -13,7 +16,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
-from dvl_calib_ros.simulation.scenario import Scenario, write_bag
+from dvl_calib_ros.simulation.scenario import Scenario, simulate, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
 ARM = -0.6
@@ -90,3 +93,21 @@ def test_what_the_user_gives_stands(tmp_path):
     given = Given(parameters=frozenset({"reference_time_offset"}))
     parameters = Parameters().replace(reference_time_offset=5.0)
     assert discover([bag], parameters, given).parameters.reference_time_offset == 5.0
+
+
+def test_a_clock_that_is_off_beside_the_log_is_taken_off_and_no_reason_against_the_recording(tmp_path, capsys):
+    """Doctor said that the stamps had to be corrected; replay had done so."""
+    errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)
+    run = simulate(Scenario("free", 300.0, 3, errors, gnss_std=0.05))
+    samples = heapq.merge(run.imu, run.gnss, run.dvl, key=lambda sample: sample.stamp_ns)
+
+    def change(name, message):
+        if "gnss" in name:
+            message.header.stamp.sec += 18
+        return message
+
+    ahead = rewrite(tmp_path / "ahead", change, samples)
+    doctor, examined = said("doctor", ahead, tmp_path, capsys)
+    assert examined["verdict"] == "yes" and "stamps are 18.0" in doctor
+    calibration = dc.replay(ahead, history=False)
+    assert calibration.verdict == "accept", calibration.reasons

@@ -51,6 +51,7 @@ class Registration:
 
     Without a reference that an attitude turns, which clock it is does not show: then the reference is in time. apart:
     by how much the DVL's stamps are later than the reference's. is_turned: whether an attitude turns the reference.
+    are_known: whether the data show how the clocks stand, in time or not.
     rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the DVL from the reference
     point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
     speed; spread: the same, m/s per axis.
@@ -61,6 +62,7 @@ class Registration:
     imu: Clock
     apart: Clock
     is_turned: bool
+    are_known: bool
     rotation_body_from_dvl: Array
     turn_std: Array
     lever_arm: Array
@@ -146,6 +148,7 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
         imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
         apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
         is_turned=fit.is_turned,
+        are_known=bool((free.std[[APART, LATE] if fit.is_turned else [APART]] < KNOWN_STD_S).all()),
         rotation_body_from_dvl=best.rotation_body_from_dvl,
         turn_std=std[TURN],
         lever_arm=lever_arm + x[ARM],
