@@ -57,7 +57,9 @@ class FoundClocks:
             clocks["reference_time_offset"] = replace(r.apart, late=-r.apart.late)
         for name, late in r.offsets.items():
             clock = clocks[name]
-            done = f"taken off ({name} {late:.2f})" if name in self.offsets else "left to the calibration, which finds it"
+            done = (
+                f"taken off ({name} {late:.2f})" if name in self.offsets else "left to the calibration, which finds it"
+            )
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
             yield f"{OFFSETS[name]} stamps are {_late(clock)}{which}: {done}"
         if r.apart.is_shown and not r.offsets:

@@ -26,7 +26,7 @@ from wholes import assert_sound
 from dvl_calib_ros.calibration.parameters import SCHEMA
 from dvl_calib_ros.files.result_file import load_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode
-from dvl_calib_ros.node.domain import take_domain
+from dvl_calib_ros.node.domain import give_back, take_domain
 
 _STEPS_NS = (0, 50_000_000, 200_000_000, -50_000_000, 3 * 10**9, -(10**9), 60 * 10**9, 10**17)
 _AT_RUN_TIME = tuple(name for name, spec in SCHEMA.items() if not spec.read_only and name != "result_file")
@@ -34,16 +34,30 @@ _TOPICS = ("dvl/twist", "gnss/twist", "imu/data")
 _MOST_STEPS = 40
 
 
+_domains: dict[CalibrationNode, int] = {}
+
+
 @cache
 def _node(folder: Path) -> CalibrationNode:
-    """One for all inputs, heard by nobody."""
-    context = rclpy.Context()
+    """One for all inputs, heard by nobody, until `end`."""
+    context, domain = rclpy.Context(), take_domain()
     with patch.dict(os.environ, {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_LOG_DIR": str(folder)}):
-        rclpy.init(context=context, domain_id=take_domain())
+        rclpy.init(context=context, domain_id=domain)
     result = Parameter("result_file", value=str(folder / "live.yaml"))
     node = CalibrationNode(context=context, parameter_overrides=[result])
     node.get_logger().set_level(LoggingSeverity.FATAL)
+    _domains[node] = domain
     return node
+
+
+def end() -> None:
+    """End the node, which would else be the first participant of this process for all tests behind."""
+    while _domains:
+        node, domain = _domains.popitem()
+        node.destroy_node()
+        rclpy.shutdown(context=node.context)
+        give_back(domain)
+    _node.cache_clear()
 
 
 def run_live(data: bytes, folder: Path) -> None:

@@ -36,6 +36,14 @@ ARGUMENTS = st.text(max_size=8) | st.sampled_from(["-p", "--params", "--models",
 FRAMES = st.sampled_from(["dvl_link", "base_link", "map", "ned", "", "\x00", "é/"]) | st.text(max_size=5)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def no_node_is_left():
+    """Neither its participant nor its domain are there for other tests of this process."""
+    yield
+    if "live" in TARGETS:
+        sys.modules["live"].end()
+
+
 @st.composite
 def messages(draw):
     """A message of any stream with any content, as rosbags decodes it."""
