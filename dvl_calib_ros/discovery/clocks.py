@@ -29,6 +29,8 @@ OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the referen
 REGISTERED, CLEARLY = 0.3, 0.5
 # A DVL that is late by less is found by the calibration itself (G2), at whatever its stamps say, s.
 LEFT_TO_CALIBRATION_S = 2.5
+# What a clock leaves open of the lever arm is said from here on, m: the calibration's own σ does not hold it.
+SAID_FROM_M = 0.08
 # Clocks of recordings of one calibration are one clock if they agree to this, s.
 ALIKE_S = 0.1
 # Of a stream one sample in so long is registered, ns.
@@ -61,7 +63,11 @@ class FoundClocks:
                 f"taken off ({name} {late:.2f})" if name in self.offsets else "left to the calibration, which finds it"
             )
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
-            yield f"{OFFSETS[name]} stamps are {_late(clock)}{which}: {done}"
+            arm = clock.std * r.speed
+            known = (
+                f"; with it the lever arm ahead is known to {arm:.1f} m" if arm > SAID_FROM_M and r.is_turned else ""
+            )
+            yield f"{OFFSETS[name]} stamps are {_late(clock)}{which}: {done}{known if name in self.offsets else ''}"
         if r.apart.is_shown and not r.offsets:
             yield (
                 f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; whose clock is "

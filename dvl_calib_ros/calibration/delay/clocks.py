@@ -17,9 +17,9 @@ from ..register.registration import register
 from .hold_out import MEASURED_BELOW, Kept, Recording
 
 # Live, what was found stands until so much more is there.
-AGAIN_FROM = 1.25
-# Fewer blocks tell nothing; of more the oldest are forgotten: two hours are enough.
-ENOUGH, MOST = 2, 720
+AGAIN_FROM = 1.5
+# Fewer blocks tell nothing, and live there is no look before a minute; of more the oldest are forgotten.
+ENOUGH, FIRST_LOOK, MOST = 2, 6, 720
 
 
 class KeptClocks:
@@ -45,7 +45,7 @@ class KeptClocks:
 
     def look_again(self) -> None:
         """Look at the clocks if there is so much more to see than the last time."""
-        if not self._over and self._blocks >= AGAIN_FROM * max(self._latest[0], ENOUGH):
+        if not self._over and self._blocks >= max(AGAIN_FROM * self._latest[0], FIRST_LOOK):
             self._latest = self._blocks, self._says(self._kept)
 
     def says(self, *, fresh: bool = True) -> str:

@@ -38,8 +38,8 @@ HELD_STD_S = 1e-4
 LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
 # References that are looked at, evenly spread: more tell little more, and take longer; fewer tell places apart.
 MOST_ROWS, FEW_ROWS = 4000, 800
-# Curves are smoothed on a grid of this step, s, and of a long recording of so many times.
-GRID_S, MOST_GRID = 0.1, 18_000
+# Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.
+GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
 # Rounds at most, and the step (s, m, rad) from which on another one changes nothing.
 ROUNDS, SETTLED_S = 12, 5e-4
 # A delay moves no further in one round, s: slopes hold that far.
@@ -122,14 +122,15 @@ class Curves:
         reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
         reach = np.clip(reach, LEAST_SLOPE_REACH_S, None)
         reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(REACH_INTERVALS * typical, MOST_REACH_S))
-        fit = local_fit(times, motion.dvl.velocity, self._grid, reach)
-        self._velocity = np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]])
-        self._found = fit.found
+        fits = [local_fit(times, motion.dvl.velocity, self._grid[at], reach[at]) for at in _parts(len(self._grid))]
+        self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
+        self._found = np.concatenate([fit.found for fit in fits])
         self._turns, self._turns_start = np.zeros((2, 3)), 0.0
         if len(motion.turns.times) > 1:
             grid = np.arange(motion.turns.times[0], motion.turns.times[-1] + self._step, self._step)
             self._turns_start = float(grid[0])
-            self._turns = np.nan_to_num(angular_velocity_at(motion.turns, grid, GAP_S)[0])
+            rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
+            self._turns = np.nan_to_num(np.concatenate(rates))
 
     def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
         """At times (J,) s: velocity (J, 3), slope (J, 3), noise gain of the slope (J,), and whether there is one."""
@@ -146,6 +147,11 @@ class Curves:
         place = (at - start) / self._step
         before = np.clip(place, 0, n - 2).astype(np.intp)
         return before, (place - before)[:, None], (place >= 0.0) & (place <= n - 1)
+
+
+def _parts(n: int) -> list[slice]:
+    """N places in parts: windows about all of them at once would take more memory than a node should."""
+    return [slice(first, first + AT_ONCE) for first in range(0, n, AT_ONCE)]
 
 
 def _between(values: Array, before: Index, share: Array) -> Array:

@@ -54,7 +54,7 @@ class Registration:
     are_known: whether the data show how the clocks stand, in time or not.
     rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the DVL from the reference
     point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
-    speed; spread: the same, m/s per axis.
+    speed; spread: the same, m/s per axis; speed: RMS, m/s.
     """
 
     dvl: Clock
@@ -71,6 +71,7 @@ class Registration:
     scale_std: float
     left: float
     spread: float
+    speed: float
 
     @property
     def offsets(self) -> dict[str, float]:
@@ -157,6 +158,7 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
         scale_std=float(std[SCALE]),
         left=best.level * math.sqrt(3.0) / max(best.speed, 1e-9),
         spread=best.level,
+        speed=best.speed,
     )
 
 
