@@ -49,7 +49,7 @@ class Assembler:
             if model.in_correction_parameters
         }
         # by how many of its rows are left where axes of the reference are not measured
-        self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m)])
+        self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
         self._gate = np.full((len(self.models), 1), self._gates[0])
         self._needs_prior = np.array([model.needs_prior for model in self.models])
         rate = np.zeros(self.start.p.shape)
