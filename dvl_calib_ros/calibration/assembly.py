@@ -172,8 +172,11 @@ def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float
     """Two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: of a sample, on average.
 
     Gated samples are not in the mean, so it is that of a chi-square variable cut off at the gate:
-    E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal.
+    E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal. Zero where references
+    measured no axis.
     """
+    if rows <= 0.0:
+        return 0.0, 0.0
     m, gate = rows, gate_of(rows, parameters)
     inside = chi2_cdf(gate, m)
     mean = m * chi2_cdf(gate, m + 2) / inside

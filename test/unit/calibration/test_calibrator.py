@@ -695,6 +695,9 @@ INDEFINITE = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 @example(  # roll hardly bound by the prior nor shown: Newton's method ran away
     {"gnss_aided_std": 1e-4, "motion_std": 1e-4, "initial_std_misalignment": 1.0}, [], VelocityFrame.BODY, 64
 )
+@example(  # references that say of every axis that they do not measure it
+    {"gnss_axes": "xy"}, [(ReferenceSample, 2, np.diag([1000.0, 1000.0, 0.0]))], VelocityFrame.BODY, 1
+)
 @searched(40)
 @given(
     given_values=settings_inside_their_bounds(),
