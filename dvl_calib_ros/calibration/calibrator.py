@@ -579,6 +579,11 @@ class Calibrator:
         return next((each.suggestion for each in self._further if each.suggestion), "")
 
     @property
+    def are_clocks_known(self) -> bool:
+        """Whether the data show how the clocks stand, in time or not."""
+        return any(each.registration is not None and each.registration.are_known for each in self._further)
+
+    @property
     def suggestion_so_far(self) -> str:
         """`suggestion`, live: what a look that is not made anew for every message says."""
         return next((each.suggestion_so_far for each in self._further if each.suggestion_so_far), "")

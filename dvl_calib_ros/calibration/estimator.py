@@ -24,6 +24,7 @@ from .kalman import GaussianState
 from .models import Model
 from .models.plugged import load
 from .parameters import ParameterError, Parameters
+from .register.registration import Registration
 from .results import Day
 from .samples import Index, Stamps
 from .selection import NO_EVIDENCE, Evidence
@@ -85,6 +86,11 @@ class Estimator(ABC):
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; ''."""
         return ""
+
+    @property
+    def registration(self) -> Registration | None:
+        """How the instruments stand, by their data alone; None for one that does not look."""
+        return None
 
     @property
     def suggestion_so_far(self) -> str:

@@ -115,7 +115,7 @@ _KINDS = (
     # clocks and stamps
     FindingKind(
         "CLOCKS_DIFFER",
-        "{stream} stamps are {seconds:.0f} s {side} the DVL's and cannot be paired",
+        "{stream} stamps are {seconds:.0f} s {side} the {other}'s and cannot be paired",
         "The two drivers stamp by different clocks.",
         "set both clocks by the same source (PTP, NTP or GNSS)",
     ),

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.coarse_mounting import DELAYS_S
 from ..calibration.directions import Directions
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
+from ..calibration.register.arrival import limit_s
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
@@ -140,13 +140,13 @@ def _clocks(recording: Recording, found: Discovery, given: Given) -> FoundClocks
     return find_clocks(recording, found.topics, found.parameters, knows_mounting=knows_mounting, given=given.parameters)
 
 
-def _in_time_of(dvl: Look, other: Look | None) -> Look | None:
+def _in_time_of(dvl: Look, other: Look | None, parameters: Parameters) -> Look | None:
     """By stamps as the DVL's clock would have them, where clocks differ by more than any delay that is looked for.
 
     Velocities of different times agree in any frame but the right one; what it says of the clocks the replay says.
     """
     ahead_s = 0.0 if other is None else other.ahead_s - dvl.ahead_s
-    if other is None or abs(ahead_s) <= DELAYS_S[-1]:
+    if other is None or abs(ahead_s) <= limit_s(parameters):
         return other
     return replace(other, stamps_s=other.stamps_s - ahead_s)
 
@@ -169,7 +169,7 @@ class _Search:
         looks = self._seen.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
         if dvl is not None:
-            self._frames(dvl, _in_time_of(dvl, reference), _in_time_of(dvl, imu))
+            self._frames(dvl, *(_in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
         self._found.insert(0, self._topics_said(topics))
         return Discovery(
             topics,

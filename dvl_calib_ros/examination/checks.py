@@ -8,7 +8,9 @@ import numpy as np
 
 from ..calibration.findings import Finding
 from ..calibration.frames import Array
-from ..calibration.parameters import SCHEMA
+from ..calibration.parameters import SCHEMA, Parameters
+from ..calibration.register.arrival import apart
+from ..calibration.samples import Stream
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recorded import Recorded
 from .kinds import named
@@ -24,8 +26,8 @@ MOST = 0.95
 JITTER = 0.05
 # ... against the rhythm of the sensor: an interval too long is followed by one too short (white jitter gives -0.5)
 AGAINST_RHYTHM = -0.3
-# Two clocks that agree to this are one; more than transport and processing make (s)
-SAME_CLOCK = 1.0
+# Stamps that step by so much more than the log have been set (s)
+SET_CLOCK = 1.0
 # A silence is a gap from this on, and from so many intervals (s, 1)
 GAP, GAP_INTERVALS = 2.0, 5.0
 # A claimed noise is wrong if it is so many times what the data show, or so small a share of it
@@ -60,7 +62,7 @@ def stamp_findings(topic: Recorded) -> list[Finding]:
         seconds = float(-steps[back].min())
         found.append(named("DOCTOR_STAMP_BACK", topic=topic.topic, count=int(back.sum()), seconds=seconds))
     ahead = steps - log_steps
-    if ahead.max() > SAME_CLOCK:
+    if ahead.max() > SET_CLOCK:
         found.append(named("DOCTOR_STAMP_JUMP", topic=topic.topic, seconds=float(ahead.max())))
     repeated = float((steps == 0.0).mean())
     if repeated > SOME:
@@ -108,35 +110,21 @@ def clock_offset_s(topic: Recorded) -> float | None:
     return float(np.median(topic.stamps_ns[stamped] - topic.log_ns[stamped])) * 1e-9 if stamped.any() else None
 
 
-def clock_findings(topics: Mapping[str, Recorded]) -> list[Finding]:
+def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> list[Finding]:
     """Streams (by dvl, reference, imu) that stamp by another clock than the rest."""
-    offsets = {role: clock_offset_s(topic) for role, topic in topics.items()}
-    known = {role: offset for role, offset in offsets.items() if offset is not None}
-    if len(known) < 2:
-        return []
-    # of three the one that is alone; of two the one that is not the DVL
-    middle = float(np.median(list(known.values()))) if len(known) > 2 else known.get("dvl", 0.0)
-    other = min(known, key=lambda role: abs(known[role] - middle))
+    offsets = {Stream(role): clock_offset_s(topic) for role, topic in topics.items()}
     found = []
-    for role, offset in known.items():
-        if role != other and abs(offset - middle) > SAME_CLOCK:
-            late = offset - middle
-            parameter = {"dvl": "dvl", "reference": "reference", "imu": "imu"}[role] + "_time_offset"
-            bound = SCHEMA[parameter].high
-            can_be_taken_off = bound is not None and abs(late) <= bound
-            fields = {
-                "seconds": abs(late),
-                "side": "after" if late > 0.0 else "before",
-                "here": f"for this bag: -p {parameter}:={late:.2f}" if can_be_taken_off else "correct the stamps",
-            }
-            found.append(
-                named(
-                    "DOCTOR_CLOCKS",
-                    topic=topics[role].topic,
-                    other=topics[other].topic,
-                    **fields,
-                )
-            )
+    for each in apart({stream: ahead for stream, ahead in offsets.items() if ahead is not None}, parameters):
+        name = f"{each.stream.value}_time_offset"
+        late, bound = getattr(parameters, name) + each.ahead, SCHEMA[name].high
+        can_be_taken_off = bound is not None and abs(late) <= bound
+        fields = {
+            "seconds": abs(each.ahead),
+            "side": "after" if each.ahead > 0.0 else "before",
+            "here": f"for this bag: -p {name}:={late:.2f}" if can_be_taken_off else "correct the stamps",
+        }
+        topic, other = topics[each.stream.value].topic, topics[each.other.value].topic
+        found.append(named("DOCTOR_CLOCKS", topic=topic, other=other, **fields))
     return found
 
 

@@ -176,7 +176,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found += checks.stamp_findings(topic) + checks.gap_findings(topic)
     # where velocities and turns show how the clocks stand, it does not matter when messages arrived
     if not _has_error(found) and not _are_clocks_known(discovery):
-        found += checks.clock_findings(streams)
+        found += checks.clock_findings(streams, discovery.parameters)
     found += checks.velocity_findings(dvl, True)
     if reference is not None:
         if not _has_error(found):  # which would be why

@@ -22,7 +22,9 @@ from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import scale_and_delay
 from ..calibration.parameters import Parameters
+from ..calibration.register.arrival import apart
 from ..calibration.results import Estimate
+from ..calibration.samples import Stream
 from ..messages.drivers import VelocityType
 
 # A stream that has brought nothing usable for so long is silent, s.
@@ -33,6 +35,7 @@ _PIECES = 6
 
 Counts = Mapping[str, Mapping[str, int]]
 _NOT_TAKEN = {"invalid", "duplicate", "out_of_order", "stray", "held", "before_restart"}
+_NAMED = {Stream.DVL: "DVL", Stream.REFERENCE: "GNSS", Stream.IMU: "IMU"}
 _SILENT = {"dvl": ("DVL_SILENT", "dvl/twist"), "imu": ("IMU_SILENT", "imu/data")}
 
 
@@ -91,21 +94,27 @@ class Silence:
             elif silent_s[stream] > SILENCE_S:
                 faults[stream] = finding(code, seconds=silent_s[stream], topic=topic)
         coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
-        return faults | _other_times(newest_ns, coming, calibrator.parameters.max_time_jump)
+        return faults | _other_times(newest_ns, coming, calibrator.parameters)
 
 
-def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], max_jump_s: float) -> dict[str, Finding]:
-    """Of the streams that come, those whose stamps are far from the DVL's."""
-    dvl_ns = newest_ns["dvl"]
-    if dvl_ns is None or "dvl" not in coming:
+def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters) -> dict[str, Finding]:
+    """Of the streams that come, those whose stamps are far from the others'."""
+    known = {stream: ns for stream, ns in newest_ns.items() if stream in coming and ns is not None}
+    dvl_ns = known.get("dvl")
+    if dvl_ns is None:
         return {}
-    faults = {}
-    for stream, name in (("reference", "GNSS"), ("imu", "IMU")):
-        ns = newest_ns[stream]
-        if stream in coming and ns is not None and abs(ns - dvl_ns) > max_jump_s * 1e9:
-            side = "ahead of" if ns > dvl_ns else "behind"
-            faults[stream] = finding("CLOCKS_DIFFER", stream=name, seconds=abs(ns - dvl_ns) * 1e-9, side=side)
-    return faults
+    # the newest of one that comes may have come a while ago
+    ahead = {Stream.DVL: 0.0} | {Stream(stream): 1e-9 * (ns - dvl_ns) for stream, ns in known.items()}
+    return {
+        each.stream.value: finding(
+            "CLOCKS_DIFFER",
+            stream=_NAMED[each.stream],
+            seconds=abs(each.ahead),
+            side=each.side,
+            other=_NAMED[each.other],
+        )
+        for each in apart(ahead, parameters, SILENCE_S)
+    }
 
 
 def diagnose(

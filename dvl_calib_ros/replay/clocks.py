@@ -6,13 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.delay.rows import LONGEST_DELAY_S
 from ..calibration.parameters import Parameters
+from ..calibration.register.arrival import apart
 from ..calibration.robust import median
 from ..calibration.samples import SampleBlock, Stamps, Stream, Streams
 from ..calibration.verification import Word
 
-SPOKEN: Mapping[Stream, str] = {Stream.REFERENCE: "the reference's", Stream.IMU: "the IMU's"}
+SPOKEN: Mapping[Stream, str] = {
+    Stream.DVL: "the DVL's",
+    Stream.REFERENCE: "the reference's",
+    Stream.IMU: "the IMU's",
+}
 # Seconds by which a well-known clock is ahead of UTC, to the second (since 2017).
 WELL_KNOWN = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37: "TAI is 37 s ahead of UTC"}
 
@@ -25,7 +29,7 @@ class StreamClocks:
     """Of messages the stamp against that of the DVL's message that arrived last before it."""
 
     def __init__(self) -> None:
-        self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in SPOKEN}
+        self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in (Stream.REFERENCE, Stream.IMU)}
 
     def add(self, streams: Streams) -> None:
         """Take what arrived one after the other."""
@@ -38,24 +42,19 @@ class StreamClocks:
 
     def objections(self, parameters: Parameters) -> list[tuple[Word, str]]:
         """What clocks that differ by more than any model looks for say against every calibration."""
-        offsets = {Stream.REFERENCE: parameters.reference_time_offset, Stream.IMU: parameters.imu_time_offset}
+        ahead = {Stream.DVL: 0.0}
+        for stream, spread in self._ahead.items():
+            if len(spread.kept):
+                ahead[stream] = float(median(1e-9 * spread.kept))
         said = []
-        for stream, whose in SPOKEN.items():
-            ahead_ns = self._ahead[stream].kept
-            if not len(ahead_ns):
-                continue
-            # as stamped, and as corrected: samples that are old when they are stamped arrive by neither clock's fault
-            stamped_s = float(median(1e-9 * ahead_ns))
-            ahead_s = stamped_s - offsets[stream] + parameters.dvl_time_offset
-            if min(abs(stamped_s), abs(ahead_s)) <= LONGEST_DELAY_S + parameters.position_window:
-                continue
-            known = WELL_KNOWN.get(round(abs(ahead_s)))
-            side = "ahead of" if ahead_s > 0.0 else "behind"
+        for each in apart(ahead, parameters):
+            known = WELL_KNOWN.get(round(abs(each.ahead)))
             said.append(
                 (
                     Word.REJECT,
-                    f"{whose} stamps are {abs(ahead_s):.1f} s {side} those of the DVL's messages with which they came"
-                    f"{f' ({known})' if known else ''}: set the clocks by one source, correct the recording's stamps",
+                    f"{SPOKEN[each.stream]} stamps are {abs(each.ahead):.1f} s {each.side} {SPOKEN[each.other]} with "
+                    f"which they came{f' ({known})' if known else ''}: set the clocks by one source, correct the "
+                    "recording's stamps",
                 )
             )
         return said

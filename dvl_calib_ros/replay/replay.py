@@ -140,7 +140,9 @@ def replay(
     if navigation is not None:
         deviates = heading_advice(navigation.deviation)
         found += deviates
-    of_drift, of_clocks = objections(navigation), clocks.objections(parameters)
+    of_drift = objections(navigation)
+    # where the data show how the clocks stand, it does not matter when messages arrived
+    of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
     of_clocks += [(Word.MARGINAL, each.says) for each in told]
     if navigation is not None and navigation.deviation is not None and navigation.deviation.rms > FIRST:
         of_clocks += [(Word.MARGINAL, each.says) for each in deviates]

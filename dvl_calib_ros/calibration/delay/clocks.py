@@ -13,7 +13,7 @@ import numpy as np
 
 from ..parameters import Parameters
 from ..register.motion import Motion, make_motion
-from ..register.registration import register
+from ..register.registration import Registration, register
 from .hold_out import MEASURED_BELOW, Kept, Recording
 
 # Live, what was found stands until so much more is there.
@@ -29,8 +29,8 @@ class KeptClocks:
         self._parameters = parameters
         self._kept: deque[Kept] = deque(maxlen=MOST)
         self._blocks = 0  # of this day
-        self._over = ""  # of a day that is over
-        self._latest = (0, "")
+        self._over: Registration | None = None  # of a day that is over, where a clock was off
+        self._latest: tuple[int, Registration | None] = (0, None)
 
     def add(self, kept: Kept) -> None:
         """Take a block's streams."""
@@ -39,36 +39,40 @@ class KeptClocks:
 
     def end_day(self) -> None:
         """The blocks from here on are of another day, whose clocks may be others."""
-        self._over = self.says()
+        found = self.registration()
+        self._over = found if found is not None and found.says(self._parameters) else None
         self._kept.clear()
-        self._blocks, self._latest = 0, (0, "")
+        self._blocks, self._latest = 0, (0, None)
 
     def look_again(self) -> None:
         """Look at the clocks if there is so much more to see than the last time."""
-        if not self._over and self._blocks >= max(AGAIN_FROM * self._latest[0], FIRST_LOOK):
-            self._latest = self._blocks, self._says(self._kept)
+        if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest[0], FIRST_LOOK):
+            self._latest = self._blocks, self._registered()
 
-    def says(self, *, fresh: bool = True) -> str:
-        """What configuration the blocks so far fit, in words, where a clock is off; else ''.
+    def registration(self, *, fresh: bool = True) -> Registration | None:
+        """How the instruments stand by the blocks so far, or on a day that is over, where a clock was off.
 
-        fresh: of all of them, else of those there were when `look_again` looked.
+        fresh: by all of them, else by those there were when `look_again` looked.
         """
-        if self._over:
+        if self._over is not None:
             return self._over
         if fresh and self._blocks > self._latest[0]:
-            self._latest = self._blocks, self._says(self._kept)
+            self._latest = self._blocks, self._registered()
         return self._latest[1]
 
-    def _says(self, kept: Collection[Kept]) -> str:
-        motion = _motion(kept) if len(kept) >= ENOUGH else None
+    def says(self, *, fresh: bool = True) -> str:
+        """What configuration these blocks fit, in words, where a clock is off; else ''."""
+        found = self.registration(fresh=fresh)
+        return "" if found is None else found.says(self._parameters)
+
+    def _registered(self) -> Registration | None:
+        motion = _motion(self._kept) if len(self._kept) >= ENOUGH else None
         if motion is None:
-            return ""
-        p = self._parameters
+            return None
         try:
-            found = register(motion, p.rotation_dvl_from_body.T, np.array(p.lever_arm))
+            return register(motion, self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm))
         except np.linalg.LinAlgError:  # numbers that ran away
-            return ""
-        return "" if found is None else found.says(p)
+            return None
 
 
 def _motion(kept: Collection[Kept]) -> Motion | None:

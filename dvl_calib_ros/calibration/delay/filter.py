@@ -24,6 +24,7 @@ from ..folds import Moments
 from ..frames import Array
 from ..history import Counts, Numbers, StateTrace
 from ..kalman import GaussianState
+from ..register.registration import Registration
 from ..results import Day
 from ..samples import Index, Stamps, Verdict
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
@@ -169,6 +170,12 @@ class DelayFilter(Estimator):
         if self._suggested is None or self._suggested[0] is not newest:  # asked for more often than there is a block
             self._suggested = newest, self._solver.suggestion()
         return self._suggested[1]
+
+    @property
+    def registration(self) -> Registration | None:
+        """How the instruments stand, by their data alone; None where these do not show it."""
+        self._newest()
+        return self._solver.registration()
 
     @property
     def suggestion_so_far(self) -> str:

@@ -18,6 +18,7 @@ from ..coarse_mounting import DELAYS_S, CoarseFits
 from ..frames import Array
 from ..kalman import GaussianState
 from ..parameters import Parameters
+from ..register.registration import Registration
 from ..samples import FRAMES, Mask, Stamps
 from ..shared_noise import SharedNoise
 from .bank import DelayBank, Found, Posterior
@@ -120,6 +121,10 @@ class BlockSolver:
         if shared := self._shared_noise.says():
             return shared
         return self._clocks.says(fresh=fresh)
+
+    def registration(self) -> Registration | None:
+        """How the instruments stand; None where the data do not show it."""
+        return self._clocks.registration()
 
     def solve(self, blocks: Sequence[Block]) -> list[Outcome]:
         """Take blocks in order: many at once cost a third of one after the other, and come to the same."""
