@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 PACKAGE = Path(__file__).resolve().parents[1] / "dvl_calib_ros"
 _BASE = ("errors",)
@@ -59,15 +61,34 @@ def modules() -> Iterator[Path]:
     yield from sorted(PACKAGE.rglob("*.py"))
 
 
+class _Text(NamedTuple):
+    """What the text of a module shows: its lines of code, and its relative imports (level, module, names)."""
+
+    lines: int
+    imports: tuple[tuple[int, str, tuple[str, ...]], ...]
+
+
+@lru_cache(maxsize=None)  # parsing all modules takes a second and a half, and each question is about all of them
+def _look(text: str) -> _Text:
+    code, imports = set(), []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.strip().startswith("#"):
+            code.add(number)
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            code -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+        elif isinstance(node, ast.ImportFrom) and node.level:
+            imports.append((node.level, node.module or "", tuple(alias.name for alias in node.names)))
+    return _Text(len(code), tuple(imports))
+
+
 def imported_by(path: Path) -> set[str]:
     """Other rooms that a file imports, also within functions and for types alone."""
     inside = path.relative_to(PACKAGE).parent.parts
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            above = inside[: len(inside) - (node.level - 1)]
-            full = [*above, *(node.module.split(".") if node.module else [])]
-            found |= {full[0]} if full else {alias.name for alias in node.names if alias.name != "__version__"}
+    for level, module, names in _look(path.read_text()).imports:
+        full = [*inside[: len(inside) - (level - 1)], *filter(None, module.split("."))]
+        found |= {full[0]} if full else {name for name in names if name != "__version__"}
     return found - {room_of(path)}
 
 
@@ -88,15 +109,7 @@ def arrows_up() -> list[tuple[str, str]]:
 
 def lines_of_code(text: str) -> int:
     """Lines that are neither blank, comment nor docstring."""
-    code = set()
-    tree = ast.parse(text)
-    for number, line in enumerate(text.splitlines(), start=1):
-        if line.strip() and not line.strip().startswith("#"):
-            code.add(number)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            code -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return len(code)
+    return _look(text).lines
 
 
 def sizes() -> Counter[str]:

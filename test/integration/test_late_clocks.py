@@ -44,10 +44,10 @@ def said(command, bag, tmp_path, capsys):
 @pytest.mark.parametrize(
     "late",
     [
-        {"reference_time_offset": 0.8},
         {"reference_time_offset": 5.0},
-        {"reference_time_offset": 30.0},
-        {"dvl_time_offset": 7.5},
+        pytest.param({"reference_time_offset": 0.8}, marks=pytest.mark.slow),
+        pytest.param({"reference_time_offset": 30.0}, marks=pytest.mark.slow),
+        pytest.param({"dvl_time_offset": 7.5}, marks=pytest.mark.slow),
         {"attitude_time_offset": 2.0},
         {"dvl_time_offset": 5.0, "reference_time_offset": 2.5},
     ],

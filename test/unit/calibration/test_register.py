@@ -59,7 +59,10 @@ def registered(*args, **late) -> Registration:
 @pytest.mark.parametrize(
     "rate", [pytest.param(1.0, marks=pytest.mark.slow), 5.0, pytest.param(10.0, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("seconds", [0.0, 0.8, 2.5, 5.0, 7.5, 30.0])
+@pytest.mark.parametrize(
+    "seconds",
+    [0.0, 0.8, pytest.param(2.5, marks=pytest.mark.slow), 5.0, pytest.param(7.5, marks=pytest.mark.slow), 30.0],
+)
 @pytest.mark.parametrize("stream", ["dvl", "reference"])
 def test_a_late_clock_is_found_and_no_other(trajectory, rate, seconds, stream):
     found = registered(trajectory, rate, **{stream: seconds})
@@ -119,6 +122,7 @@ def test_a_straight_leg_at_one_speed_shows_no_clock():
         assert found.offsets == {} and found.says(Parameters()) == ""
 
 
+@pytest.mark.slow
 def test_sigmas_of_the_clocks_and_the_arm_are_what_runs_scatter_by():
     z = []
     for seed in range(12):
