@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -68,7 +68,7 @@ class _Text(NamedTuple):
     imports: tuple[tuple[int, str, tuple[str, ...]], ...]
 
 
-@lru_cache(maxsize=None)  # parsing all modules takes a second and a half, and each question is about all of them
+@cache  # parsing all modules takes a second and a half, and each question is about all of them
 def _look(text: str) -> _Text:
     code, imports = set(), []
     for number, line in enumerate(text.splitlines(), start=1):
