@@ -106,12 +106,19 @@ class AttitudeRates:
             self._both[frame] += a.T @ in_body
             self._rates[frame] += in_body.T @ in_body
 
+    @property
+    def is_level(self) -> bool:
+        """Whether the attitude is a heading alone, without roll and pitch."""
+        return self._n >= ENOUGH and not self._tilted
+
     def says(self) -> str:
         """What the data fit, in words, where attitude and angular velocity do not agree; else ''."""
         shown = slice(None) if self._tilted else slice(2, None)  # of a heading alone, what is about the vertical
         total = float(np.trace(self._turning[shown, shown]))
         if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
             return ""
+        if not self._rates[_BODY].any():
+            return "the data fit an IMU without angular velocity (exactly 0 in every message)"
         given = self._left(_BODY, np.eye(3), shown)
         if given < WRONG_FROM * total:
             return ""
@@ -133,7 +140,7 @@ class AttitudeRates:
         """Frames of the angular velocity, and B (3, 3), that may be what was recorded, and each in words."""
         yield from ((_BODY, matrix, words) for words, matrix in CONVENTIONS)
         both, rates = self._both[_BODY], self._rates[_BODY]
-        scale = float(np.trace(both) / np.trace(rates)) if np.trace(rates) > 0.0 else 1.0
+        scale = float(np.trace(both) / np.trace(rates))
         if scale > 0.0 and abs(math.log(scale)) > SCALED_FROM:
             in_degrees = abs(math.log(scale * 180.0 / math.pi)) < SCALED_FROM
             size = "in degrees per second" if in_degrees else f"that is {1.0 / scale:.2g} times as large"

@@ -10,8 +10,10 @@ question that is asked of it is a method.)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -35,12 +37,15 @@ from .observations import Observations
 from .observe import Observer
 from .parameters import ParameterError, Parameters
 from .results import Day, Estimate, Result
+from .robust import median
 from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
-from .verification import Verification, verify
+from .verification import SEVERAL, Verification, verify
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
+# An error of so many times the usual one is that of an outlier.
+OUTLYING = 5.0
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
 SAMPLES_OF_A_BLOCK = 128
 
@@ -499,12 +504,13 @@ class Calibrator:
 
     def verification(self, name: str) -> Verification:
         """The verdict on one model's calibration, by hold-out; for a calibrator made with ``verified``."""
-        estimate = self.estimate(name)
+        estimate = self._without_tilt(self.estimate(name))
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         judge = next(group for group in self._groups if group.needs is Needs.REFERENCE)
         self._update(judge)
         estimator = self._estimators[name]
         held_out = estimator.held_out_error(judge.moments, self.parameters.rotation_dvl_from_body)
+        is_large = held_out is not None and held_out.corrected > SEVERAL * held_out.predicted
         return verify(
             model,
             state,
@@ -516,7 +522,22 @@ class Calibrator:
             any(each.reference_claims for each in self._further),
             next((each.doubt for each in self._further if each.doubt), "") if model.aided else "",
             bool(model.estimator) and estimator.claims,
+            self._typical_error(model, state) if is_large else None,
         )
+
+    def _typical_error(self, model: Model, state: GaussianState) -> float | None:
+        """Velocity error of a state, m/s rms, without outliers; None where nothing was kept."""
+        kept = self.recording
+        if kept is None:
+            return None
+        x, recording = state.x, kept[0]
+        terms = Terms.of_state(x) if model.estimator else Terms(model.error_terms_from_state @ x, np.zeros(3), 0.0)
+        error = recording.compared(np.arange(len(recording.dvl.times)), terms, self.parameters).error
+        square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
+        if not len(square):
+            return None
+        good = square[square <= OUTLYING**2 * median(square)]
+        return math.sqrt(float(good.mean()))
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """For every fold what one model corrects on every day, had it not seen that fold; for one made ``verified``.
@@ -553,7 +574,7 @@ class Calibrator:
         return Result(
             selected=self.selected,
             selected_because=self.selection.reason(self.parameters),
-            estimates={name: self.estimate(name) for name in self._models},
+            estimates={name: self._without_tilt(self.estimate(name)) for name in self._models},
             segments=tuple(self.selection.segments),
             counts=self.counts,
             first_ns=self.first_ns,
@@ -563,6 +584,28 @@ class Calibrator:
             suggestion=self.suggestion,
             days=self.days,
             days_of=next((name for name in self._models if self._days_of(name)), ""),
+        )
+
+    @property
+    def is_level(self) -> bool:
+        """Whether references were turned into the body by a heading alone: roll and pitch then hold the trim."""
+        return any(each.is_level for each in self._further)
+
+    def _without_tilt(self, estimate: Estimate) -> Estimate:
+        """Where no roll and pitch of the vehicle are known, an estimate that claims none of the DVL."""
+        model, p = MODELS[estimate.model], self.parameters
+        if not (model.aided and self.is_level):
+            return estimate
+        level = p.rotation_dvl_from_body[:, :2]
+        unknown = np.zeros((model.n_state, model.n_state))
+        unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
+        own = estimate.recording_covariance + unknown
+        return replace(
+            estimate,
+            covariance=estimate.covariance + unknown,
+            recording_covariance=own,
+            convergence=convergence(model, own, p),
+            observability=observability(model, own, p),
         )
 
     def _days_of(self, name: str) -> tuple[Day, ...]:

@@ -88,6 +88,11 @@ class Estimator(ABC):
         return ""
 
     @property
+    def is_level(self) -> bool:
+        """Whether the attitude that turns references into the body is a heading alone, without roll and pitch."""
+        return False
+
+    @property
     def registration(self) -> Registration | None:
         """How the instruments stand, by their data alone; None for one that does not look."""
         return None

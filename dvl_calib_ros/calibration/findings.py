@@ -376,6 +376,35 @@ _KINDS = (
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
     FindingKind(
+        "IMU_LEVEL",
+        "the IMU's orientation is a heading alone (roll and pitch are 0 in every message), so the DVL's roll and pitch "
+        "are not known",
+        "What the vehicle is trimmed by looks like a mounting of the DVL, and the same IMU will not take it off again.",
+        "record an IMU that gives roll and pitch",
+    ),
+    FindingKind(
+        "TILT_NOT_FOLLOWED",
+        "the DVL's velocity does not turn with the vehicle's {axis}: it leaves {share:.1f} ± {std:.1f} of it, which "
+        "makes {off:.1f}° of mounting",
+        "1: the driver has turned the velocity into a level frame. 2 or -2: the IMU's angle, or an axis of the DVL, "
+        "has the other sign. Either way the mean of the angle over the run looks like a mounting.",
+        "have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
+    ),
+    FindingKind(
+        "DVL_BIAS",
+        "the DVL is off by the same velocity at every speed, {axes} mm/s in the body: {degrees:.1f}° at the usual one",
+        "A bias of the DVL's electronics, a rounding, or water that moves in its shell. At one speed nothing tells it "
+        "from a mounting.",
+        "take the bias off in the driver, or have the DVL serviced",
+    ),
+    FindingKind(
+        "VELOCITY_SMOOTHED",
+        "the {name} is smoothed over {seconds:.1f} s",
+        "A filter that follows late cuts corners: in turns its velocity is that of another motion, of which the "
+        "calibration makes a roll, a lever arm and a delay.",
+        "record the velocity before it is filtered",
+    ),
+    FindingKind(
         "LEVER_ARM_CONTRADICTED",
         "the data show another lever arm than the one that was given: {axes}",
         "The place that was given is wrong, or something else is that looks like it: heading, turn rates or clock of "

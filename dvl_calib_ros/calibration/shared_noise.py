@@ -33,6 +33,8 @@ LEAST_NOISE_MPS = 1e-4
 ENOUGH, FEWEST = 12, 30
 # Share of the noise from which it is said, and by how many standard deviations, of the stretches' scatter, it is more.
 SHARED_FROM, SURE_FROM = 0.1, 4.0
+# ... and the same where the vehicle's own steps are taken to be as found, and not as large as they may be.
+PASSED_FROM, PASSED_SURE_FROM = 0.06, 4.5
 # Noise is so much of the differences at least, or they are the vehicle's own.
 LEAST_SHARE = 0.3
 # Differences that have no sample in common correlate by less: those of a vehicle that shakes do not.
@@ -97,6 +99,9 @@ class SharedNoise:
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
         best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
         c_4, v_4, steps = mean[best].tolist()
+        passed, own = c_4 - max(steps, 0.0), v_4 - max(steps, 0.0)
+        if own > LEAST_SHARE * v_4 and passed > max(PASSED_FROM * own, PASSED_SURE_FROM * float(std[best, 0])):
+            return passed / own  # a filter that smooths passes little on, and adds little: it is the surer for that
         steps = max(steps, 0.0) + 2.0 * float(std[best, 2])
         noise = v_4 - steps
         if noise < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):

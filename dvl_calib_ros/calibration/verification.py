@@ -137,6 +137,7 @@ def verify(
     reference_claims: bool = True,
     lever_arm_turns: str = "",
     finds_lever_arm: bool = False,
+    typical_error: float | None = None,
 ) -> Verification:
     """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
 
@@ -152,6 +153,7 @@ def verify(
     reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
     lever_arm_turns: How much of an angle is the lever arm's, in words, if the motion does not tell them apart.
     finds_lever_arm: Whether it is in σ of the angles, and not taken as known.
+    typical_error: Velocity error without outliers, m/s rms, where that on held-out samples is large.
 
     """
     findings = [
@@ -160,7 +162,7 @@ def verify(
         *([(Word.REJECT, f"{suggestion}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
-        _error_finding(held_out, parameters, reference_claims),
+        _error_finding(held_out, parameters, reference_claims, typical_error),
     ]
     findings.sort(key=lambda finding: _SEVERITY.index(finding[0]))
     reasons = tuple(sentence for _, sentence in findings)
@@ -230,7 +232,9 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     return findings
 
 
-def _error_finding(held_out: HeldOutError | None, parameters: Parameters, reference_claims: bool) -> Finding:
+def _error_finding(
+    held_out: HeldOutError | None, parameters: Parameters, reference_claims: bool, typical_error: float | None
+) -> Finding:
     if held_out is None:
         return Word.MARGINAL, "too few samples with a reference velocity to verify it on held-out data"
     uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
@@ -242,6 +246,8 @@ def _error_finding(held_out: HeldOutError | None, parameters: Parameters, refere
     if corrected**2 - uncorrected**2 > WORSE_FROM * held_out.calibration**2:
         return Word.REJECT, f"{found}: the calibration makes it worse"
     if corrected > SEVERAL * predicted:
+        if typical_error is not None and typical_error < SEVERAL * predicted:
+            return Word.MARGINAL, f"{found}, {typical_error:.3f} without outliers: there are many of them"
         return Word.REJECT, (
             f"{found}, several times less: the configuration is wrong, or an effect is missing from the model "
             "(dvl-calib diagnose looks for it)"

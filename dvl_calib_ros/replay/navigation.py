@@ -23,6 +23,7 @@ from ..calibration.robust import median
 from ..calibration.samples import Index
 from ..calibration.verification import Word
 from .heading_deviation import HeadingDeviation, heading_deviation
+from .left_over import Followed, left_over
 
 # Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
@@ -81,6 +82,8 @@ class Navigation:
         (P, 2) m from the start.
     deviation
         By what the heading is off as it changes; None where that does not show.
+    followed
+        What the velocity that is left follows; None without attitude, or where there is too little.
     """
 
     distance_m: float
@@ -97,6 +100,7 @@ class Navigation:
     track_before: Array
     track_after: Array
     deviation: HeadingDeviation | None = None
+    followed: Followed | None = None
 
 
 def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) -> Navigation | None:
@@ -127,7 +131,7 @@ def dead_reckoned(
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
     n = len(recording.dvl.times)
-    before, after = (_Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n)) for _ in range(2))
+    before, after = (_Level.of(n) for _ in range(2))
     before.fill(recording, np.arange(n), NO_TERMS, parameters)
     for k, each in enumerate(terms):
         after.fill(recording, np.flatnonzero(folds == k), each, parameters)
@@ -164,17 +168,26 @@ def dead_reckoned(
         )
         if on_a_map
         else None,
+        followed=left_over(recording.dvl.times[use], *(each[use] for each in after.whole)) if on_a_map else None,
     )
 
 
 class _Level(NamedTuple):
     """Of N samples (N, 4) m/s ahead and to port, and east and north where that is known: reference velocity, and error
-    of the DVL's; whether that is known (N,), and yaw (N,) rad."""
+    of the DVL's; whether that is known (N,), and yaw (N,) rad. whole: rotation_enu_from_body (N, 3, 3), velocity and
+    error (N, 3) m/s, rates (N, 3) rad/s, body."""
 
     velocity: Array
     error: Array
     oriented: NDArray[np.bool_]
     yaw: Array
+    whole: tuple[Array, Array, Array, Array]
+
+    @staticmethod
+    def of(n: int) -> _Level:
+        """To be filled."""
+        whole = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+        return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), whole)
 
     def fill(self, recording: Recording, at: Index, terms: Terms, parameters: Parameters) -> None:
         """Write those of some samples, corrected by these terms."""
@@ -185,6 +198,8 @@ class _Level(NamedTuple):
             self.oriented[some] = seen.oriented
             rotation = seen.rotation_enu_from_body
             self.yaw[some] = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+            for kept, own in zip(self.whole, (rotation, seen.body, seen.error, seen.rates), strict=True):
+                kept[some] = own
             for level, body in ((self.velocity, seen.body), (self.error, seen.error)):
                 level[some, :2] = body[:, :2]
                 level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]

@@ -38,6 +38,7 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from .clocks import StreamClocks
 from .heading_deviation import FIRST, heading_advice
+from .left_over import left_over_advice
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 
@@ -132,6 +133,7 @@ def replay(
     result = calibrator.result()
     result = replace(result, days=_named(result.days, recording))
     found += _warnings(result, topics, decoder)
+    found += [finding("IMU_LEVEL")] if calibrator.is_level else []
     # a configuration that is wrong, such as a late reference, is why the arm is another
     told = [] if result.suggestion else told_arm_advice(result.estimates, calibrator.parameters)
     found += told
@@ -140,10 +142,12 @@ def replay(
     if navigation is not None:
         deviates = heading_advice(navigation.deviation)
         found += deviates
+    left = left_over_advice(navigation.followed) if navigation is not None else []
+    found += [each for _, each in left]
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived
     of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
-    of_clocks += [(Word.MARGINAL, each.says) for each in told]
+    of_clocks += [(Word.MARGINAL, each.says) for each in told] + [(word, each.says) for word, each in left]
     if navigation is not None and navigation.deviation is not None and navigation.deviation.rms > FIRST:
         of_clocks += [(Word.MARGINAL, each.says) for each in deviates]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:

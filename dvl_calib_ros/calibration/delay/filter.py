@@ -178,6 +178,11 @@ class DelayFilter(Estimator):
         return self._solver.registration()
 
     @property
+    def is_level(self) -> bool:
+        """As `Estimator`."""
+        return self._idle_solver().is_level
+
+    @property
     def suggestion_so_far(self) -> str:
         """The same, where a clock is late as it was seen a little ago: nobody waits for a look at all there is."""
         newest = self._newest()

@@ -15,6 +15,7 @@ import numpy as np
 from ..attitude_rates import AttitudeRates
 from ..bank import ModelCounts
 from ..coarse_mounting import DELAYS_S, CoarseFits
+from ..dvl_stream import DvlStream
 from ..frames import Array
 from ..kalman import GaussianState
 from ..parameters import Parameters
@@ -90,6 +91,8 @@ class BlockSolver:
         self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
+        self._dvl_stream = DvlStream()
+        self._turned = False
         self._clocks = KeptClocks(parameters)
         self._is_live = live
         x, y, z = parameters.lever_arm
@@ -114,6 +117,8 @@ class BlockSolver:
         fresh: of clocks by all that is known, which takes a while; else as they were looked at on the way, live.
         """
         contradiction, found = self._attitude_rates.says(), self._coarse.suggestion()
+        if own := self._dvl_stream.says():
+            return own
         if contradiction:  # of what follows from it only what mends it is worth a word
             return f"{contradiction}; {found.says}" if found and "imu_frame" in found.says else contradiction
         if found is not None:
@@ -125,6 +130,11 @@ class BlockSolver:
     def registration(self) -> Registration | None:
         """How the instruments stand; None where the data do not show it."""
         return self._clocks.registration()
+
+    @property
+    def is_level(self) -> bool:
+        """Whether references were turned into the body by a heading alone, without roll and pitch."""
+        return self._turned and self._attitude_rates.is_level
 
     def solve(self, blocks: Sequence[Block]) -> list[Outcome]:
         """Take blocks in order: many at once cost a third of one after the other, and come to the same."""
@@ -262,6 +272,9 @@ class BlockSolver:
         if not streams.are_compared:
             return False
         self._spikes += streams.dvl_spikes
+        self._turned = self._turned or not reference.in_body.all()
+        stamps_ns = block.dvl.stamps_ns
+        self._dvl_stream.add(block.dvl.velocity[(stamps_ns >= block.from_ns) & (stamps_ns < block.end_ns)])
         claimed = int(np.count_nonzero(reference.claimed))
         self._claims += claimed - (len(reference.times) - claimed)
         seen, turns, rows_of = compared[block.from_ns]
@@ -330,4 +343,7 @@ class BlockSolver:
         at = streams.own_dvl
         in_the_body = streams.dvl.velocity[at] @ self._parameters.rotation_dvl_from_body
         reference = np.where(known, seen.velocity, np.nan)
-        self._shared_noise.add(streams.dvl.times[at], in_the_body, streams.reference.times, reference)
+        # by the stamps as they were: what a filter made comes after what it was made from
+        p = self._parameters
+        times, reference_times = streams.dvl.times[at] + p.dvl_time_offset, streams.reference.times
+        self._shared_noise.add(times, in_the_body, reference_times + p.reference_time_offset, reference)

@@ -113,3 +113,21 @@ def test_nothing_is_said_of_too_little():
 def test_all_ways_to_exchange_and_negate_axes_are_looked_at_once():
     matrices = {tuple(matrix.ravel()) for _, matrix in CONVENTIONS}
     assert len(matrices) == len(CONVENTIONS) == 6 * 8 - 1
+
+
+def test_rates_that_are_zero_while_the_attitude_turns_are_none():
+    times, orientation, rates = vehicle()
+    assert "without angular velocity" in says(times, orientation, 0.0 * rates)
+    still = np.tile(orientation[:1], (len(times), 1))
+    assert says(times, still, 0.0 * rates) == ""
+
+
+def test_an_attitude_without_roll_and_pitch_is_a_heading_alone():
+    for tilt, is_level in ((TILT, False), (0.0, True)):
+        checked = AttitudeRates()
+        times, orientation, rates = vehicle(tilt=tilt)
+        if is_level:
+            orientation[:, :2] = 0.0
+            orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
+        checked.add(times, orientation, rates)
+        assert checked.is_level is is_level

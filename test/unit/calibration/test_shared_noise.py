@@ -86,3 +86,16 @@ def test_axes_that_are_not_measured_and_gaps_take_no_part():
     reference[:, 2] = np.nan
     kept = np.random.default_rng(1).random(len(times)) > 0.02
     assert judged(times[kept], dvl[kept], reference_times, reference).share() > 0.5
+
+
+@pytest.mark.parametrize("tau", [0.5, 1.0])
+def test_a_filter_that_smooths_is_told_by_what_it_passes_on(tau):
+    times, dvl, reference_times, _ = streams()
+    rng = np.random.default_rng(7)
+    share = 0.2 / (0.2 + tau)
+    kept = dvl.copy()
+    for at in range(1, len(kept)):
+        kept[at] = kept[at - 1] + share * (dvl[at] - kept[at - 1])
+    reference = np.column_stack([np.interp(reference_times, times, column) for column in kept.T])
+    found = judged(times, dvl, reference_times, reference + rng.normal(0.0, 0.003, reference.shape))
+    assert "made from this DVL" in found.says()

@@ -1,0 +1,209 @@
+"""What is left of the velocity after the calibration: whether it follows something that no mounting makes.
+
+Held against the corrected DVL's velocity, a reference leaves noise. Where that follows the vehicle's tilt, the DVL's
+velocity does not turn with the vehicle as the IMU's orientation says (a driver that has levelled it, an orientation of
+the wrong sign); where it is the same at every speed, the DVL has a bias; where it follows how the velocity bends, one
+of the two is smoothed. All three turn angles by what σ does not hold, so they are looked for, by least squares beside
+all that the calibration has found already.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..calibration.attitude_rates import LEVEL_BELOW
+from ..calibration.findings import Finding, finding
+from ..calibration.frames import Array, cross, skew
+from ..calibration.robust import median
+from ..calibration.samples import Index
+from ..calibration.verification import Word
+
+# Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
+TILT_S = 1.0, 15.0
+# The velocity bends by what its means of so long, s, do.
+BEND_S = 1.0
+# Stretches, s, by whose scatter σ is found; fewer say nothing.
+STRETCH_S, ENOUGH = 15.0, 12
+# So many σ are no chance.
+SURELY = 6.0
+# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s).
+KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3)
+# ... and of what is looked for: shares of tilt, and bend (s²); a bias (m/s), looked for in means of so long, s.
+QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
+# Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
+# of how it bends, m/s².
+LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+# A share from here on is no levelled velocity, but a sign.
+WRONG_SIGN_FROM = 1.6
+# An error of a mounting (rad) that is worth a word, and one that no answer is given beside.
+SAID_FROM, WRONG_FROM = math.radians(0.2), math.radians(0.5)
+# Smoothing (s, time constant) that is worth a word, and one beside which no answer is given.
+SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
+# A velocity so many times further off than usual is an outlier.
+OUTLYING, ROUNDS = 4.0, 3
+# What is left is noise of so much at least, m/s.
+QUIETEST_MPS = 1e-3
+
+
+class Followed(NamedTuple):
+    """What the velocity that is left follows.
+
+    tilt, tilt_std: (2,) share of roll and of pitch that the DVL's velocity leaves out, 0 of a right one, 1 of a
+    levelled one, 2 or -2 where a sign is wrong. bias, bias_std: (3,) m/s of the DVL, body. smoothed, smoothed_std: s²,
+    half the square of the reference's time constant; below 0 the DVL's. lean: (2,) mean roll and pitch, rad. speed:
+    m/s, rms.
+    """
+
+    tilt: Array
+    tilt_std: Array
+    bias: Array
+    bias_std: Array
+    smoothed: float
+    smoothed_std: float
+    lean: Array
+    speed: float
+
+
+def left_over(
+    time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array
+) -> Followed | None:
+    """None where there is too little to look at.
+
+    Parameters
+    ----------
+    time: (N,) s.
+    rotation_enu_from_body: (N, 3, 3).
+    velocity, error: (N, 3) m/s of the reference, and reference less corrected DVL, body.
+    rates: (N, 3) rad/s, body.
+
+    """
+    if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
+        return None
+    roll = np.arctan2(rotation_enu_from_body[:, 2, 1], rotation_enu_from_body[:, 2, 2])
+    pitch = -np.arcsin(np.clip(rotation_enu_from_body[:, 2, 0], -1.0, 1.0))
+    changing = [_mean(time, tilt, TILT_S[0]) - _mean(time, tilt, TILT_S[1]) for tilt in (roll, pitch)]
+    body_from_enu = rotation_enu_from_body.swapaxes(1, 2)
+    # by the DVL's own velocity, for noise of the reference is what is explained; smoothed, for so is its own
+    earth = _mean(time, _turned(rotation_enu_from_body, velocity - error), BEND_S)
+    before, after = _at(time, earth, -BEND_S), _at(time, earth, BEND_S)
+    moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
+    n = len(time)
+    known = np.zeros((n, 3, len(KNOWN)))
+    known[:, :, :3] = skew(moving)
+    known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
+    known[:, :, 5:8] = skew(rates)
+    known[:, :, 8] = slope
+    known[:, :, 9:] = body_from_enu
+    quick = np.zeros((n, 3, 3))
+    for axis in range(2):
+        about = np.zeros((n, 3))
+        about[:, axis] = -changing[axis]
+        quick[:, :, axis] = cross(about, moving)
+    # as the vehicle's turning bends it: noise of the DVL is in all of a mean alike
+    turning = _mean(time, _turned(rotation_enu_from_body, _mean(time, velocity - error, MEAN_S)), BEND_S)
+    bend = _at(time, turning, BEND_S) - 2.0 * turning + _at(time, turning, -BEND_S)
+    quick[:, :, 2] = _turned(body_from_enu, bend / BEND_S**2)
+    bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
+    fast = _fitted(time, np.concatenate([known, quick], axis=2), error, np.concatenate([KNOWN, QUICK]))
+    constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
+    starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
+    means = [_means(each, starts) for each in (time, np.concatenate([known, constant], axis=2), error)]
+    slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, CONSTANT]))
+    if fast is None or slow is None:
+        return None
+    tilt, std = fast[0][-3:-1], fast[1][-3:-1]
+    std[[each.std() < LEAST_TILT for each in changing]] = math.inf
+    lean = np.array([roll.mean(), pitch.mean()])
+    speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
+    # without tilt, what waves do to it looks like turning
+    shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
+    smoothed_std = float(fast[1][-1]) if shows else math.inf
+    return Followed(tilt, std, slow[0][-3:], slow[1][-3:], float(fast[0][-1]), smoothed_std, lean, speed)
+
+
+def left_over_advice(found: Followed | None) -> list[tuple[Word, Finding]]:
+    """What to say of it, and what it is to the verdict."""
+    if found is None:
+        return []
+    seconds = math.sqrt(2.0 * abs(found.smoothed))
+    if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > SMOOTHED_FROM_S:
+        word = Word.REJECT if seconds > TOO_SMOOTH_S else Word.MARGINAL
+        # what else it follows then comes of that
+        return [(word, finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds))]
+    said = []
+    for axis, name in enumerate(("roll", "pitch")):
+        share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
+        if abs(share) > max(SURELY * std, NOT_FOLLOWED):
+            off = abs(share * float(found.lean[axis]))
+            word = Word.REJECT if off > WRONG_FROM or abs(share) > WRONG_SIGN_FROM else Word.MARGINAL
+            said.append((word, finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))))
+    size = np.abs(found.bias)
+    shown = (size > SURELY * found.bias_std) & (size > SAID_FROM * found.speed)
+    if shown.any():
+        axes = ", ".join(
+            f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
+            for i, axis in enumerate("xyz")
+            if shown[i]
+        )
+        turned = float(size[shown].max()) / found.speed
+        word = Word.REJECT if turned > WRONG_FROM else Word.MARGINAL
+        said.append((word, finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned))))
+    return said
+
+
+def _smoothed_one(found: Followed) -> str:
+    return "reference" if found.smoothed > 0.0 else "DVL"
+
+
+def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> tuple[Array, Array] | None:
+    """x (n,) and σ (n,) by the scatter of stretches of time, of error (N, 3) = columns (N, 3, n) x."""
+    stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
+    starts = np.flatnonzero(np.diff(stretch, prepend=-1))
+    if len(starts) < ENOUGH:
+        return None
+    n = columns.shape[2]
+    rest = error
+    for _ in range(ROUNDS):
+        square = (rest**2).sum(axis=1)
+        level = max(float(median(square)), QUIETEST_MPS**2)
+        weight = 1.0 / np.maximum(square / (OUTLYING**2 * level), 1.0)
+        weighted = columns * weight[:, None, None]
+        flat, z = columns.reshape(-1, n), error.reshape(-1)
+        information = weighted.reshape(-1, n).T @ flat + np.diag(level / 3.0 / likely**2)
+        p = np.linalg.inv(information)
+        x = p @ (weighted.reshape(-1, n).T @ z)
+        rest = error - columns @ x
+    scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
+    m = len(starts)
+    scatter = p @ scores.T
+    together = scatter[:, : m // 2 * 2].reshape(n, -1, 2).sum(axis=2)
+    variance = np.maximum((scatter**2).sum(axis=1), (together**2).sum(axis=1)) * (m / (m - 1.0))
+    return x, np.sqrt(variance)
+
+
+def _mean(time: Array, values: Array, seconds: float) -> Array:
+    """Means over so many seconds about each time (N,) of values (N, ...)."""
+    first = np.searchsorted(time, time - 0.5 * seconds)
+    end = np.searchsorted(time, time + 0.5 * seconds, side="right")
+    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    number = (end - first).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray((sums[end] - sums[first]) / number)
+
+
+def _at(time: Array, values: Array, later: float) -> Array:
+    """Values (N, 3) so many seconds later than each time (N,)."""
+    return np.column_stack([np.interp(time + later, time, column) for column in values.T])
+
+
+def _means(values: Array, starts: Index) -> Array:
+    """Means of values (N, ...) from each start to the next."""
+    number = np.diff(starts, append=len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    return np.asarray(np.add.reduceat(values, starts, axis=0) / number)
+
+
+def _turned(rotation: Array, vectors: Array) -> Array:
+    """(N, 3) vectors by rotations (N, 3, 3)."""
+    return np.asarray(np.matmul(rotation, vectors[..., None])[..., 0])

@@ -1,0 +1,104 @@
+"""What is left of the velocity follows nothing where all is right; a levelled, biased or smoothed velocity is named."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.calibration.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.verification import Word
+from dvl_calib_ros.replay.left_over import left_over, left_over_advice
+
+STEP_S = 0.2
+
+
+class Vehicle:
+    """Legs and turns to both sides at three speeds, in waves, trimmed; what it is and what is measured of it."""
+
+    def __init__(self, rng, seconds=500.0, trim_deg=2.0, wave_deg=1.5, speeds=(0.8, 1.2, 1.6)):
+        self.time = np.arange(0.0, seconds, STEP_S)
+        leg = (self.time // 50.0).astype(int)
+        turning = np.where(self.time % 50.0 > 36.0, np.where(leg % 4 < 2, 1.0, -1.0) * 0.11, 0.0)
+        self.yaw_rate = smoothed(turning, 1.0)
+        yaw = np.cumsum(self.yaw_rate) * STEP_S
+        wave = math.radians(wave_deg)
+        self.roll = wave * np.sin(self.time * 1.1)
+        self.pitch = math.radians(trim_deg) + wave * np.sin(self.time * 0.9 + 1.0)
+        self.turns = np.array([rotation_from_rpy(each) for each in zip(self.roll, self.pitch, yaw, strict=True)])
+        self.level = np.array([rotation_from_rpy((0.0, 0.0, each)) for each in yaw])
+        ahead = smoothed(np.array(speeds)[leg % 3], 2.0)
+        along = np.column_stack([ahead, -0.3 * self.yaw_rate * ahead, 0.03 * np.sin(self.time * 0.9)])
+        self.earth = np.einsum("nij,nj->ni", self.level, along)
+        self.body = np.einsum("nji,nj->ni", self.turns, self.earth)
+        self.rates = np.zeros((len(self.time), 3))
+        self.rates[:, 2] = self.yaw_rate
+        self.noise = rng.normal(0.0, 0.03, self.body.shape), rng.normal(0.0, 0.01, self.body.shape)
+
+    def found(self, dvl=None, reference=None, turns=None):
+        """By a DVL (N, 3) in the body, a reference (N, 3) in the earth and an IMU; what is not given is right."""
+        turns = self.turns if turns is None else turns
+        seen = (self.earth if reference is None else reference) + self.noise[0]
+        body = np.einsum("nji,nj->ni", turns, seen)
+        error = body - (self.body if dvl is None else dvl) - self.noise[1]
+        # the calibration takes off what looks like a mounting
+        moving = body - error
+        lean = np.cross(moving, np.eye(3)[:, None]).transpose(1, 2, 0)
+        x = np.linalg.lstsq(lean.reshape(-1, 3), error.reshape(-1), rcond=None)[0]
+        return left_over(self.time, turns, body, error - lean @ x, self.rates)
+
+
+def smoothed(values, seconds):
+    """By a filter that follows late."""
+    kept, share = np.array(values, dtype=float), STEP_S / (STEP_S + seconds)
+    for at in range(1, len(kept)):
+        kept[at] = kept[at - 1] + share * (values[at] - kept[at - 1])
+    return kept
+
+
+@pytest.mark.parametrize("wave_deg", [0.0, 0.2, 1.5, 5.0])
+@pytest.mark.parametrize("speeds", [(0.8, 1.2, 1.6), (1.2, 1.2, 1.2)])
+def test_where_all_is_right_nothing_is_said(rng, wave_deg, speeds):
+    assert left_over_advice(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found()) == []
+
+
+@pytest.mark.parametrize(("trim_deg", "word"), [(0.0, Word.MARGINAL), (3.0, Word.REJECT)])
+def test_a_velocity_that_its_driver_has_levelled_does_not_turn_with_the_pitch(rng, trim_deg, word):
+    vehicle = Vehicle(rng, trim_deg=trim_deg)
+    levelled = np.einsum("nji,nj->ni", vehicle.level, vehicle.earth)
+    found = vehicle.found(dvl=levelled)
+    assert found.tilt[1] == pytest.approx(1.0, abs=0.2)
+    ((verdict, said),) = left_over_advice(found)
+    assert verdict is word and said.code == "TILT_NOT_FOLLOWED" and "pitch" in said.says
+
+
+def test_a_pitch_of_the_other_sign_is_no_answer_whatever_the_trim(rng):
+    vehicle = Vehicle(rng, trim_deg=0.0)
+    yaw = np.arctan2(vehicle.turns[:, 1, 0], vehicle.turns[:, 0, 0])
+    turned = [rotation_from_rpy(each) for each in zip(vehicle.roll, -vehicle.pitch, yaw, strict=True)]
+    ((verdict, said),) = left_over_advice(vehicle.found(turns=np.array(turned)))
+    assert verdict is Word.REJECT and said.code == "TILT_NOT_FOLLOWED"
+
+
+def test_a_bias_shows_at_several_speeds(rng):
+    vehicle = Vehicle(rng)
+    found = vehicle.found(dvl=vehicle.body + np.array([0.02, -0.025, 0.0]))
+    assert found.bias[:2] == pytest.approx([0.02, -0.025], abs=0.01)
+    ((verdict, said),) = left_over_advice(found)
+    assert verdict is Word.REJECT and said.code == "DVL_BIAS"
+
+
+def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
+    vehicle = Vehicle(rng)
+    slow = smoothed(vehicle.earth, 1.5)
+    in_time = np.column_stack([np.interp(vehicle.time + 1.5, vehicle.time, column) for column in slow.T])
+    ((verdict, said),) = left_over_advice(vehicle.found(reference=in_time))
+    assert verdict is Word.REJECT and said.code == "VELOCITY_SMOOTHED" and said.says.startswith("the reference")
+
+
+def test_an_attitude_without_tilt_and_a_short_run_say_nothing(rng):
+    vehicle = Vehicle(rng, speeds=(1.0, 1.0, 1.0))
+    found = vehicle.found(turns=vehicle.level)
+    assert np.isinf(found.tilt_std).all() and math.isinf(found.smoothed_std)
+    assert Vehicle(rng, seconds=60.0).found() is None and left_over_advice(None) == []
