@@ -46,6 +46,8 @@ from .verification import SEVERAL, Verification, verify
 COPIED_AT_ONCE = 64
 # An error of so many times the usual one is that of an outlier.
 OUTLYING = 5.0
+# Rows, and blocks of samples, that may wait for a group whose samples do not come: without an IMU none ever does.
+ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
 SAMPLES_OF_A_BLOCK = 128
 
@@ -220,13 +222,17 @@ class Calibrator:
         self._look_at_headings()
         if aligner.partners.n_paired > self._n_selected:
             self._select()
-        due = [
-            group for group in self._groups if aligner.partners.given[group.needs] - group.n_given >= self._block_size
-        ]
+        due = [group for group in self._groups if self._is_due(group)]
         if due:
             for group in due:
                 self._give_decided(group)
             self._forget_rows()
+
+    def _is_due(self, group: Group) -> bool:
+        """Whether enough samples have come together for a group, or rows that hold none, which nobody can forget."""
+        if self._aligner.partners.given[group.needs] - group.n_given >= self._block_size:
+            return True
+        return self._decided(group.needs) - group.next_row >= max(ROWS_HELD, ROWS_HELD_BLOCKS * self._block_size)
 
     def _select(self) -> None:
         """Let the selection know what is paired, but for what may go by what is only gathered."""

@@ -309,7 +309,8 @@ class CalibrationNode(AnsweringNode):
         state_of = (model.name, calibrator.n_given(model.name))
         if state_of == self._mounting_published or calibrator.last_ns is None:
             return
-        if calibrator.suggestion:  # of a wrong configuration: no mounting, for somebody would take it
+        # of a wrong configuration none, for somebody would take it; messages wait meanwhile, so no look at all there is
+        if calibrator.suggestion_so_far:
             return
         self._mounting_published = state_of
         stamp = Time()

@@ -7,19 +7,47 @@ lever arm of ρ u explains almost as well: so what G2 has kept of each day is re
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..frames import Array
 from ..parameters import Parameters
 from ..register.motion import Motion, make_motion
 from ..register.registration import Registration, register
-from .hold_out import MEASURED_BELOW, Kept, Recording
+from ..samples import Mask
+from .hold_out import MEASURED_BELOW, Kept
+from .rows import ImuColumns
 
 # Live, what was found stands until so much more is there.
 AGAIN_FROM = 1.5
-# Fewer blocks tell nothing, and live there is no look before a minute; of more the oldest are forgotten.
-ENOUGH, FIRST_LOOK, MOST = 2, 6, 720
+# Fewer blocks tell nothing, and live there is no look before a minute. Of more, which are 40 minutes, the oldest are
+# forgotten: no more rows are looked at than a third of these have, and a node's memory is to be flat.
+ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
+
+
+class _Seen(NamedTuple):
+    """What is registered of a block: times (N,) s and velocities (N, 3) of the DVL; of M references the same, whether
+    they are in the body (M,) and which axes they measure (M, 3); times, attitudes and rates of the IMU."""
+
+    dvl_times: Array
+    dvl_velocity: Array
+    times: Array
+    velocity: Array
+    in_body: Mask
+    is_measured: NDArray[np.bool_]
+    imu_times: Array
+    orientation: Array
+    angular_velocity: Array
+
+    @staticmethod
+    def of(kept: Kept) -> _Seen:
+        """What is kept of a block, without what is of no use here: covariances alone are half of it."""
+        r = kept.reference
+        is_measured = np.diagonal(r.noise, axis1=1, axis2=2) < MEASURED_BELOW
+        return _Seen(*kept.dvl, r.times, r.velocity, r.in_body, is_measured, *kept.imu)
 
 
 class KeptClocks:
@@ -27,21 +55,21 @@ class KeptClocks:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        self._kept: deque[Kept] = deque(maxlen=MOST)
+        self._seen: deque[_Seen] = deque(maxlen=MOST)
         self._blocks = 0  # of this day
         self._over: Registration | None = None  # of a day that is over, where a clock was off
         self._latest: tuple[int, Registration | None] = (0, None)
 
     def add(self, kept: Kept) -> None:
         """Take a block's streams."""
-        self._kept.append(kept)
+        self._seen.append(_Seen.of(kept))
         self._blocks += 1
 
     def end_day(self) -> None:
         """The blocks from here on are of another day, whose clocks may be others."""
         found = self.registration()
         self._over = found if found is not None and found.says(self._parameters) else None
-        self._kept.clear()
+        self._seen.clear()
         self._blocks, self._latest = 0, (0, None)
 
     def look_again(self) -> None:
@@ -66,7 +94,7 @@ class KeptClocks:
         return "" if found is None else found.says(self._parameters)
 
     def _registered(self) -> Registration | None:
-        motion = _motion(self._kept) if len(self._kept) >= ENOUGH else None
+        motion = _motion(tuple(self._seen)) if len(self._seen) >= ENOUGH else None
         if motion is None:
             return None
         try:
@@ -75,16 +103,14 @@ class KeptClocks:
             return None
 
 
-def _motion(kept: Collection[Kept]) -> Motion | None:
-    recording = Recording.of(list(kept))
-    in_body = recording.reference.in_body
+def _motion(seen: Sequence[_Seen]) -> Motion | None:
+    dvl_times, velocity, times, reference, in_body, is_measured, *imu = map(np.concatenate, zip(*seen, strict=True))
     alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
-    variance = np.diagonal(recording.reference.noise[alike], axis1=1, axis2=2)
-    x, y, z = (2 * np.count_nonzero(variance < MEASURED_BELOW, axis=0) > len(variance)).tolist()
+    x, y, z = (2 * np.count_nonzero(is_measured[alike], axis=0) > np.count_nonzero(alike)).tolist()
     return make_motion(
-        (recording.dvl.times, recording.dvl.velocity),
-        (recording.reference.times[alike], recording.reference.velocity[alike]),
+        (dvl_times, velocity),
+        (times[alike], reference[alike]),
         not bool(in_body[alike].all()) if alike.any() else False,
         (x, y, z),
-        recording.imu,
+        ImuColumns(*imu),
     )

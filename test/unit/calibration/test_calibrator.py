@@ -460,6 +460,16 @@ def test_reset_forgets_everything():
     assert_same(feed(calibrator, samples), calibrate(samples))
 
 
+@pytest.mark.parametrize("kinds", [(DvlSample,), (DvlSample, ReferenceSample)])
+def test_rows_that_nobody_will_have_are_not_kept_for_models_of_streams_that_do_not_come(kinds):
+    """Without an IMU the node grew by half a kilobyte with each sample, for a model that waited for attitudes."""
+    run = variant(NOISY, seconds=1200.0, frame=VelocityFrame.BODY, imu_every=0)
+    calibrator = calibrate(only(make_samples(run), *kinds), block_size=512)
+    assert calibrator.counts["dvl"]["accepted"] > 5000
+    rows = calibrator._aligner.rows
+    assert rows.size - rows.begin < 3000
+
+
 # ---------------------------------------------------------------- priors
 
 
