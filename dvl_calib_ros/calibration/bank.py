@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -19,8 +20,10 @@ import numpy as np
 
 from . import kalman
 from .assembly import Assembler
+from .block_scatter import BlockScatter
 from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .frames import Array
+from .heading_states import upwards
 from .heave import HeaveRows, HeaveSums, with_heave
 from .height import HeightOfLate
 from .history import Counts, Standing
@@ -29,7 +32,6 @@ from .models import Model, Needs
 from .observations import Observations
 from .parameters import Parameters
 from .samples import Index, Mask, Stamps
-from .time_blocks import BlockScatter
 
 Ends = Index
 # Blocks by whose scatter σ is checked, s: as long as the noise of a vehicle's motion lasts.
@@ -97,10 +99,15 @@ class Group:
         self._x, self._p = self._assembler.start
         self._of_day = models[0].of_day
         still = self._assembler.process_rate is None
-        self._scatter = BlockScatter(self._x, self._p, BLOCK_S) if still else None
+        # the paper's models are as they are published
+        deviates = self.needs is Needs.REFERENCE and models[0].in_correction_parameters
+        up = upwards(parameters.rotation_dvl_from_body, models[0].n_state) * deviates
+        self._scatter_of = partial(BlockScatter, seconds=BLOCK_S, up=up, heading_std=parameters.heading_deviation_std)
+        self._scatter = self._scatter_of(self._x, self._p) if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
         self._height = HeightOfLate() if models[0].uses_height else None
         self._states: dict[str, GaussianState] = {}
+        self._of_recording: dict[str, GaussianState] = {}
         self._sound: dict[str, GaussianState] = {}  # the last that could be published
         self._last_stamp_ns: int | None = None
         self.n_given = self.next_row = 0
@@ -122,7 +129,9 @@ class Group:
             seen = replace(seen, height=self._height.add(stamps_ns, seen.rising))
         data = self._assembler.measurements(seen, weight, prior_known)
         process = self._process_noise(stamps_ns)
-        cuts = np.zeros(0, dtype=np.intp) if self._scatter is None else self._scatter.cuts(stamps_ns)
+        cuts = np.zeros(0, dtype=np.intp)
+        if self._scatter is not None:
+            cuts = self._scatter.cuts(stamps_ns, seen.earth_in_body)
         every, shown = _joined_ends(cuts, ends), _joined_ends(cuts[-1:], ends)
         if self._heave is None:
             after = self._after(data, process, every)
@@ -134,8 +143,9 @@ class Group:
         if self._scatter is not None and len(cuts):
             assert every is not None and known_at is not None and after.at is not None and states is not None
             at, last = np.searchsorted(every, cuts), int(np.searchsorted(known_at, cuts[-1]))
-            self._scatter.add(after.at.x[at], after.at.p[at], GaussianState(states.x[last], states.p[last]))
+            self._scatter.add(cuts, after.at.x[at], after.at.p[at], GaussianState(states.x[last], states.p[last]))
         self._states.clear()
+        self._of_recording.clear()
         if self._folds is not None:
             folds = folds_of(stamps_ns, self._parameters)
             self._folds.add(folds, data, after.used)
@@ -165,11 +175,12 @@ class Group:
             try:
                 self._scatter.end_day(before, after, self._of_day, self._now())
             except np.linalg.LinAlgError:  # numbers that ran away: it looks at the new day alone
-                self._scatter = BlockScatter(*after, BLOCK_S)
+                self._scatter = self._scatter_of(*after)
         if self._folds is not None:
             with suppress(np.linalg.LinAlgError):
                 self._folds.end_day(self._assembler.prior, self._of_day)
         self._states.clear()
+        self._of_recording.clear()
 
     def _with_heave(
         self,
@@ -278,7 +289,7 @@ class Group:
         That is 1 under a random walk, with which what one block told is forgotten by and by.
         """
         index = self.index[name]
-        return np.ones(self._x.shape[1]) if self._scatter is None else self._scatter.inflation(index)
+        return np.ones(self._x.shape[1]) if self._scatter is None else self._scatter.found(index).inflation
 
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model; not to be written to."""
@@ -286,11 +297,28 @@ class Group:
             self._states[name] = self._sound[name] = self._sound_state(name)
         return self._states[name]
 
-    def _sound_state(self, name: str) -> GaussianState:
-        """The state as it is to be published; the one before where the way from the filter's to it fails."""
+    def of_recording(self, name: str) -> GaussianState:
+        """`state` with what blocks of time say: of how the heading deviates, and how much larger σ is."""
+        if self._scatter is None:
+            return self.state(name)
+        if name not in self._of_recording:
+            found = self._scatter.found(self.index[name])
+            state = self._sound_state(name, found.shift[0], found.more[0]) if found.more.any() else self.state(name)
+            self._of_recording[name] = state.raised(found.inflation)
+        return self._of_recording[name]
+
+    def heading_deviation(self, name: str) -> GaussianState | None:
+        """Coefficients of how the heading deviates, as of `HeadingStates`, by one model; None where it has none."""
+        return None if self._scatter is None else self._scatter.found(self.index[name]).coefficients
+
+    def _sound_state(self, name: str, shift: Array | float = 0.0, more: Array | float = 0.0) -> GaussianState:
+        """The state as it is to be published; the one before where the way from the filter's to it fails.
+
+        shift (n,), more (n, n): what is added to x and P of the filter before.
+        """
         index = self.index[name]
         x, p = self._now()
-        found = self._published(index, x[index], p[index])
+        found = self._published(index, x[index] + shift, p[index] + more)
         if found is not None:
             return found
         self._restarted[index] += 1

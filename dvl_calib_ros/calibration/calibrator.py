@@ -506,6 +506,7 @@ class Calibrator:
             nis_bounds=nis_bounds(rows, self.parameters, used),
             convergence=convergence(model, covariance, self.parameters),
             observability=observability(model, covariance, self.parameters),
+            heading_deviation=self._estimators[model.name].heading_deviation,
         )
 
     def verification(self, name: str) -> Verification:
@@ -621,6 +622,12 @@ class Calibrator:
     def days(self) -> tuple[Day, ...]:
         """What belongs to each day, where there are several and an estimator finds something of each; else none."""
         return next((days for name in self._models if (days := self._days_of(name))), ())
+
+    @property
+    def heading_deviation(self) -> GaussianState | None:
+        """How the heading deviates, as `Estimate.heading_deviation`, by the model that knows most of it."""
+        each = [estimator.heading_deviation for estimator in reversed(self._estimators.values())]
+        return next((found for found in each if found is not None), None)
 
     @property
     def suggestion(self) -> str:

@@ -83,6 +83,11 @@ class Estimator(ABC):
         return ""
 
     @property
+    def heading_deviation(self) -> GaussianState | None:
+        """Coefficients x (5,), P (5, 5) of how the heading deviates, as of `heading_states.HeadingStates`; None."""
+        return None
+
+    @property
     def suggestion(self) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; ''."""
         return ""
@@ -200,13 +205,19 @@ class LinearEstimator(Estimator):
         return self._group.inflation(self._model.name)
 
     @property
+    def heading_deviation(self) -> GaussianState | None:
+        """As `Estimator`."""
+        return self._group.heading_deviation(self._model.name)
+
+    @property
     def counts(self) -> ModelCounts:
         """As `Estimator`."""
         return self._group.counts(self._model.name)
 
     def of_recording(self) -> GaussianState:
         """As `Estimator`."""
-        return self.state().raised(self.inflation)
+        self._update(self._group)
+        return self._group.of_recording(self._model.name)
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
         """As `Estimator`."""

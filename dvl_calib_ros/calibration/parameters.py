@@ -373,6 +373,15 @@ class Parameters:
         low=1e-6,
         high=10.0,
     )
+    heading_deviation_std: float = _parameter(
+        math.radians(0.5),
+        "Prior standard deviation of how the heading that turns the reference deviates: with itself (one and two "
+        "cycles, as of a compass), and from first to last (as a gyro drifts) (G1, G2). On one heading it is in the σ "
+        "of yaw; several headings show whether it is smaller or larger. 0: the heading is exact.",
+        unit="rad",
+        low=0.0,
+        high=0.5,
+    )
     day_std_heading: float = _parameter(
         math.radians(0.1),
         "By how much the heading reference is off on a day, constantly: in the σ of yaw, which is that of the next "

@@ -27,6 +27,8 @@ class Estimate:
     recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
     more than the filter claims. filter_std: (n,) standard deviations that the filter claims. used, gated:
     samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
+    heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw and of
+    twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
     """
 
     model: str
@@ -40,6 +42,7 @@ class Estimate:
     nis_bounds: tuple[float, float]
     convergence: Convergence
     observability: tuple[Observability, ...]
+    heading_deviation: GaussianState | None = None
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -9,15 +9,11 @@ estimation of misspecified models", 1982).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import suppress
-
 import numpy as np
 from numpy.typing import NDArray
 
 from .chi_square import chi2_isf
 from .frames import Array
-from .kalman import GaussianState
 
 # Blocks kept; when they are full, neighbours are joined and blocks are twice as long. So memory is bounded, and effects
 # that last for minutes show in the end.
@@ -31,13 +27,15 @@ CHANCE = 0.1
 class TimeBlocks:
     """Information of consecutive blocks of time, for K hypotheses or models at once.
 
-    count: number of blocks. weight: number of samples that all count for.
+    count: number of blocks. weight: number of samples that all count for. total: Λ (K, n, n) and y (K, n) of all of
+    them; not to be written to.
     """
 
     def __init__(self) -> None:
         # with room for MOST of them
         self._information = np.zeros((0, 0, 0, 0))
         self._vector = np.zeros((0, 0, 0))
+        self.total: tuple[Array, Array] = np.zeros((0, 0, 0)), np.zeros((0, 0))
         self.count = 0
         self._each = 1  # additions in a full block
         self._in_last = 0
@@ -51,6 +49,7 @@ class TimeBlocks:
     def add(self, information: Array, vector: Array, weight: float) -> None:
         """Add what a stretch told: Λ_b (K, n, n), y_b (K, n). weight: number of samples that it counts for."""
         self.weight += weight
+        self.total = (self.total[0] + information, self.total[1] + vector) if self.count else (information, vector)
         if self.count and self._in_last < self._each:
             self._information[self.count - 1] += information
             self._vector[self.count - 1] += vector
@@ -86,18 +85,22 @@ class TimeBlocks:
             rest = y - (told[:, :, of_day] @ found[..., None])[..., 0]
             told[:] = (onto @ told @ onto.swapaxes(1, 2))[source]
             y[:] = (onto @ rest[..., None])[source, :, 0]
+        if self.count:
+            self.total = self.kept[0].sum(axis=0), self.kept[1].sum(axis=0)
 
-    def inflation(self, index: int, x: Array, p: Array) -> Array:
+    def inflation(self, index: int, x: Array, p: Array, variance: Array | None = None) -> Array:
         """By how much σ of each state (n,) has to grow, at least 1. index: which of the K. x (n,), P (n, n) of it.
 
-        The largest over blocks as they are, and over two and four of them together.
+        The largest over blocks as they are, and over two and four of them together. variance: (r,) of r quantities that
+        are judged instead, whose covariance with the states p (r, n) then is.
         """
-        factor = np.ones(len(x))
+        variance = np.diag(p) if variance is None else variance
+        factor = np.ones(len(variance))
         if self.count < FEWEST:
             return factor
         information, vector = (each[:, index] for each in self.kept)
         scores = vector - information @ x
-        claimed = np.diag(p @ information.sum(axis=0) @ p)
+        claimed = np.diag(p @ information.sum(axis=0) @ p.T)
         while len(scores) >= FEWEST:
             m = len(scores)
             scatter = p @ scores.T
@@ -105,87 +108,10 @@ class TimeBlocks:
             ratio = found / np.maximum(claimed, 1e-300)
             beyond_chance = ratio > chi2_isf(CHANCE, m - 1) / (m - 1)
             # the prior's part of P is not the data's to judge
-            total = 1.0 + (found - claimed) / np.diag(p)
+            total = 1.0 + (found - claimed) / np.maximum(variance, 1e-300)
             factor = np.maximum(factor, np.where(beyond_chance, np.sqrt(np.maximum(total, 1.0)), 1.0))
             if m % 2:
                 scores = np.vstack([scores[:-2], scores[-2:].sum(axis=0)])[: m - 1]
                 m -= 1
             scores = scores[0::2][: m // 2] + scores[1::2][: m // 2]
         return factor
-
-
-_NO_CUTS = np.zeros(0, dtype=np.intp)
-
-
-class BlockScatter:
-    """`TimeBlocks` of K filters without process noise, told by their states where one block ends and the next begins.
-
-    What a block told is the difference of the information after and before it. The factors are those as of the end of
-    the last block, so they depend on stamps alone.
-    """
-
-    def __init__(self, x: Array, p: Array, seconds: float) -> None:
-        """Start from states x (K, n), P (K, n, n). seconds: length of a block."""
-        self._blocks = TimeBlocks()
-        self._length_ns = round(seconds * 1e9)
-        self._last: int | None = None
-        self._state = x, p
-        self._told = _information(x, p)
-        self._factors: dict[int, Array] = {}
-
-    def cuts(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Numbers of samples (E) of those with these stamps (N,) after which a new block begins."""
-        first, last = int(stamps_ns[0]) // self._length_ns, int(stamps_ns[-1]) // self._length_ns
-        if first == last == (first if self._last is None else self._last):  # as nearly always live
-            self._last = last
-            return _NO_CUTS
-        blocks = stamps_ns // self._length_ns
-        before = blocks[0] if self._last is None else self._last
-        self._last = int(blocks[-1])
-        return np.flatnonzero(np.diff(blocks, prepend=before))
-
-    def add(self, x: Array, p: Array, last: tuple[Array, Array]) -> None:
-        """Take the states at the cuts, x (E, K, n), P (E, K, n, n).
-
-        last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by.
-        """
-        for information, vector in _informations(x, p):
-            self._blocks.add(information - self._told[0], vector - self._told[1], 1.0)
-            self._told = information, vector
-        self._state = last
-        self._factors.clear()
-
-    def end_day(
-        self, before: GaussianState, after: GaussianState, of_day: NDArray[np.intp], last: GaussianState
-    ) -> None:
-        """Go on with states `after` the end of a day, x (K, n), P (K, n, n), from those `before`. of_day: which (u,) of
-        them were of the day. last: those `after`, as in `add`."""
-        self.add(before.x[None], before.p[None], last)
-        self._blocks.end_day(of_day, *self._told, np.arange(len(before.x)))
-        self._state, self._told = last, _information(*after)
-        self._last = None
-        self._factors.clear()
-
-    def inflation(self, index: int) -> Array:
-        """By how much σ of each state (n,) of one filter has to grow, at least 1."""
-        if index not in self._factors:
-            x, p = self._state
-            self._factors[index] = self._blocks.inflation(index, x[index], p[index])
-        return self._factors[index]
-
-
-def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array]]:
-    """Of E states x (K, n), P (K, n, n); without those whose numbers ran away: the filter goes on from before them."""
-    try:
-        yield from zip(*_information(x, p), strict=True)
-        return
-    except np.linalg.LinAlgError:
-        pass
-    for each in zip(x, p, strict=True):
-        with suppress(np.linalg.LinAlgError):
-            yield _information(*each)
-
-
-def _information(x: Array, p: Array) -> tuple[Array, Array]:
-    information = np.linalg.inv(p)
-    return information, (information @ x[..., None])[..., 0]

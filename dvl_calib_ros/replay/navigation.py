@@ -18,6 +18,7 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.delay.hold_out import NO_TERMS, Recording, Terms
 from ..calibration.folds import folds_of
 from ..calibration.frames import Array
+from ..calibration.kalman import GaussianState
 from ..calibration.parameters import Parameters
 from ..calibration.robust import median
 from ..calibration.samples import Index
@@ -117,16 +118,22 @@ def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) ->
     # of every fold and day what corrects it
     n_days = len(terms[0])
     parts = folds_of(stamps_ns, parameters) * n_days + calibrator.day_of(stamps_ns)
-    return dead_reckoned(recording, parts, [each for of_days in terms for each in of_days], parameters, epoch_ns)
+    corrections = [each for of_days in terms for each in of_days]
+    return dead_reckoned(recording, parts, corrections, parameters, epoch_ns, calibrator.heading_deviation)
 
 
 def dead_reckoned(
-    recording: Recording, folds: NDArray[np.int64], terms: Sequence[Terms], parameters: Parameters, epoch_ns: int = 0
+    recording: Recording,
+    folds: NDArray[np.int64],
+    terms: Sequence[Terms],
+    parameters: Parameters,
+    epoch_ns: int = 0,
+    heading: GaussianState | None = None,
 ) -> Navigation | None:
     """The track by the DVL as mounted, and corrected.
 
-    folds: (N,) of each DVL sample, which of `terms` corrects it. epoch_ns: what the recording's times count from. None
-    without reference, or with hardly any motion.
+    folds: (N,) of each DVL sample, which of `terms` corrects it. epoch_ns: what the recording's times count from.
+    heading: as `Estimate.heading_deviation`. None without reference, or with hardly any motion.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -163,10 +170,8 @@ def dead_reckoned(
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
-        deviation=heading_deviation(
-            recording.dvl.times[use], after.yaw[use], after.velocity[use, :2], after.error[use, :2]
-        )
-        if on_a_map
+        deviation=heading_deviation(recording.dvl.times[use], after.yaw[use], heading)
+        if on_a_map and heading is not None
         else None,
         followed=left_over(recording.dvl.times[use], *(each[use] for each in after.whole)) if on_a_map else None,
     )

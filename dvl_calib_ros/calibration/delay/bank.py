@@ -22,6 +22,7 @@ import numpy as np
 from ..correction_parameters import PriorOnErrors, to_correction
 from ..folds import FOLDS, FoldSums, folds_of, with_states_of
 from ..frames import Array
+from ..heading_states import HeadingStates, all_told, heading_states, heading_terms, upwards, with_terms
 from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState, distance_squared
 from ..parameters import Parameters
@@ -65,13 +66,14 @@ class Hypotheses(NamedTuple):
 
 class Found(NamedTuple):
     """What is known at some time: the likely hypotheses x (M, n), P (M, n, n), on ψ and κ, the numbers kept (M,) of
-    their delays, and the share (M,) of each; shown and inflation as of `Posterior`."""
+    their delays, and the share (M,) of each; shown, inflation and heading as of `Posterior`."""
 
     likely: GaussianState
     kept: Index
     share: Array
     shown: Mask
     inflation: Array
+    heading: GaussianState | None
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class Posterior:
     state: x (n,), P (n, n) of G2's states. shown: (n,) which of them the data alone shows. inflation: (n,) by how much
     its standard deviations were raised above the filter's own. turned: (3,) by how much 1 m of lever arm along the
     axis that matters most turns each misalignment, rad; by_lever_arm: (3,) variance of each that comes with what is not
-    known of the lever arm, in variances without.
+    known of the lever arm, in variances without. heading: coefficients of its deviation, as of `HeadingStates`.
     """
 
     state: GaussianState
@@ -89,6 +91,7 @@ class Posterior:
     inflation: Array
     turned: Array
     by_lever_arm: Array
+    heading: GaussianState | None
 
 
 class _Ended(NamedTuple):
@@ -144,6 +147,8 @@ class DelayBank:
         self.used = self.gated = 0
         self._nis_sum = 0.0
         self.blocks = TimeBlocks()
+        self._up = upwards(parameters.rotation_dvl_from_body, N_STATE)
+        self._epoch_ns: int | None = None  # of the first row
         k = len(DELAYS_S)
         self._folds = FoldSums((k, N_STATE, N_STATE), (k, N_STATE)) if verified else None
 
@@ -168,10 +173,10 @@ class DelayBank:
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
         begins = [_information(_around_each_delay(with_states_of(each, self._unknown, OF_DAY))) for each in known]
-        total = np.linalg.inv(found.p)
+        total = all_told(found.information, found.vector, self.blocks)
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
-        self.blocks.end_day(OF_DAY, total, (total @ found.x[..., None])[..., 0], source)
+        self.blocks.end_day(OF_DAY, *total, source)
         self._ended.append(_Ended(known, shown, inflation))
         self._heave.close()
         self._heave.absorb()  # its rows are in what is known
@@ -216,13 +221,23 @@ class DelayBank:
         self._information += total
         self._regressor_noise += rows.weight[use] @ rows.regressor_noise[use]
         self._vector += total_vector
-        self.blocks.add(total, total_vector, float(rows.weight[use].sum()))
+        weight = rows.weight * use
+        self.blocks.add(*self._with_terms(total, total_vector, rows, weight, stamps_ns), float(weight.sum()))
         self._heave.add_sums(stamps_ns, rows.heave, use)
         self._learn_heave()
         if self._folds is not None:
             for fold, (information, vector, _) in by_fold:
                 self._folds.add(fold, information, vector)
         return use
+
+    def _with_terms(
+        self, information: Array, vector: Array, rows: DelayedRows, weight: Array, stamps_ns: Stamps
+    ) -> tuple[Array, Array]:
+        """What rows of this weight (J,) and with these stamps (J,) told, with what it says of the heading's error."""
+        if self._epoch_ns is None:
+            self._epoch_ns = int(stamps_ns[0])
+        seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
+        return with_terms(information, vector, heading_terms(rows.motion.earth, weight, seconds), self._up)
 
     def misfits(self, rows: DelayedRows) -> tuple[Array, Array]:
         """What all hypotheses would make of further rows, nothing being changed.
@@ -323,10 +338,15 @@ class DelayBank:
         """What is known as of now."""
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
-        inflation = self._inflation(best, found)
         kept, share = _likely(log_share)
         likely = GaussianState(found.x[kept], found.p[kept])
-        return Found(likely, kept, share, self._shown(best, inflation), inflation)
+        if self._process_rate is not None:
+            ones: Array = np.ones(N_STATE)
+            return Found(likely, kept, share, self._shown(best, ones), ones, None)
+        deviation = self._deviation(likely, kept, int(np.searchsorted(kept, best)))
+        likely = GaussianState(likely.x + deviation.shift, likely.p + deviation.more)
+        shown = self._shown(best, deviation.inflation)
+        return Found(likely, kept, share, shown, deviation.inflation, deviation.coefficients)
 
     def posteriors(self, found: Sequence[Found]) -> list[Posterior]:
         """The mixture of all hypotheses, as it was found on this day each time.
@@ -357,7 +377,7 @@ class DelayBank:
         turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
         claimed = with_states_of(raised, self.prior, _without(found.shown, _BEYOND))
-        return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest)
+        return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest, found.heading)
 
     def days(self) -> list[DayState]:
         """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""
@@ -426,7 +446,12 @@ class DelayBank:
         """By how much blocks of time raise σ of each state (n,)."""
         if self._process_rate is not None:
             return np.ones(N_STATE)
-        return self.blocks.inflation(best, found.x[best], found.p[best])
+        of_one = np.array([best])
+        return self._deviation(GaussianState(found.x[of_one], found.p[of_one]), of_one, 0).inflation
+
+    def _deviation(self, states: GaussianState, numbers: Index, best: int) -> HeadingStates:
+        """How the heading deviates by hypotheses x (M, n), P (M, n, n) with these numbers (M,); best: place of one."""
+        return heading_states(self.blocks, states, numbers, best, self._parameters.heading_deviation_std)
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """All hypotheses as one, in the errors."""

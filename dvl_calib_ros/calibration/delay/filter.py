@@ -147,6 +147,12 @@ class DelayFilter(Estimator):
             return factor
         return np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
 
+    @property
+    def heading_deviation(self) -> GaussianState | None:
+        """As `Estimator`."""
+        posterior = self.posterior
+        return posterior.heading if posterior is not None and self.claims else self._base.heading_deviation
+
     def state(self) -> GaussianState:
         """The state; while nothing more is claimed that of the model that this extends."""
         posterior, base = self.posterior, self._base.state()
@@ -154,7 +160,7 @@ class DelayFilter(Estimator):
 
     def of_recording(self) -> GaussianState:
         """As `state`, with σ as blocks of time show it: its own has been raised."""
-        return self.state() if self.claims else self.state().raised(self.inflation)
+        return self.state() if self.claims else self.extended(self._base.of_recording())
 
     def extended(self, base: GaussianState) -> GaussianState:
         """The state of the model that this one extends, with the prior of what it does not have."""

@@ -18,8 +18,8 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.files.result_file import result_document
 
-# σ of the recording itself: what another day makes of it is no matter of noise
-OF_THE_DAY = {"day_std_heading": 0.0, "day_std_scale": 0.0}
+# σ of the recording itself, with an exact heading: what another day or a compass makes of it is no matter of noise
+OF_THE_DAY = {"day_std_heading": 0.0, "day_std_scale": 0.0, "heading_deviation_std": 0.0}
 CLAIMED = Parameters(gnss_aided_std=0.03, **OF_THE_DAY)
 
 

@@ -7,47 +7,87 @@ import math
 import numpy as np
 import pytest
 
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.replay.heading_deviation import FIRST, heading_advice, heading_deviation
 
-
-def recorded(rng, off, offset=(0.0, 0.0), legs=8, noise=0.03, scale=0.0):
-    """Legs of 40 s at 1 m/s all around; off: (yaw, s) -> rad by which the heading reads too much to the right."""
-    time = np.arange(0.0, 40.0 * legs, 0.2)
-    yaw = np.floor(time / 40.0) * 2.0 * math.pi / 8.0
-    velocity = np.tile([1.0, 0.0], (len(time), 1))
-    error = rng.normal(0.0, noise, velocity.shape)
-    error[:, 0] += scale + offset[0] * np.cos(yaw) + offset[1] * np.sin(yaw)
-    error[:, 1] += off(yaw, time) - offset[0] * np.sin(yaw) + offset[1] * np.cos(yaw)
-    return time, yaw, velocity, error
+START_NS, STEP_S, LEG_S = 1_600_000_000_000_000_000, 0.5, 40.0
+YAW = math.radians(1.0)  # of the DVL in the vehicle
 
 
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.02, -0.015)])
-def test_a_constant_error_of_the_heading_or_of_the_reference_is_no_deviation(seed, offset):
+def recorded(seed, off, offset=(0.0, 0.0), legs=16, every=math.pi / 4.0):
+    """Legs of 40 s at 1 m/s, each turned by `every` from the one before; off: (yaw, s) -> by what the heading is off.
+
+    offset: m/s, of the reference east and north. Returns the calibrator, times (N,) and true yaws (N,).
+    """
     rng = np.random.default_rng(seed)
-    assert heading_deviation(*recorded(rng, lambda yaw, _: 0.02 + 0.0 * yaw, offset, scale=0.01)) is None
+    calibrator = Calibrator(Parameters(gnss_aided_std=0.03), block_size=64, models=("G1",))
+    time = np.arange(0.0, LEG_S * legs, STEP_S)
+    yaw = np.floor(time / LEG_S) * every + 0.2
+    for at, heading in zip(time.tolist(), yaw.tolist(), strict=True):
+        stamp = START_NS + round(at * 1e9)
+        turned = rotation_from_rpy([0.0, 0.0, heading + off(heading, at)])
+        velocity = rotation_from_rpy([0.0, 0.0, heading])[:, 0] + (*offset, 0.0) + rng.normal(0.0, 0.03, 3)
+        dvl = rotation_from_rpy([0.0, 0.0, YAW])[:, 0] + rng.normal(0.0, 0.005, 3)
+        calibrator.feed_imu(ImuSample(stamp, quaternion_from_rotation(turned), (0.0, 0.0, 0.0)))
+        calibrator.feed_reference(ReferenceSample(stamp, tuple(velocity.tolist()), None, VelocityFrame.ENU))
+        calibrator.feed_dvl(DvlSample(stamp, tuple(dvl.tolist())))
+    calibrator.finish()
+    return calibrator, time, yaw
+
+
+def deviation(*args, **more):
+    calibrator, time, yaw = recorded(*args, **more)
+    return heading_deviation(time, yaw, calibrator.heading_deviation)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, -0.009)])
+def test_a_constant_error_of_the_heading_or_of_the_reference_is_no_deviation(seed, offset):
+    assert deviation(seed, lambda *_: 0.02, offset) is None
 
 
 @pytest.mark.parametrize("cycles", [1, 2])
-def test_a_compass_that_deviates_is_found_with_its_size_and_headings(rng, cycles):
+def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
     size = math.radians(2.0)
-    found = heading_deviation(*recorded(rng, lambda yaw, _: size * np.sin(cycles * yaw)))
+    found = deviation(1, lambda yaw, _: size * math.sin(cycles * yaw))
     assert found.rms == pytest.approx(size / math.sqrt(2.0), rel=0.25) and not found.by_time
-    if cycles == 1:  # most at yaw 90 degrees, which is north
-        assert min(found.most_at, 2.0 * math.pi - found.most_at) < 0.1
+    if cycles == 1:  # most at the heading next to yaw 90 degrees, which is north
+        assert min(found.most_at, 2.0 * math.pi - found.most_at) < 0.25
     (said,) = heading_advice(found)
     assert said.code == "HEADING_DEVIATION" and "with the heading" in said.says and "compass first" not in said.remedy
 
 
-def test_a_gyro_that_drifts_is_named_by_time_and_beyond_three_degrees_the_compass_comes_first(rng):
-    found = heading_deviation(*recorded(rng, lambda yaw, time: math.radians(6.0) * np.sin(yaw) + 0.0 * time))
+@pytest.mark.parametrize("legs, every", [(16, math.pi / 4.0), (16, math.pi)], ids=["all around", "to and fro"])
+@pytest.mark.parametrize("size", [0.0, 0.5, 2.0])
+def test_yaw_is_within_its_sigma(legs, every, size):
+    off = []
+    for seed in range(4):
+        deviates = lambda yaw, _, at=seed: math.radians(size) * math.sin(yaw + 1.6 * at)  # noqa: E731
+        calibrator, *_ = recorded(seed, deviates, legs=legs, every=every)
+        estimate = calibrator.estimate("G1")
+        off.append((estimate.state[2] - YAW) / estimate.recording_std[2])
+        assert estimate.recording_std[2] < math.radians(0.3 + 0.5 * size)
+    assert np.abs(off).max() < 3.0, off
+
+
+def test_on_one_heading_sigma_of_yaw_holds_what_the_heading_may_be_off_by():
+    calibrator, *_ = recorded(0, lambda *_: math.radians(0.8), every=0.0)
+    estimate = calibrator.estimate("G1")
+    assert math.radians(0.5) < estimate.recording_std[2] < math.radians(0.8)
+    assert abs(estimate.state[2] - YAW) < 2.0 * estimate.recording_std[2]
+
+
+def test_a_gyro_that_drifts_is_named_by_time_and_beyond_three_degrees_the_compass_comes_first():
+    found = deviation(2, lambda yaw, _: math.radians(6.0) * math.sin(yaw))
     assert found.rms > FIRST and "calibrate the compass first" in heading_advice(found)[0].remedy
-    drifts = heading_deviation(*recorded(rng, lambda _, time: math.radians(5.0) * time / time[-1], legs=16))
+    drifts = deviation(2, lambda _, time: math.radians(5.0) * time / (16 * LEG_S))
     assert drifts.by_time and "with time" in heading_advice(drifts)[0].says
 
 
-def test_few_stretches_or_turns_alone_say_nothing(rng):
-    time, yaw, velocity, error = recorded(rng, lambda yaw, _: np.sin(yaw), legs=2)
-    assert heading_deviation(time, yaw, velocity, error) is None
-    assert heading_deviation(time, time, velocity, error) is None
-    assert heading_deviation(time[:0], yaw[:0], velocity[:0], error[:0]) is None
+def test_few_headings_or_nothing_at_all_say_nothing():
+    assert deviation(3, lambda yaw, _: math.sin(yaw) * 0.05, legs=1) is None
+    assert heading_deviation(np.zeros(0), np.zeros(0), GaussianState(np.zeros(5), np.eye(5))) is None

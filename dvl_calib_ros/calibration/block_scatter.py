@@ -1,0 +1,108 @@
+"""Blocks of time of filters that go on sample by sample, and what they say: σ, and how the heading deviates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from .frames import Array
+from .heading_states import BlockTerms, HeadingStates, all_told, heading_states, with_terms
+from .kalman import GaussianState
+from .samples import Index, Stamps
+from .time_blocks import TimeBlocks
+
+_NO_CUTS = np.zeros(0, dtype=np.intp)
+
+
+class BlockScatter:
+    """`TimeBlocks` of K filters without process noise, told by their states where one block ends and the next begins.
+
+    What a block told is the difference of the information after and before it. What they say is as of the end of the
+    last block, so it depends on stamps alone.
+    """
+
+    def __init__(self, x: Array, p: Array, seconds: float, up: Array, heading_std: float) -> None:
+        """Start from states x (K, n), P (K, n, n).
+
+        seconds: length of a block. up: (n,) as `heading_states.upwards`, zeros for filters without a reference.
+        """
+        self._blocks = TimeBlocks()
+        self._length_ns = round(seconds * 1e9)
+        self._up, self._heading_std = up, heading_std
+        self._terms = BlockTerms() if up.any() and heading_std > 0.0 else None
+        self._last: int | None = None
+        self._state = GaussianState(x, p)
+        self._told = _information(x, p)
+        self._found: dict[int, HeadingStates] = {}
+
+    def cuts(self, stamps_ns: Stamps, earth_in_body: Array | None) -> Index:
+        """Take N samples (N,), of references as of `Observations.earth_in_body`.
+
+        Returns numbers (E,) of those after which a new block begins.
+        """
+        if self._terms is not None:
+            self._terms.add(stamps_ns, earth_in_body)
+        first, last = int(stamps_ns[0]) // self._length_ns, int(stamps_ns[-1]) // self._length_ns
+        if first == last == (first if self._last is None else self._last):  # as nearly always live
+            self._last = last
+            return _NO_CUTS
+        blocks = stamps_ns // self._length_ns
+        before = blocks[0] if self._last is None else self._last
+        self._last = int(blocks[-1])
+        return np.flatnonzero(np.diff(blocks, prepend=before))
+
+    def add(self, cuts: Index, x: Array, p: Array, last: GaussianState) -> None:
+        """Take the states at the cuts, x (E, K, n), P (E, K, n, n).
+
+        last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by.
+        """
+        terms = [None] * len(cuts) if self._terms is None else self._terms.upto(cuts)
+        self._add(terms, x, p, last)
+
+    def _add(self, terms: Iterable[Array | None], x: Array, p: Array, last: GaussianState) -> None:
+        for own, now in zip(terms, _informations(x, p), strict=True):
+            if now is None:
+                continue
+            told = now[0] - self._told[0], now[1] - self._told[1]
+            information, vector = told if own is None else with_terms(*told, own, self._up)
+            self._blocks.add(information, vector, 1.0)
+            self._told = now
+        self._state = last
+        self._found.clear()
+
+    def end_day(self, before: GaussianState, after: GaussianState, of_day: Index, last: GaussianState) -> None:
+        """Go on with states `after` the end of a day, x (K, n), P (K, n, n), from those `before`. of_day: which (u,) of
+        them were of the day. last: those `after`, as in `add`."""
+        self._add([None if self._terms is None else self._terms.rest()], before.x[None], before.p[None], last)
+        known = self._told if self._terms is None else all_told(*self._told, self._blocks)
+        self._blocks.end_day(of_day, *known, np.arange(len(before.x)))
+        self._told = _information(*after)
+        self._last = None
+        self._found.clear()
+
+    def found(self, index: int) -> HeadingStates:
+        """What blocks say of one filter: by how much σ has to grow, and what is to be added for the deviation."""
+        if index not in self._found:
+            of_one = GaussianState(*(each[index : index + 1] for each in self._state))
+            self._found[index] = heading_states(self._blocks, of_one, np.array([index]), 0, self._heading_std)
+        return self._found[index]
+
+
+def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array] | None]:
+    """Of E states x (K, n), P (K, n, n); None of those whose numbers ran away: the filter goes on from before them."""
+    try:
+        yield from zip(*_information(x, p), strict=True)
+        return
+    except np.linalg.LinAlgError:
+        pass
+    for each in zip(x, p, strict=True):
+        try:
+            yield _information(*each)
+        except np.linalg.LinAlgError:
+            yield None
+
+
+def _information(x: Array, p: Array) -> tuple[Array, Array]:
+    information = np.linalg.inv(p)
+    return information, (information @ x[..., None])[..., 0]

@@ -1,0 +1,219 @@
+"""By how much the heading is off, as it changes with the heading and with time: states beside those of the mounting.
+
+Yaw is found against the IMU's heading. A constant error of that is harmless, as the same IMU navigates; one that
+changes is not: a compass deviates by one and two cycles of the heading, a gyro drifts. The error δ turns a reference in
+an earth frame as a misalignment about the body's vertical u does, so with Λ_b, y_b what a block of time told of the
+states and t_b the terms of its heading, the block tells of them and of the coefficients d of δ = tᵀd together
+
+    | Λ_b          Λ_b u tᵀ    |   | y_b       |
+    | t (Λ_b u)ᵀ   uᵀΛ_b u t tᵀ |   | uᵀy_b t   |
+
+No row has a column more; blocks of time have (time_blocks.py). On one heading δ and yaw are the same to the data, and
+σ of yaw holds both; on reciprocal headings one cycle of it averages out. How large coefficients are is said by
+`heading_deviation_std`, until headings show it to be more or less (empirical Bayes).
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from .frames import Array, product
+from .kalman import GaussianState
+from .samples import Index, Mask, Stamps
+from .time_blocks import TimeBlocks
+
+# Terms of a block: sine and cosine of its heading and of twice that, time (s), and one, where references are of the
+# earth, else zeros.
+N_TERMS = 6
+# Prior σ of the coefficients, of heading_deviation_std: one cycle, two cycles, and a drift from first to last.
+_SHARE = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
+N_COEFFICIENTS = len(_SHARE)
+# A compass deviates with the heading, a gyro drifts: what one of them shows says nothing of the other.
+_CYCLES, _DRIFT = np.arange(N_COEFFICIENTS) < 4, np.arange(N_COEFFICIENTS) == 4
+# How large they may be instead of what the parameter says, which is the root of their mean square, and how likely each
+# is: a factor of 4 is one σ of its logarithm. Most headings are better than it, a few are much worse.
+_WIDTH = np.log(4.0)
+_LOGS: Array = np.arange(-6.0, 3.5, 0.35)
+_LOG_LIKELY: Array = -0.5 * (_LOGS / _WIDTH + _WIDTH) ** 2
+_FACTORS: Array = np.exp(_LOGS) / np.sqrt(np.exp(_LOG_LIKELY) @ np.exp(2.0 * _LOGS) / np.exp(_LOG_LIKELY).sum())
+# A drift is one from so long on, s.
+_SHORTEST_S = 60.0
+
+
+def heading_terms(earth_in_body: Array, weight: Array, seconds: float) -> Array:
+    """Terms (6,) of a block: means over references, `Observations.earth_in_body` (N, 3, 2), weight (N,)."""
+    ahead = earth_in_body[:, 0]
+    length = np.sqrt((ahead * ahead).sum(axis=1))
+    share = np.where(length > 0.0, weight, 0.0) / max(float(weight.sum()), 1e-300)
+    east, north = (ahead / np.where(length > 0.0, length, 1.0)[:, None]).T
+    one = share.sum()
+    return np.array(
+        [share @ north, share @ east, 2.0 * (share @ (north * east)), share @ (east**2 - north**2), seconds * one, one]
+    )
+
+
+class BlockTerms:
+    """Terms of blocks of time that end where they are said to, from samples in order."""
+
+    def __init__(self) -> None:
+        self._epoch_ns: int | None = None
+        self._waiting: list[tuple[Stamps, Array]] = []
+
+    def add(self, stamps_ns: Stamps, earth_in_body: Array | None) -> None:
+        """Take N samples: stamps (N,), `Observations.earth_in_body` (N, 3, 2)."""
+        if self._epoch_ns is None:
+            self._epoch_ns = int(stamps_ns[0])
+        earth = np.zeros((len(stamps_ns), 3, 2)) if earth_in_body is None else earth_in_body
+        self._waiting.append((stamps_ns, earth))
+
+    def upto(self, cuts: Index) -> Array:
+        """Terms (E, 6) of the blocks that end after so many (E,) of the samples taken last; zeros without any."""
+        *before, (stamps_ns, earth) = self._waiting
+        parts = [slice(first, end) for first, end in pairwise([0, *cuts.tolist(), len(stamps_ns)])]
+        blocks = [[(stamps_ns[part], earth[part])] for part in parts]
+        blocks[0] = [*before, *blocks[0]]
+        self._waiting = blocks.pop()
+        return np.array([self._terms(block) for block in blocks])
+
+    def rest(self) -> Array:
+        """Terms (6,) of the block that ends with the last sample taken."""
+        block, self._waiting = self._waiting, []
+        return self._terms(block)
+
+    def _terms(self, block: list[tuple[Stamps, Array]]) -> Array:
+        if not sum(len(stamps_ns) for stamps_ns, _ in block):
+            return np.zeros(N_TERMS)
+        assert self._epoch_ns is not None
+        stamps_ns, earth = (np.concatenate(each) for each in zip(*block, strict=True))
+        seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
+        return heading_terms(earth, np.ones(len(earth)), seconds)
+
+
+def upwards(rotation_dvl_from_body: Array, n: int) -> Array:
+    """Of n states, the misalignment first, those that turn about the body's vertical: u (n,)."""
+    u = np.zeros(n)
+    u[:3] = rotation_dvl_from_body[:, 2]
+    return u
+
+
+def with_terms(information: Array, vector: Array, terms: Array, up: Array) -> tuple[Array, Array]:
+    """What a block told of K times n states, Λ (K, n, n) and y (K, n), with what it tells of the terms beside them."""
+    k, n = vector.shape
+    both, y = np.empty((k, n + N_TERMS, n + N_TERMS)), np.empty((k, n + N_TERMS))
+    turned = information @ up
+    both[:, :n, :n] = information
+    both[:, :n, n:] = turned[:, :, None] * terms
+    both[:, n:, :n] = both[:, :n, n:].swapaxes(1, 2)
+    both[:, n:, n:] = (turned @ up)[:, None, None] * np.outer(terms, terms)
+    y[:, :n] = vector
+    y[:, n:] = (vector @ up)[:, None] * terms
+    return both, y
+
+
+def all_told(information: Array, vector: Array, blocks: TimeBlocks) -> tuple[Array, Array]:
+    """All that is known of K times n states, Λ (K, n, n) and y (K, n), with what blocks tell of the terms."""
+    if not blocks.count:
+        return with_terms(information, vector, np.zeros(N_TERMS), np.zeros(vector.shape[1]))
+    n = vector.shape[1]
+    both, y = (each.copy() for each in blocks.total)
+    both[:, :n, :n], y[:, :n] = information, vector
+    return both, y
+
+
+class HeadingStates(NamedTuple):
+    """What the data say of it, and what that makes of M hypotheses of n states.
+
+    coefficients: x (5,), P (5, 5), of the hypothesis that says how large it is: of sine and cosine of the yaw and of
+    twice the yaw, rad, and of time, rad/s; None where no reference is turned by a heading. shift (M, n), more
+    (M, n, n): to be added to x and P. inflation: (n,) by how much σ of that hypothesis has to grow then, as of
+    `TimeBlocks`.
+    """
+
+    coefficients: GaussianState | None
+    shift: Array
+    more: Array
+    inflation: Array
+
+
+def heading_states(blocks: TimeBlocks, states: GaussianState, numbers: Index, best: int, std: float) -> HeadingStates:
+    """The deviation by blocks of time that are `with_terms`; none by others, which say no more than `inflation`.
+
+    states: x (M, n), P (M, n, n) without it, of the hypotheses with these numbers (M,) in the blocks. best: place among
+    them of the one that says how large it is. std: rad, `heading_deviation_std`.
+    """
+    m, n = states.x.shape
+    if not blocks.count or blocks.total[1].shape[1] == n:  # blocks without terms
+        factor = blocks.inflation(int(numbers[best]), states.x[best], states.p[best])
+        return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), factor)
+    told, vector = (each[numbers] for each in blocks.total)
+    onto = _onto_coefficients(told[best, n:, n:], blocks.kept[0][:, numbers[best], -1, -2:])
+    beside = onto @ told[:, n:, :n]
+    turned = beside @ states.p
+    own = onto @ told[:, n:, n:] @ onto.T - turned @ beside.swapaxes(1, 2)
+    scores = vector[:, n:] @ onto.T - product(beside, states.x)
+
+    def deviating(root: Array, which: slice | Index) -> tuple[Array, Array, Array, Array]:
+        """Coefficients, their covariance, shift and more of some hypotheses, where their prior has σ root (5,)."""
+        p = root[:, None] * np.linalg.inv(np.eye(N_COEFFICIENTS) + root[:, None] * own[which] * root) * root
+        x = product(p, scores[which])
+        gain = p @ turned[which]
+        more = turned[which].swapaxes(1, 2) @ gain
+        return (
+            x,
+            0.5 * (p + p.swapaxes(1, 2)),
+            -product(turned[which].swapaxes(1, 2), x),
+            0.5 * (more + more.swapaxes(1, 2)),
+        )
+
+    def inflation(root: Array) -> tuple[Array, Array, Array]:
+        """Of the best one: coefficients, their covariance, and by how much σ (n + 5,) of states and them grow."""
+        x, p, shift, more = (each[0] for each in deviating(root, np.array([best])))
+        across = -turned[best].T @ p
+        both = np.block([[states.p[best] + more, across], [across.T, p]])
+        of_terms = np.block([[np.eye(n), np.zeros((n, N_COEFFICIENTS))], [np.zeros((N_TERMS, n)), onto.T]])
+        at = of_terms @ np.concatenate([states.x[best] + shift, x])
+        return x, p, blocks.inflation(int(numbers[best]), at, both @ of_terms.T, np.diag(both))
+
+    # what is left where it may be of any size is noise, and whatever else: the evidence is worth as much less
+    _, _, factor = inflation(_FACTORS[-1] * std * _SHARE)
+    level = float((factor[n:] ** 2).mean())
+    root = std * _SHARE
+    for which in (_CYCLES, _DRIFT):
+        root = np.where(which, _size(own[best] / level, scores[best] / level, root, which), 1.0) * root
+    x, p, factor = inflation(root)
+    _, _, shift, more = deviating(root, slice(None))
+    in_time = np.append(np.ones(N_COEFFICIENTS - 1), onto[-1, -2])
+    of_one = GaussianState(x * in_time, p * np.outer(in_time, in_time)).raised(factor[n:])
+    return HeadingStates(of_one if told[best, -1, -1] > 0.0 else None, shift, more, factor[:n])
+
+
+def _onto_coefficients(square: Array, times: Array) -> Array:
+    """(5, 6): from sums over the terms to those over coefficients, whose drift has no mean and ends with 1.
+
+    square: (6, 6) of the terms. times: (B, 2) of blocks, information of yaw times its time (s), and that information.
+    """
+    onto = np.zeros((N_COEFFICIENTS, N_TERMS))
+    onto[: N_TERMS - 2, : N_TERMS - 2] = np.eye(N_TERMS - 2)
+    told = times[times[:, 1] > 0.0]
+    if len(told):
+        at = told[:, 0] / told[:, 1]
+        span = max(float(at[-1] - at[0]), _SHORTEST_S)
+        onto[-1, -2:] = 1.0 / span, -square[-1, -2] / square[-1, -1] / span
+    return onto
+
+
+def _size(information: Array, scores: Array, root: Array, which: Mask) -> float:
+    """How many times larger the prior σ root (5,) of some coefficients is, by the evidence: root of the mean square.
+
+    information (5, 5), scores (5,): of the coefficients, without their prior. which: (5,).
+    """
+    roots = np.where(which, _FACTORS[:, None], 1.0) * root
+    spread = np.eye(N_COEFFICIENTS) + roots[:, :, None] * information * roots[:, None]
+    about = roots * scores
+    explained = (about * np.linalg.solve(spread, about[..., None])[..., 0]).sum(axis=1)
+    likely = 0.5 * (explained - np.linalg.slogdet(spread)[1]) + _LOG_LIKELY
+    share = np.exp(likely - likely.max())
+    return float(np.sqrt(share @ _FACTORS**2 / share.sum()))
