@@ -101,8 +101,10 @@ class Group:
         still = self._assembler.process_rate is None
         # the paper's models are as they are published
         deviates = self.needs is Needs.REFERENCE and models[0].in_correction_parameters
-        up = upwards(parameters.rotation_dvl_from_body, models[0].n_state) * deviates
-        self._scatter_of = partial(BlockScatter, seconds=BLOCK_S, up=up, heading_std=parameters.heading_deviation_std)
+        self._up = upwards(parameters.rotation_dvl_from_body, models[0].n_state) * deviates
+        self._scatter_of = partial(
+            BlockScatter, seconds=BLOCK_S, up=self._up, heading_std=parameters.heading_deviation_std
+        )
         self._scatter = self._scatter_of(self._x, self._p) if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
         self._height = HeightOfLate() if models[0].uses_height else None
@@ -304,7 +306,7 @@ class Group:
         if name not in self._of_recording:
             found = self._scatter.found(self.index[name])
             state = self._sound_state(name, found.shift[0], found.more[0]) if found.more.any() else self.state(name)
-            self._of_recording[name] = state.raised(found.inflation)
+            self._of_recording[name] = state.raised(found.inflation).turned(self._up, found.drifted)
         return self._of_recording[name]
 
     def heading_deviation(self, name: str) -> GaussianState | None:

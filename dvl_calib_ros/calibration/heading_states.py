@@ -128,13 +128,14 @@ class HeadingStates(NamedTuple):
 
     coefficients: x (5,), P (5, 5), of the hypothesis that says how large it is: of sine and cosine of the yaw and of
     twice the yaw, rad, and of time, rad/s; None where no reference is turned by a heading. shift (M, n), more
-    (M, n, n): to be added to x and P. inflation: (n,) by how much σ of that hypothesis has to grow then, as of
-    `TimeBlocks`.
+    (M, n, n): to be added to x and P. drifted: rad², to be added to the variance of yaw, as nobody knows when a heading
+    that drifts was right. inflation: (n,) by how much σ of that hypothesis has to grow then, as of `TimeBlocks`.
     """
 
     coefficients: GaussianState | None
     shift: Array
     more: Array
+    drifted: float
     inflation: Array
 
 
@@ -147,13 +148,15 @@ def heading_states(blocks: TimeBlocks, states: GaussianState, numbers: Index, be
     m, n = states.x.shape
     if not blocks.count or blocks.total[1].shape[1] == n:  # blocks without terms
         factor = blocks.inflation(int(numbers[best]), states.x[best], states.p[best])
-        return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), factor)
+        return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), 0.0, factor)
     told, vector = (each[numbers] for each in blocks.total)
     onto = _onto_coefficients(told[best, n:, n:], blocks.kept[0][:, numbers[best], -1, -2:])
     beside = onto @ told[:, n:, :n]
     turned = beside @ states.p
     own = onto @ told[:, n:, n:] @ onto.T - turned @ beside.swapaxes(1, 2)
     scores = vector[:, n:] @ onto.T - product(beside, states.x)
+    if not _is_definite(own, std):  # numbers that ran away say nothing of the heading
+        return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), 0.0, np.ones(n))
 
     def deviating(root: Array, which: slice | Index) -> tuple[Array, Array, Array, Array]:
         """Coefficients, their covariance, shift and more of some hypotheses, where their prior has σ root (5,)."""
@@ -185,9 +188,22 @@ def heading_states(blocks: TimeBlocks, states: GaussianState, numbers: Index, be
         root = np.where(which, _size(own[best] / level, scores[best] / level, root, which), 1.0) * root
     x, p, factor = inflation(root)
     _, _, shift, more = deviating(root, slice(None))
+    # at any time of the recording, as far as data show
+    is_turned = bool(told[best, -1, -1] > 0.0)
+    drifted = (x[-1] ** 2 + p[-1, -1]) / 12.0 if is_turned else 0.0
     in_time = np.append(np.ones(N_COEFFICIENTS - 1), onto[-1, -2])
     of_one = GaussianState(x * in_time, p * np.outer(in_time, in_time)).raised(factor[n:])
-    return HeadingStates(of_one if told[best, -1, -1] > 0.0 else None, shift, more, factor[:n])
+    return HeadingStates(of_one if is_turned else None, shift, more, float(drifted), factor[:n])
+
+
+def _is_definite(information: Array, std: float) -> bool:
+    """Whether information (M, 5, 5) on the coefficients is that, rounding aside."""
+    widest = _FACTORS[-1] * std * _SHARE
+    try:
+        np.linalg.cholesky(np.eye(N_COEFFICIENTS) + widest[:, None] * information * widest)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(information).all())
 
 
 def _onto_coefficients(square: Array, times: Array) -> Array:

@@ -43,6 +43,10 @@ class GaussianState(NamedTuple):
         """The same with each standard deviation times a factor (n,); symmetric to the last bit, as P is."""
         return GaussianState(self.x, self.p * (factor[:, None] * factor))
 
+    def turned(self, about: Array, variance: float) -> GaussianState:
+        """The same with so much more variance along a direction (n,)."""
+        return GaussianState(self.x, self.p + variance * (about[:, None] * about)) if variance else self
+
 
 @dataclass(frozen=True)
 class Measurements:

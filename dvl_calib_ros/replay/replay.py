@@ -149,7 +149,7 @@ def replay(
     of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
     of_clocks += [(Word.MARGINAL, each.says) for each in told] + [(word, each.says) for word, each in left]
     if navigation is not None and navigation.deviation is not None and navigation.deviation.rms > FIRST:
-        of_clocks += [(Word.MARGINAL, each.says) for each in deviates]
+        of_clocks += [(Word.REJECT, each.says) for each in deviates]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_clocks += [] if result.counts["pairing"]["paired"] else [(Word.REJECT, NOTHING_COMPARED)]
     return Replayed(

@@ -66,7 +66,8 @@ class Hypotheses(NamedTuple):
 
 class Found(NamedTuple):
     """What is known at some time: the likely hypotheses x (M, n), P (M, n, n), on ψ and κ, the numbers kept (M,) of
-    their delays, and the share (M,) of each; shown, inflation and heading as of `Posterior`."""
+    their delays, and the share (M,) of each; shown, inflation and heading as of `Posterior`;
+    drifted as of `HeadingStates`."""
 
     likely: GaussianState
     kept: Index
@@ -74,6 +75,7 @@ class Found(NamedTuple):
     shown: Mask
     inflation: Array
     heading: GaussianState | None
+    drifted: float
 
 
 @dataclass(frozen=True)
@@ -342,11 +344,11 @@ class DelayBank:
         likely = GaussianState(found.x[kept], found.p[kept])
         if self._process_rate is not None:
             ones: Array = np.ones(N_STATE)
-            return Found(likely, kept, share, self._shown(best, ones), ones, None)
+            return Found(likely, kept, share, self._shown(best, ones), ones, None, 0.0)
         deviation = self._deviation(likely, kept, int(np.searchsorted(kept, best)))
         likely = GaussianState(likely.x + deviation.shift, likely.p + deviation.more)
         shown = self._shown(best, deviation.inflation)
-        return Found(likely, kept, share, shown, deviation.inflation, deviation.coefficients)
+        return Found(likely, kept, share, shown, deviation.inflation, deviation.coefficients, deviation.drifted)
 
     def posteriors(self, found: Sequence[Found]) -> list[Posterior]:
         """The mixture of all hypotheses, as it was found on this day each time.
@@ -369,7 +371,7 @@ class DelayBank:
 
     def _posterior(self, found: Found, errors: GaussianState) -> Posterior:
         state = _one(errors, found.kept, found.share)
-        raised = state.raised(found.inflation)
+        raised = state.raised(found.inflation).turned(self._up, found.drifted)
         p = state.p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
         by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)

@@ -35,8 +35,8 @@ def limit_s(parameters: Parameters) -> float:
 def apart(ahead: Mapping[Stream, float], parameters: Parameters, late_s: float = 0.0) -> list[Apart]:
     """Streams by another clock than the rest.
 
-    ahead: of each stream, the DVL first, how far its stamps are ahead of its messages' arrival, s, beside any common time. late_s: by
-    how much that may be wrong.
+    ahead: of each stream, the DVL first, how far its stamps are ahead of its messages' arrival, s, beside any common
+    time. late_s: by how much that may be wrong.
     """
     offsets = {
         Stream.DVL: parameters.dvl_time_offset,

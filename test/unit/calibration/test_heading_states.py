@@ -71,6 +71,7 @@ def test_it_equals_least_squares_with_columns_of_its_own(rng, monkeypatch):
     x = p @ (wide.T @ z)
     alone = without_deviation(h, z)
     np.testing.assert_allclose(alone.x[0] + found.shift[0], x[:N], rtol=1e-8, atol=1e-12)
+    assert found.drifted == pytest.approx((x[-1] ** 2 + p[-1, -1]) / 12.0)  # when it was right is not known
     np.testing.assert_allclose(alone.p[0] + found.more[0], p[:N, :N], rtol=1e-8, atol=1e-14)
     scale = np.array([1.0, 1.0, 1.0, 1.0, 1.0 / span])  # a drift is told in rad/s
     np.testing.assert_allclose(found.coefficients.x, scale * x[N:], rtol=1e-7, atol=1e-12)
@@ -87,7 +88,7 @@ def yaw_of(headings, rng, truth, **more):
     alone = without_deviation(h, z)
     found = heading_states(blocks, alone, np.zeros(1, dtype=int), 0, STD)
     x, p = alone.x[0] + found.shift[0], alone.p[0] + found.more[0]
-    return x[2], math.sqrt(p[2, 2]) * found.inflation[2], found
+    return x[2], math.hypot(math.sqrt(p[2, 2]) * found.inflation[2], math.sqrt(found.drifted)), found
 
 
 def test_on_one_heading_sigma_of_yaw_holds_the_deviation_and_several_show_that_there_is_none(rng):

@@ -88,6 +88,12 @@ def test_a_gyro_that_drifts_is_named_by_time_and_beyond_three_degrees_the_compas
     assert drifts.by_time and "with time" in heading_advice(drifts)[0].says
 
 
+def test_sigma_of_yaw_holds_a_drift_from_the_beginning_on():
+    calibrator, *_ = recorded(4, lambda _, time: math.radians(2.0) * time / (16 * LEG_S))
+    estimate = calibrator.estimate("G1")
+    assert math.radians(0.3) < abs(estimate.state[2] - YAW) < 2.5 * estimate.recording_std[2]
+
+
 def test_few_headings_or_nothing_at_all_say_nothing():
     assert deviation(3, lambda yaw, _: math.sin(yaw) * 0.05, legs=1) is None
     assert heading_deviation(np.zeros(0), np.zeros(0), GaussianState(np.zeros(5), np.eye(5))) is None
