@@ -16,6 +16,7 @@ from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.time_blocks import TimeBlocks
 from dvl_calib_ros.files.result_file import result_document
 
 # σ of the recording itself, with an exact heading: what another day or a compass makes of it is no matter of noise
@@ -152,3 +153,29 @@ def test_the_sigma_that_is_published_is_that_of_the_next_recording_and_the_recor
     assert not day_covariance(MODELS["M7"], mounted).any()
     scales = day_covariance(MODELS["G1"], mounted)[3:5, 3:5]
     np.testing.assert_allclose(scales, 0.003**2)  # sound is as fast along all axes
+
+
+def mean_of(noise):
+    """x, σ of the mean of a series, one state, told in blocks of ten."""
+    blocks, n = TimeBlocks(), len(noise)
+    for part in noise.reshape(-1, 10):
+        blocks.add(np.full((1, 1, 1), float(len(part))), np.full((1, 1), part.sum()), float(len(part)))
+    x, p = np.array([noise.mean()]), np.array([[1.0 / n]])
+    return float(x[0]), float(blocks.inflation(0, x, p)[0]) / np.sqrt(n)
+
+
+@pytest.mark.parametrize(("lasts", "least", "most"), [(0.0, 0.8, 1.1), (20.0, 0.7, 1.1), (60.0, 0.7, 1.2)])
+def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, least, most):
+    """640 samples: blocks of 80 are the longest that there are enough of, and noise may last 60."""
+    normalised = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        noise = rng.normal(size=640)
+        if lasts:
+            keep = np.exp(-1.0 / lasts)
+            noise[0] *= 1.0 / np.sqrt(1.0 - keep**2)
+            for at in range(1, len(noise)):
+                noise[at] += keep * noise[at - 1]
+        x, std = mean_of(noise)
+        normalised.append(x / std)
+    assert least < np.sqrt(np.mean(np.square(normalised))) < most
