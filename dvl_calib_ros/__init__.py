@@ -6,6 +6,7 @@ give. It is imported when it is asked for, since the command line must not wait 
 
 import sys as _sys
 from pathlib import Path as _Path
+from types import ModuleType as _ModuleType
 
 TYPE_CHECKING = False  # as in typing, which takes longer than all else here
 if TYPE_CHECKING:
@@ -54,6 +55,28 @@ def _version() -> str:
 
 
 __version__ = _version()
+
+
+class _Callable(_ModuleType):
+    """The subpackage `replay`, which has the public function's name: called, it is `api.replay`."""
+
+    def __call__(self, *bags: object, **options: object) -> object:
+        """See `dvl_calib_ros.api.replay`."""
+        from .api import replay
+
+        return replay(*bags, **options)  # type: ignore[arg-type]
+
+
+class _Package(_ModuleType):
+    """This package: importing any module of `replay` sets that name to the subpackage, which stays callable."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name == "replay" and isinstance(value, _ModuleType):
+            value.__class__ = _Callable
+        super().__setattr__(name, value)
+
+
+_sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> object:

@@ -47,8 +47,6 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     ),
     "__init__": ("api",),
 }  # fmt: skip
-# The one arrow that goes up: a subpackage that is called, `dvl_calib_ros.replay(bag)`
-UP = {("replay", "api")}
 
 
 def room_of(path: Path) -> str:
