@@ -46,7 +46,7 @@ from .verification import SEVERAL, Verification, verify
 COPIED_AT_ONCE = 64
 # An error of so many times the usual one is that of an outlier.
 OUTLYING = 5.0
-# Rows, and blocks of samples, that may wait for a group whose samples do not come: without an IMU none ever does.
+# Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
 SAMPLES_OF_A_BLOCK = 128
@@ -112,6 +112,7 @@ class Calibrator:
         self._extended = [base for name in self._models if (base := MODELS[name].extends) is not None]
         self._initial = initial
         self._block_size = block_size
+        self._rows_held = max(ROWS_HELD, ROWS_HELD_BLOCKS * block_size)
         self._on_event = on_event
         self._on_rows = on_rows
         self._on_restart = on_restart
@@ -232,7 +233,7 @@ class Calibrator:
         """Whether enough samples have come together for a group, or rows that hold none, which nobody can forget."""
         if self._aligner.partners.given[group.needs] - group.n_given >= self._block_size:
             return True
-        return self._decided(group.needs) - group.next_row >= max(ROWS_HELD, ROWS_HELD_BLOCKS * self._block_size)
+        return self._decided(group.needs) - group.next_row >= self._rows_held
 
     def _select(self) -> None:
         """Let the selection know what is paired, but for what may go by what is only gathered."""
@@ -253,7 +254,8 @@ class Calibrator:
         first, decided = self._n_headings, aligner.partners.n_oriented
         if self._headings.shown or decided == first:
             return
-        if not self._headings.waits_for(int(rows.stamps_ns[decided - 1 - rows.base])):
+        is_judged = self._headings.waits_for(int(rows.stamps_ns[decided - 1 - rows.base]))
+        if not is_judged and decided - first < self._rows_held:
             return
         self._n_headings = decided
         for start, end, is_new_day in self._by_days(first, decided):
