@@ -429,7 +429,7 @@ class Calibrator:
     @property
     def longest_dropout_ns(self) -> int:
         """The longest dropout of the DVL since the start or the last restart."""
-        return self._aligner.longest_dropout_ns
+        return self._aligner.dropouts.longest_ns
 
     @property
     def newest_ns(self) -> dict[str, int | None]:

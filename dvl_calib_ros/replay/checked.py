@@ -12,8 +12,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from ..calibration.alignment import DROPOUT_NS
 from ..calibration.comparison import Comparison, Difference, compare, moved_in_words, sentences
+from ..calibration.dropouts import DROPOUT_NS
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.findings import Finding, finding
 from ..calibration.models import MODELS
