@@ -57,6 +57,9 @@ TRIMMED = 0.85
 QUIETEST, CLAIMS_TOO_MUCH = 0.01, 3.0
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
+# What an IMU claims of its heading (rad) is believed between these: few are as good as the first, and one that claims
+# more than the second says that it does not know.
+BEST_HEADING, WORST_HEADING = math.radians(0.1), math.radians(10.0)
 # Reference frames, in the order in which they are taken for one that the data cannot tell.
 USUAL = (VelocityFrame.ENU, VelocityFrame.BODY, VelocityFrame.NED)
 
@@ -264,6 +267,18 @@ class _Search:
                 "DVL sits; half a metre turns the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
             )
         self._know_position(placed, reference)
+        if imu is not None:
+            self._know_heading(imu)
+
+    def _know_heading(self, imu: Look) -> None:
+        """How far the heading is to be believed, where the IMU says it."""
+        if self._gives("heading_deviation_std") or not imu.claimed_std <= WORST_HEADING:
+            return
+        std = self._values["heading_deviation_std"] = float(f"{max(imu.claimed_std, BEST_HEADING):.2g}")
+        self._found.append(
+            f"the IMU claims its heading to ±{math.degrees(imu.claimed_std):.2g}°: taken for how it may deviate "
+            f"(-p heading_deviation_std:={std:.2g})"
+        )
 
     def _know_position(self, placed: Placed | None, reference: Look | None) -> None:
         """Say what is known of the DVL's position in the body, which the lever arm alone is not."""

@@ -36,7 +36,8 @@ class Laid:
     velocity, rad/s, nan where not given. frame: (N,) places in frames, of frame_ids. covariance: (N,) places in
     distinct (C, 3, 3), (m/s)², -1 where not given. broken: (N,) 1 + the first of its type's rules that a message
     breaks, 0 if none. beside: (N, 3) acceleration, m/s², of an IMU, angular velocity, rad/s, of a twist; else nan.
-    world: frame_id of the first message's header, which of an odometry is that of its pose.
+    world: frame_id of the first message's header, which of an odometry is that of its pose. heading_variance: that of
+    an IMU's orientation about z, rad², of the first message; nan where none is given.
     """
 
     arrival: Stamps
@@ -48,6 +49,7 @@ class Laid:
     broken: Codes
     beside: Array
     world: str = ""
+    heading_variance: float = math.nan
     frames: tuple[str, ...] = ()
     distinct: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
 
@@ -164,6 +166,7 @@ class Collector:
         shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "beside": (3,)}
         self._laid = {name: _Column(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
         self._world = ""
+        self._heading_variance = math.nan
         self._frames: dict[bytes, int] = {}
         self._distinct: list[Array] = []
         self._n_distinct = 0
@@ -194,6 +197,8 @@ class Collector:
         covariances, broken = Covariances.none(n), np.zeros(n, dtype=np.uint8)
         if kind is None:
             values, beside = _imu(columns)
+            if math.isnan(self._heading_variance):
+                self._heading_variance = heading_variance(columns.orientation_covariance[0])
         else:
             velocity = kind.velocity(columns)
             values, beside = _columns_of(velocity), np.broadcast_to(turning(columns), (n, 3))
@@ -232,6 +237,7 @@ class Collector:
         laid = Laid(
             **{name: column.array() for name, column in self._laid.items()},
             world=self._world,
+            heading_variance=self._heading_variance,
             frames=tuple(name.decode("ascii") for name in self._frames),
             distinct=np.concatenate([np.zeros((0, 3, 3)), *self._distinct]),
         )
@@ -257,6 +263,12 @@ def turning(message: Any) -> Array:
     if twist is None:
         return np.full((1, 3), np.nan)
     return _columns_of(getattr(twist, "twist", twist).angular)
+
+
+def heading_variance(covariance: Any) -> float:
+    """Variance of an IMU's orientation about z, rad², by its covariance (9,); nan where that says nothing."""
+    given = covariance[0] != NO_DATA and covariance[8] > 0.0
+    return float(covariance[8]) if given else math.nan
 
 
 def _imu(columns: Columns) -> tuple[Array, Array]:

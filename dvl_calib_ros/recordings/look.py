@@ -23,7 +23,7 @@ from ..calibration.samples import Index, Mask, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
-from .columns import TopicColumns, stamped, turning
+from .columns import TopicColumns, heading_variance, stamped, turning
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
 # straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
@@ -42,7 +42,7 @@ class Look:
     in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
     given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero where it has none. world:
     frame_id of the header, which of an odometry is that of its pose. claimed_std: noise per axis that the messages
-    claim, m/s, in the median; nan where they claim none.
+    claim, m/s, of an IMU that of its heading, rad, in the median; nan where they claim none.
     """
 
     topic: str
@@ -190,7 +190,8 @@ class _Numbers:
         stamps_ns = np.where(laid.stamps_ns == 0, laid.log_ns, laid.stamps_ns)
         self._rows.append((laid.arrival, laid.log_ns, stamps_ns, laid.values, laid.beside))
         self.world = self.world or laid.world
-        self._variances.append(laid.variances.mean(axis=1))
+        of_each = laid.variances.mean(axis=1) if self._kind is not None else np.array([laid.heading_variance])
+        self._variances.append(of_each)
         self._names += [
             (int(arrival), part.laid.frames[place])
             for arrival, place in zip(laid.arrival.tolist(), laid.frame.tolist(), strict=True)
@@ -227,7 +228,7 @@ class _Numbers:
 
     def _claimed_variance(self, message: Any) -> float:
         if self._kind is None:
-            return math.nan
+            return heading_variance(message.orientation_covariance)
         given = message.covariance if self._kind.is_position else self._kind.covariance(message)
         if given is None or self._kind.lacks_covariance(message):
             return math.nan
