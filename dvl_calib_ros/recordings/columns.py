@@ -6,10 +6,9 @@ Nothing is judged yet, for frames and parameters are known only later: values an
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.samples import Codes, Covariances, Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
-
-# A column that is larger than this (bytes) is kept on disk: an ordinary recording's are not.
-IN_MEMORY = 128 << 20
+from .growing import GrowingRows
 
 
 @dataclass(frozen=True)
@@ -164,14 +161,14 @@ class Collector:
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
         self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
         shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "beside": (3,)}
-        self._laid = {name: _Column(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
+        self._laid = {name: GrowingRows(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
         self._world = ""
         self._heading_variance = math.nan
         self._frames: dict[bytes, int] = {}
         self._distinct: list[Array] = []
         self._n_distinct = 0
         self._singles = {
-            name: _Column(dtype)
+            name: GrowingRows(dtype)
             for name, dtype in (("arrival", np.int64), ("log_ns", np.int64), ("channel", np.int32), ("end", np.int64),
                                 ("content", np.uint8))
         }  # fmt: skip
@@ -313,45 +310,6 @@ def _in_order(singles: Singles) -> Singles:
         singles, arrival=singles.arrival[order], log_ns=singles.log_ns[order], channel=singles.channel[order], end=end,
         content=singles.content[at],
     )  # fmt: skip
-
-
-class _Column:
-    """Rows that come piece by piece, on disk once there are many."""
-
-    def __init__(self, dtype: Any, shape: tuple[int, ...] = (), expected: int = 0) -> None:
-        """shape: of a row. expected: how many there will be, as far as that is known: more are taken as well."""
-        self._file: BinaryIO | None = None
-        row = np.dtype(dtype).itemsize * max(1, math.prod(shape))
-        self._rows = np.empty((max(1, min(expected, IN_MEMORY // row)), *shape), dtype)
-        self._n = 0
-
-    def add(self, rows: Any) -> None:
-        """Take further rows (N, ...)."""
-        if self._n + len(rows) > len(self._rows):
-            if self._rows.nbytes >= IN_MEMORY:
-                self._spill()
-            # grown where it is, not copied: there is no second one at any time
-            wanted = max(self._n + len(rows), 2 * self._n)
-            self._rows.resize((max(wanted, len(self._rows)), *self._rows.shape[1:]), refcheck=False)
-        self._rows[self._n : self._n + len(rows)] = rows
-        self._n += len(rows)
-
-    def _spill(self) -> None:
-        if self._file is None:
-            self._file = tempfile.TemporaryFile()  # noqa: SIM115  # until its rows are mapped
-        self._file.write(self._rows[: self._n].tobytes())
-        self._n = 0
-
-    def array(self) -> NDArray[Any]:
-        """All rows; they are given once."""
-        if self._file is None:
-            self._rows.resize((self._n, *self._rows.shape[1:]), refcheck=False)
-            return self._rows
-        self._spill()
-        self._file.flush()
-        rows = np.asarray(np.memmap(self._file, dtype=self._rows.dtype, mode="r"))
-        self._file.close()  # the map holds it
-        return rows.reshape(-1, *self._rows.shape[1:])
 
 
 def stamped(message: Any, log_ns: int) -> int:
