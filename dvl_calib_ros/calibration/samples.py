@@ -122,12 +122,14 @@ class Covariances:
         """The rows of a slice, of indices or of a mask."""
         return Covariances(self.distinct, self.index[at])
 
-    def joined(self, other: Covariances) -> Covariances:
-        """These rows and then others."""
-        shifted = np.where(other.index < 0, -1, other.index + len(self.distinct))
-        return Covariances(
-            np.concatenate([self.distinct, other.distinct]), np.concatenate([self.index, shifted]).astype(np.intp)
-        )
+    def joined(self, *others: Covariances) -> Covariances:
+        """These rows and then those of others."""
+        index, n = [self.index], len(self.distinct)
+        for other in others:
+            index.append(np.where(other.index < 0, -1, other.index + n))
+            n += len(other.distinct)
+        distinct = np.concatenate([self.distinct, *(other.distinct for other in others)])
+        return Covariances(distinct, np.concatenate(index).astype(np.intp))
 
 
 @dataclass(frozen=True)
@@ -189,19 +191,20 @@ class SampleBlock:
             refused=self.refused[at],
         )
 
-    def joined(self, other: SampleBlock) -> SampleBlock:
-        """These rows and then others, of the same stream."""
-        reasons = (*self.reasons, *(reason for reason in other.reasons if reason not in self.reasons))
-        code = np.array([0, *(1 + reasons.index(reason) for reason in other.reasons)], dtype=np.uint8)
+    def joined(self, *others: SampleBlock) -> SampleBlock:
+        """These rows and then those of others, of the same stream; many at once, as each time all are copied."""
+        reasons = tuple(dict.fromkeys(reason for each in (self, *others) for reason in each.reasons))
+        refused = []
+        for each in (self, *others):
+            code = np.array([0, *(1 + reasons.index(reason) for reason in each.reasons)], dtype=np.uint8)
+            refused.append(code[each.refused])
+        stamps_ns, values, arrival, frames = (
+            np.concatenate([getattr(each, name) for each in (self, *others)])
+            for name in ("stamps_ns", "values", "arrival", "frames")
+        )
+        covariances = self.covariances.joined(*(other.covariances for other in others))
         return SampleBlock(
-            self.stream,
-            np.concatenate([self.stamps_ns, other.stamps_ns]),
-            np.concatenate([self.values, other.values]),
-            self.covariances.joined(other.covariances),
-            np.concatenate([self.arrival, other.arrival]),
-            np.concatenate([self.frames, other.frames]),
-            np.concatenate([self.refused, code[other.refused]]),
-            reasons,
+            self.stream, stamps_ns, values, covariances, arrival, frames, np.concatenate(refused), reasons
         )
 
     def shifted(self, offset_ns: int) -> SampleBlock:

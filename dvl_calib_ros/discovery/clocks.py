@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -147,11 +146,9 @@ def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> Mot
         Streams(*(_some(block) for block in stretch.streams))
         for stretch in recording.stretches(named, MessageDecoder(own))
     ]
-    return (
-        motion_of(Streams(*(reduce(SampleBlock.joined, each) for each in zip(*parts, strict=True))), own)
-        if parts
-        else None
-    )
+    if not parts:
+        return None
+    return motion_of(Streams(*(one.joined(*others) for one, *others in zip(*parts, strict=True))), own)
 
 
 def _some(block: SampleBlock) -> SampleBlock:

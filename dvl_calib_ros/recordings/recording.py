@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from ..bags.columns import windows
 from ..bags.reader import BagReader
 from ..calibration.parameters import Parameters
-from ..calibration.samples import SampleBlock, Stamps, Stream, Streams, no_samples
+from ..calibration.samples import Stamps, Stream, Streams, no_samples
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.opening import open_bags
@@ -142,8 +142,7 @@ class Held:
 def _joined(found: Sequence[Stretch]) -> Streams:
     if not found:
         return Streams(*map(no_samples, (Stream.DVL, Stream.REFERENCE, Stream.IMU)))
-    blocks = [reduce(SampleBlock.joined, each) for each in zip(*(stretch.streams for stretch in found), strict=True)]
-    return Streams(*blocks)
+    return Streams(*(one.joined(*others) for one, *others in zip(*(stretch.streams for stretch in found), strict=True)))
 
 
 def open_recording(

@@ -112,10 +112,10 @@ def _block(
     blocks = [make(stream, each, decoder) for each in laid] + ([_of_rows(stream, rows)] if rows else [])
     if not blocks:
         return no_samples(stream)
-    block = blocks[0]
-    for other in blocks[1:]:
-        block = block.joined(other)
-    return block if len(blocks) == 1 else block.part(np.argsort(block.arrival, kind="stable"))
+    if len(blocks) == 1:
+        return blocks[0]
+    block = blocks[0].joined(*blocks[1:])
+    return block.part(np.argsort(block.arrival, kind="stable"))
 
 
 def _first_of_frames(laid: Laid) -> list[tuple[int, str]]:

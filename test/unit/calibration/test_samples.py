@@ -36,6 +36,8 @@ def test_a_message_that_is_no_sample_is_a_row_with_its_reason():
     )
     other = sample_block(Stream.DVL, np.array([9]), np.ones((1, 3)), refused=refused[1:] - 1, reasons=("flagged",))
     assert list(block.joined(other).samples()) == [DvlSample(5, (1, 1, 1)), "no_bottom", "flagged"]
+    three = block.joined(other, block)
+    assert list(three.samples()) == [*block.joined(other).samples(), *block.samples()] and len(three.reasons) == 3
 
 
 def test_a_covariance_that_repeats_is_kept_once_and_given_back_in_every_row():
@@ -45,6 +47,9 @@ def test_a_covariance_that_repeats_is_kept_once_and_given_back_in_every_row():
     np.testing.assert_array_equal(found.distinct[found.index], values)
     both = Covariances.none(1).joined(found)
     assert both.index.tolist() == [-1, 0, 0, 1, 2, 2]
+    three = found.joined(Covariances.none(1), found)
+    np.testing.assert_array_equal(three.distinct[three.index], np.concatenate([values, values[-1:], values]))
+    assert three.index.tolist() == [0, 0, 1, 2, 2, -1, 3, 3, 4, 5, 5]
 
 
 def test_columns_that_do_not_fit_together_are_refused():
