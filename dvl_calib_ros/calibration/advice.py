@@ -9,6 +9,7 @@ import numpy as np
 
 from .comparison import date
 from .findings import Finding, finding
+from .parameters import Parameters
 from .results import Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
@@ -20,6 +21,8 @@ SUSPICIOUS_REPEATED = 0.05
 # A constant error of the reference is said if it is larger than this, m/s (twice what is allowed for by default), and
 # than so many σ.
 OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
+# It is not shown from this share of its prior σ on. References and DVLs are off by so much, m/s, without being broken.
+NOT_SHOWN, OFTEN_OFF = 0.6, 0.02
 # So many losses of GNSS are flapping.
 FLAPPING = 3
 
@@ -97,6 +100,21 @@ def consistency_advice(estimate: Estimate) -> list[Finding]:
     if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
+
+
+def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float) -> list[Finding]:
+    """Whether nothing but what is assumed of it tells a constant error of reference or DVL from yaw and scale.
+
+    speed: m/s, usual.
+    """
+    own, assumed = estimate.state_names, parameters.reference_offset_std
+    if "reference_east" not in own or not estimate.used or speed <= 0.0:
+        return []
+    std = estimate.filter_std[[own.index("reference_east"), own.index("reference_north")]]
+    if float(std.min()) < NOT_SHOWN * assumed:
+        return []
+    share = OFTEN_OFF / speed
+    return [finding("ONE_HEADING", off=OFTEN_OFF, degrees=math.degrees(share), percent=100.0 * share, assumed=assumed)]
 
 
 def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Finding]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
+from ..calibration.advice import data_advice, gate_advice, message_advice, one_heading_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
@@ -141,7 +141,8 @@ def replay(
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
     if navigation is not None:
         deviates = heading_advice(navigation.deviation)
-        found += deviates
+        speed = navigation.distance_m / max(navigation.seconds, 1e-9)
+        found += deviates + one_heading_advice(result.estimate, calibrator.parameters, speed)
     left = left_over_advice(navigation.followed) if navigation is not None else []
     found += [each for _, each in left]
     of_drift = objections(navigation)

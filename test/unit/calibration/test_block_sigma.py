@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.advice import reference_advice
+from dvl_calib_ros.calibration.advice import one_heading_advice, reference_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.days import day_covariance
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
@@ -128,6 +128,13 @@ def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may
         level_course((0.006, 0.004), False), CLAIMED.replace(reference_offset_std=1e-6), models=("G1",)
     )
     assert abs(trusting.estimate("G1").state[2]) > 2.0 * trusting.estimate("G1").std[2]
+
+
+def test_on_one_heading_it_is_said_what_a_constant_error_would_be():
+    (said,) = one_heading_advice(on_course((0.0, 0.0), headings=False).estimate("G1"), CLAIMED, 1.5)
+    assert said.code == "ONE_HEADING" and "0.02 m/s would be 0.8° or 1.3 %" in said.says
+    for name, headings in (("G1", True), ("M3", False)):
+        assert one_heading_advice(on_course((0.0, 0.0), headings).estimate(name), CLAIMED, 1.5) == []
 
 
 def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed():
