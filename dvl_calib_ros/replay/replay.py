@@ -142,7 +142,9 @@ def replay(
     if navigation is not None:
         deviates = heading_advice(navigation.deviation)
         speed = navigation.distance_m / max(navigation.seconds, 1e-9)
-        found += deviates + one_heading_advice(result.estimate, calibrator.parameters, speed)
+        found += deviates
+        if decoder.frame_of_reference is not VelocityFrame.BODY:
+            found += one_heading_advice(result.estimate, calibrator.parameters, speed)
     left = left_over_advice(navigation.followed) if navigation is not None else []
     found += [each for _, each in left]
     of_drift = objections(navigation)
