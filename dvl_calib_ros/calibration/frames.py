@@ -156,3 +156,15 @@ def attitude_enu_flu_from_ned_frd(rpy: ArrayLike) -> Array:
     ``rotation_enu_from_body`` (..., 3, 3) of the forward-left-up body.
     """
     return ENU_FROM_NED @ rotation_from_rpy(rpy) @ FLU_FROM_FRD
+
+
+def nearest_rotation(products: Array) -> Array:
+    """The rotations C (..., 3, 3) that minimise Σ|a - C b|², of Σ a bᵀ (..., 3, 3).
+
+    Wahba's problem, by singular values (Markley, "Attitude determination using vector observations", 1988).
+    """
+    u, _, vt = np.linalg.svd(products)
+    proper = np.ones((*u.shape[:-2], 3))
+    proper[..., 2] = np.linalg.det(u @ vt)
+    found: Array = u * proper[..., None, :] @ vt
+    return found

@@ -15,16 +15,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.coarse_mounting import DELAYS_S, LIKELY, MISALIGNED, SCALED
 from ..calibration.frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
     Array,
     cross,
+    nearest_rotation,
     rotation_from_quaternion,
     rpy_from_rotation,
     skew,
 )
+from ..calibration.register.configuration import MISALIGNED, SCALED
 from ..calibration.samples import VelocityFrame
 from ..recordings.look import Look, comparable
 
@@ -43,6 +44,12 @@ FITS = 0.3
 TURNS = 0.01
 # Rounds in which rotation and lever arm are found in turns.
 ROUNDS = 3
+# What is likely of a misalignment (rad), a scale and a lever arm (m). It decides what the motion does not: on a circle
+# at one speed a lever arm looks like a turned DVL. It counts by 0.005 of the speed in every sample, which moves what is
+# shown by a hundredth.
+LIKELY: Array = np.array([0.05] * 3 + [0.02] + [1.0] * 3) / 0.005
+# By how much the DVL's stamps may be late, s, at a step that is short beside turns and waves.
+DELAYS_S = np.linspace(-3.0, 3.0, 13)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,9 +164,7 @@ def turns_right(reference: Look, imu: Look, frame: ImuFrame) -> bool | None:
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
     """The rotation M (3, 3) that minimises mean |a - M b|² + AS_IT_IS |b|² |M - as_it_is|²; a, b: (N, 3)."""
     square = float((b**2).sum(axis=1).mean())
-    u, _, vt = np.linalg.svd(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
-    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    return u @ np.diag([1.0, 1.0, sign]) @ vt
+    return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
 
 
 def _rms(difference: Array) -> float:

@@ -13,20 +13,12 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array
-
-
-def nearest_rotations(measured: Array, reference: Array) -> Array:
-    """C (..., 3, 3) of determinant 1 that minimises Σ |g - C v|² over vectors v, g (..., N, 3)."""
-    u, _, vt = np.linalg.svd(np.swapaxes(reference, -1, -2) @ measured)
-    proper = np.ones((*u.shape[:-2], 3))
-    proper[..., 2] = np.linalg.det(u @ vt)
-    return np.asarray(u * proper[..., None, :] @ vt)
+from ..calibration.frames import Array, nearest_rotation
 
 
 def troni_whitcomb(time: Array, measured: Array, reference: Array) -> Array:
     """From velocities (..., N, 3) m/s."""
-    return nearest_rotations(measured, reference)
+    return nearest_rotation(np.swapaxes(reference, -1, -2) @ measured)
 
 
 def kinsey_whitcomb(time: Array, measured: Array, reference: Array) -> Array:
@@ -35,7 +27,7 @@ def kinsey_whitcomb(time: Array, measured: Array, reference: Array) -> Array:
     In the body frame, where the misalignment is constant; the reference's positions are its integrated velocity.
     """
     step = np.diff(time, prepend=time[:1])[:, None]
-    return nearest_rotations(np.cumsum(measured * step, axis=-2), np.cumsum(reference * step, axis=-2))
+    return troni_whitcomb(time, np.cumsum(measured * step, axis=-2), np.cumsum(reference * step, axis=-2))
 
 
 BASELINES: Mapping[str, Callable[[Array, Array, Array], Array]] = {

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from ..frames import Array
 from ..parameters import Parameters
+from ..register.configuration import fitting_configuration
 from ..register.motion import Motion, make_motion
 from ..register.registration import Registration, register
-from ..samples import Mask
+from ..samples import FRAMES, Codes, Mask
 from .hold_out import MEASURED_BELOW, Kept
 from .rows import ImuColumns
 
@@ -50,57 +51,72 @@ class _Seen(NamedTuple):
         return _Seen(*kept.dvl, r.times, r.velocity, r.in_body, is_measured, *kept.imu)
 
 
+class Looked(NamedTuple):
+    """After so many blocks: how the instruments stand, and what configuration fits where the one given does not."""
+
+    blocks: int = 0
+    registration: Registration | None = None
+    configuration: str = ""
+
+
 class KeptClocks:
-    """What registration says of the clocks, of the days that are over and of this one."""
+    """What registration says of clocks and frames, of the days that are over and of this one."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._seen: deque[_Seen] = deque(maxlen=MOST)
         self._blocks = 0  # of this day
-        self._over: Registration | None = None  # of a day that is over, where a clock was off
-        self._latest: tuple[int, Registration | None] = (0, None)
+        self._declared = np.zeros(len(FRAMES), dtype=np.int64)  # references said to be in each frame
+        self._over: Looked | None = None  # of a day that is over, where something was off
+        self._latest = Looked()
 
-    def add(self, kept: Kept) -> None:
-        """Take a block's streams."""
+    def add(self, kept: Kept, frames: Codes) -> None:
+        """Take a block's streams. frames: (J,) codes of the frames that its references are said to be in."""
         self._seen.append(_Seen.of(kept))
+        self._declared += np.bincount(frames, minlength=len(FRAMES))
         self._blocks += 1
 
     def end_day(self) -> None:
         """The blocks from here on are of another day, whose clocks may be others."""
-        found = self.registration()
-        self._over = found if found is not None and found.says(self._parameters) else None
+        found = self.looked()
+        self._over = found if found.configuration or self._says(found) else None
         self._seen.clear()
-        self._blocks, self._latest = 0, (0, None)
+        self._blocks, self._latest = 0, Looked()
 
     def look_again(self) -> None:
-        """Look at the clocks if there is so much more to see than the last time."""
-        if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest[0], FIRST_LOOK):
-            self._latest = self._blocks, self._registered()
+        """Look if there is so much more to see than the last time."""
+        if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
+            self._latest = self._look()
 
-    def registration(self, *, fresh: bool = True) -> Registration | None:
-        """How the instruments stand by the blocks so far, or on a day that is over, where a clock was off.
+    def looked(self, *, fresh: bool = True) -> Looked:
+        """What the blocks so far show, or a day that is over, where something was off.
 
-        fresh: by all of them, else by those there were when `look_again` looked.
+        fresh: all of them, else those there were when `look_again` looked.
         """
         if self._over is not None:
             return self._over
-        if fresh and self._blocks > self._latest[0]:
-            self._latest = self._blocks, self._registered()
-        return self._latest[1]
+        if fresh and self._blocks > self._latest.blocks:
+            self._latest = self._look()
+        return self._latest
 
     def says(self, *, fresh: bool = True) -> str:
-        """What configuration these blocks fit, in words, where a clock is off; else ''."""
-        found = self.registration(fresh=fresh)
-        return "" if found is None else found.says(self._parameters)
+        """What clocks these blocks fit, in words, where one is off; else ''."""
+        return self._says(self.looked(fresh=fresh))
 
-    def _registered(self) -> Registration | None:
+    def _says(self, looked: Looked) -> str:
+        return "" if looked.registration is None else looked.registration.says(self._parameters)
+
+    def _look(self) -> Looked:
         motion = _motion(tuple(self._seen)) if len(self._seen) >= ENOUGH else None
         if motion is None:
-            return None
+            return Looked(self._blocks)
+        nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
+        declared = FRAMES[int(self._declared.argmax())]
         try:
-            return register(motion, self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm))
+            found = register(motion, nominal, lever_arm)
+            return Looked(self._blocks, found, fitting_configuration(motion, declared, nominal, lever_arm, found))
         except np.linalg.LinAlgError:  # numbers that ran away
-            return None
+            return Looked(self._blocks)
 
 
 def _motion(seen: Sequence[_Seen]) -> Motion | None:

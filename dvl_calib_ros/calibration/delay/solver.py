@@ -14,13 +14,12 @@ import numpy as np
 
 from ..attitude_rates import AttitudeRates
 from ..bank import ModelCounts
-from ..coarse_mounting import DELAYS_S, CoarseFits
 from ..dvl_stream import DvlStream
 from ..frames import Array
 from ..kalman import GaussianState
 from ..parameters import Parameters
 from ..register.registration import Registration
-from ..samples import FRAMES, Mask, Stamps
+from ..samples import Stamps
 from ..shared_noise import SharedNoise
 from .bank import DelayBank, Found, Posterior
 from .blocks import MARGIN_NS, Block
@@ -88,7 +87,6 @@ class BlockSolver:
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
         self.bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified, parameters)
-        self._coarse = CoarseFits(parameters.rotation_dvl_from_body)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
         self._dvl_stream = DvlStream()
@@ -114,22 +112,22 @@ class BlockSolver:
     def suggestion(self, *, fresh: bool = True) -> str:
         """What configuration the data fit, in words, where the one given is grossly wrong; else ''.
 
-        fresh: of clocks by all that is known, which takes a while; else as they were looked at on the way, live.
+        fresh: by all that is known, which takes a while; else as they were looked at on the way, live.
         """
-        contradiction, found = self._attitude_rates.says(), self._coarse.suggestion()
         if own := self._dvl_stream.says():
             return own
+        contradiction, found = self._attitude_rates.says(), self._clocks.looked(fresh=fresh).configuration
         if contradiction:  # of what follows from it only what mends it is worth a word
-            return f"{contradiction}; {found.says}" if found and "imu_frame" in found.says else contradiction
-        if found is not None:
-            return found.says
+            return f"{contradiction}; {found}" if "imu_frame" in found else contradiction
+        if found:
+            return found
         if shared := self._shared_noise.says():
             return shared
         return self._clocks.says(fresh=fresh)
 
     def registration(self) -> Registration | None:
         """How the instruments stand; None where the data do not show it."""
-        return self._clocks.registration()
+        return self._clocks.looked().registration
 
     @property
     def is_level(self) -> bool:
@@ -221,7 +219,6 @@ class BlockSolver:
         imu_parts, own_parts = Parts.of([each.imu.times for each in streams]), Parts.of([each.own for each in streams])
         times = np.concatenate([self._seconds(each.raw.stamps_ns) for each in streams])
         rotation, oriented = attitude_at(imu, times, p.imu_timeout, imu_parts, own_parts)
-        self._compare_coarsely(streams, times, rotation, oriented)
         own_imu = [ImuColumns(*(column[each.own_imu] for column in each.imu)) for each in streams]
         begins = Parts.of([each.times for each in own_imu]).bounds[:-1].tolist()
         self._attitude_rates.add(*joined(own_imu), begins)
@@ -288,7 +285,7 @@ class BlockSolver:
             dvl = DvlColumns(*(column[good] for column in dvl))
         from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
         kept = Kept.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
-        self._clocks.add(kept)
+        self._clocks.add(kept, streams.raw.frames)
         if self.kept is not None:
             self.kept.append(kept)
         if rows is None:
@@ -307,34 +304,6 @@ class BlockSolver:
             last = self.kept[-1]
             good = ~np.isin(last.dvl.times, self._seconds(stamps_ns), assume_unique=True)
             self.kept[-1] = last._replace(dvl=DvlColumns(*(column[good] for column in last.dvl)))
-
-    def _compare_coarsely(self, streams: Sequence[Cleaned], times: Array, rotation: Array, oriented: Mask) -> None:
-        """Give references, as their messages had them, to `_coarse`.
-
-        times: (J,) s of all, rotation (J, 3, 3) and oriented (J,) the attitudes at these times.
-        """
-        late = times[:, None] + DELAYS_S
-        velocity, rates = np.zeros((*late.shape, 3)), np.full((len(times), 3), np.nan)
-        inside = np.zeros(len(times), dtype=bool)
-        for each, at in zip(streams, Parts.of([each.own for each in streams]), strict=True):
-            dvl, imu = each.dvl, each.imu
-            if len(dvl.times) < 2:
-                continue
-            inside[at] = (late[at, 0] >= dvl.times[0]) & (late[at, -1] <= dvl.times[-1])
-            for axis in range(3):
-                velocity[at, :, axis] = np.interp(late[at], dvl.times, dvl.velocity[:, axis])
-                if len(imu.times) > 1:
-                    rates[at, axis] = np.interp(times[at], imu.times, imu.angular_velocity[:, axis])
-        raw = np.concatenate([each.raw.values[:, :3] for each in streams])
-        frames = np.concatenate([each.raw.frames for each in streams])
-        unmeasured = np.concatenate([each.raw.unmeasured for each in streams]) != 0
-        moving = inside & ((raw**2).sum(axis=1) >= self._parameters.min_speed**2) & ~unmeasured
-        for code in set(frames.tolist()):
-            for has_attitude in (True, False):
-                use = moving & (frames == code) & (oriented == has_attitude)
-                if use.any():
-                    attitude = rotation[use] if has_attitude else None
-                    self._coarse.add(FRAMES[code], raw[use], attitude, velocity[use], rates[use])
 
     def _compare_noise(self, streams: Cleaned, seen: InBody) -> None:
         """Give a block's streams to `_shared_noise`. seen: its references."""

@@ -10,6 +10,7 @@ is turned into the body by an attitude of another time, its velocity turns as th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ import numpy as np
 from ..delay.local_motion import REACH_INTERVALS, local_fit, reach_at, spacing_at
 from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at, attitude_at
 from ..extrinsics import rotation_of, turn_between
-from ..frames import Array, cross, skew
+from ..frames import Array, cross, nearest_rotation, skew
 from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
@@ -81,6 +82,11 @@ class Fitted(NamedTuple):
         """What is left, in chi-square by a level of noise (m/s), robust, and as independent as blocks show."""
         scale = HALF_AT**2 * self.axes
         return scale * float(np.log1p(self.squares / (scale * level**2)).sum())
+
+    @property
+    def left(self) -> float:
+        """What is not explained, as a share of the speed."""
+        return self.level * math.sqrt(3.0) / max(self.speed, 1e-9)
 
     @property
     def std(self) -> Array:
@@ -248,8 +254,7 @@ class Fit:
             return None
         body, _, velocity, *_ = streams
         square = float((velocity**2).sum())
-        u, _, vt = np.linalg.svd(body.T @ velocity + 1e-3 * square * np.eye(3))
-        return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+        return nearest_rotation(body.T @ velocity + 1e-3 * square * np.eye(3))
 
     def _rows(self, x: Array, rotation: Array) -> _Rows | None:
         streams = self._streams(float(x[LATE]), float(x[APART]))

@@ -156,7 +156,7 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
         lever_arm_std=std[ARM],
         scale=float(x[SCALE]),
         scale_std=float(std[SCALE]),
-        left=best.level * math.sqrt(3.0) / max(best.speed, 1e-9),
+        left=best.left,
         spread=best.level,
         speed=best.speed,
     )

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.extrinsics import rotation_of
+from dvl_calib_ros.calibration.frames import nearest_rotation
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.baselines import BASELINES, nearest_rotations
+from dvl_calib_ros.evaluation.baselines import BASELINES
 from dvl_calib_ros.evaluation.convergence import TIMES_S, curve_keys, curves, squared_errors
 from dvl_calib_ros.evaluation.evaluate import DEFAULTS
 from dvl_calib_ros.evaluation.procedure import dvl_velocities, references
@@ -30,7 +31,7 @@ def test_a_baseline_finds_a_rotation_exactly_where_nothing_else_is_wrong(name):
 def test_what_is_found_is_a_rotation_also_of_motion_in_a_plane_or_of_none():
     level = np.array([[1.0, 0.2, 0.0], [0.5, -1.0, 0.0], [1.0, 1.0, 0.0]])
     for vectors in (level, level[:1], np.zeros((3, 3))):
-        found = nearest_rotations(vectors, vectors)
+        found = nearest_rotation(vectors.T @ vectors)
         assert np.allclose(found @ found.T, np.eye(3), atol=1e-12) and np.linalg.det(found) == pytest.approx(1.0)
 
 

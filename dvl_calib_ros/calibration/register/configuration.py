@@ -1,0 +1,167 @@
+"""What configuration the data fit, where the one given is grossly wrong: frames, axes, mounting.
+
+A mounting wrong by 45 degrees, or a reference that is not in the frame that it is said to be in, shows in a filter only
+as samples that are gated. So the motion is registered as it would be with the reference in the body, in ENU and in NED,
+with whatever mounting fits, and what fits is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..delay.rows import attitude_at
+from ..directions import Directions
+from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
+from ..samples import VelocityFrame
+from .fine import ARM, FEW_ROWS, GAP_S, MOST_ROWS, REFERENCE, SCALE, Curves, Fit, Fitted, N
+from .motion import Motion
+from .registration import Registration
+
+# A configuration is wrong from here on: what is left of the motion, as a share of it, is that of 10 degrees.
+WRONG_FROM = math.sin(math.radians(10.0))
+# What is said to fit leaves less than this share, and less than half of what the configuration given leaves.
+FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
+# A rotation this near another is that one, rad: what is left is misalignment, for the calibration to find.
+SAME_WITHIN = math.radians(12.0)
+# Mountings are drawn with multiples of such an angle, rad, and one that is the same but for a misalignment is named.
+DRAWN = math.pi / 4.0
+# Axes turned round are the right ones if they leave so much less than those given: in chi-square, were all samples
+# independent; of blocks of ten that are alike it is a tenth.
+CLEARLY = 40.0
+# A registration explains the motion with a misalignment (rad) and a scale below these.
+MISALIGNED, SCALED = math.radians(10.0), 0.1
+# From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
+LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
+# Whatever else is tried than what is configured is tried without another lever arm.
+WITHOUT_ARM: Sequence[Array] = (REFERENCE, *np.eye(N)[ARM])
+_FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
+
+
+def fitting_configuration(
+    motion: Motion, declared: VelocityFrame, nominal: Array, lever_arm: Array, given: Registration | None
+) -> str:
+    """What fits much better than what is configured, in words; '' if nothing does, or the configuration fits.
+
+    declared: the frame that the reference is said to be in. nominal: rotation_body_from_dvl (3, 3). given: the motion
+    registered with it.
+    """
+    if not all(motion.measured):
+        return ""
+    if motion.has_attitude:
+        directions = Directions()
+        rotation, known = attitude_at(motion.imu, motion.dvl.times, GAP_S)
+        directions.add((motion.dvl.velocity @ nominal.T)[known], rotation[known])
+        if directions.turn_with_heading:
+            return (
+                "the DVL's velocities turn with the heading, as those in the earth's frame do (let its driver give "
+                "them in its own axes)"
+            )
+    curves = Curves(motion)
+    if given is not None and _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) < WRONG_FROM:
+        return _flipped(motion, curves, nominal, lever_arm)
+    as_given = min((_left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given else math.inf), 1.0)
+    found: dict[VelocityFrame, Fitted] = {}
+    also_turned = set()
+    for frame in _FRAMES:
+        fit = Fit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
+        # the mountings that have a name, and whichever fits
+        likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
+        each = [_nearest(fit, rotation) for rotation in likely]
+        if (turned := each[1]) is not None and _misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
+            also_turned.add(frame)
+        if some := [one for one in each if one is not None]:
+            found[frame] = min(some, key=lambda one: one.level)
+    if not found:
+        return ""
+    # of two that fit alike the frame given is the likelier
+    best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
+    if found[best].left > min(FITS_BELOW, BETTER_BY * as_given):
+        return ""
+    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
+
+
+def _nearest(fit: Fit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM) -> Fitted | None:
+    """The best with a DVL that is late by no more than a calibration finds; None without any."""
+    each = (fit(0.0, late, rotation_body_from_dvl, held) for late in LATE_S)
+    found = [one for one in each if one is not None and np.isfinite(one.x).all()]
+    return min(found, key=lambda one: one.level, default=None)
+
+
+def _misfit(one: Fitted, nominal: Array) -> float:
+    return _left(one.left, float(one.x[SCALE]), one.rotation_body_from_dvl, nominal)
+
+
+def _left(left: float, scale: float, rotation: Array, nominal: Array) -> float:
+    """What is left with the mounting given: what is explained by a turn that is none of a misalignment is not."""
+    turned = _angle(rotation, nominal)
+    is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
+    return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
+
+
+def _as_if(motion: Motion, declared: VelocityFrame, frame: VelocityFrame) -> Motion:
+    """The motion with its reference, said to be in one frame, as in another."""
+    reference, ned = motion.reference, VelocityFrame.NED
+    if (declared is ned) is not (frame is ned):
+        reference = reference @ ENU_FROM_NED.T
+    return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
+
+
+def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array) -> str:
+    """Whether y and z turned round explain more without a lever arm than the axes given do with any.
+
+    A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
+    its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm.
+    """
+    fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
+    found = []
+    for rotation, held in ((nominal, (REFERENCE,)), (nominal @ FLU_FROM_FRD, WITHOUT_ARM)):
+        near = _nearest(quick, rotation, held)
+        found.append(None if near is None else fit(0.0, near.dvl_late, rotation, held))
+    given, turned = found
+    if given is None or turned is None:
+        return ""
+    gain = 6.0 * turned.rows * math.log(max(given.level, 1e-6) / max(turned.level, 1e-6))
+    return "the DVL's axes look forward-right-down (dvl_axes: frd)" if gain > CLEARLY else ""
+
+
+def _named(declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool) -> str:
+    """also_turned: the axes of the body turned round fit as well."""
+    same_frame, as_given = best is declared, _angle(rotation, nominal) < SAME_WITHIN
+    if same_frame and as_given:  # a large misalignment, for the calibration to find
+        return ""
+    frame, body = best.value, VelocityFrame.BODY
+    about = (
+        [] if same_frame else [f"the reference looks like {frame.upper() if best is not body else 'the body frame'}"]
+    )
+    parameters: dict[str, object] = {} if same_frame else {"gnss_frame": frame}
+    earth = body not in (best, declared)
+    otherwise = ""
+    if as_given:  # the frame explains it
+        if earth and not same_frame and also_turned:
+            otherwise = ", or the IMU's orientation looks like NED (imu_frame: ned): only sway tells these apart"
+    elif not same_frame and earth and _angle(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
+        about, parameters = ["the IMU's orientation looks like NED, forward-right-down"], {"imu_frame": "ned"}
+    elif _angle(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
+        about.append("the DVL's axes look forward-right-down")
+        parameters["dvl_axes"] = "frd"
+    else:
+        rpy = [round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(_as_drawn(rotation))]
+        about.append(f"the data fit mounting_rpy {' '.join(f'{angle:.3g}' for angle in rpy)}")
+        parameters["mounting_rpy"] = rpy
+    remedy = ", ".join(f"{name}: {value}" for name, value in parameters.items())
+    return f"{' and '.join(about)} ({remedy}){otherwise}"
+
+
+def _as_drawn(rotation: Array) -> Array:
+    """The rotation by multiples of `DRAWN` that a mounting (3, 3) is the same as; itself if it is of none."""
+    drawn = rotation_from_rpy(np.round(rpy_from_rotation(rotation) / DRAWN) * DRAWN)
+    return drawn if _angle(rotation, drawn) < SAME_WITHIN else rotation
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Angle of the rotation between two rotations (3, 3), rad."""
+    return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(a.T @ b)) - 1.0))))
