@@ -11,6 +11,7 @@ from .comparison import date
 from .findings import Finding, finding
 from .parameters import Parameters
 from .results import Day, Estimate
+from .told_arm import ARM
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -118,7 +119,7 @@ def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float)
 
 
 def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Finding]:
-    """Whether the reference is wrong by a constant that several headings have shown, on each of several days.
+    """Whether its clock leaves the lever arm open, and whether it is wrong by a constant, on each of several days.
 
     days: that the model found something of, if there are several.
     """
@@ -126,11 +127,16 @@ def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Findi
     std = estimate.std_of(*names)
     if std is None:
         return []
+    said = []
+    open_std = np.sqrt(np.diag(estimate.left_open))
+    if open_std.any():
+        at = [estimate.state_names.index(name) for name in ARM]
+        delay = open_std[estimate.state_names.index("time_offset")]
+        said.append(finding("CLOCK_OR_ARM", metres=np.linalg.norm(open_std[at]), seconds=delay))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days
     ] or [("", np.array([estimate.state_of(name) for name in names]), std)]
-    said = []
     for where, offset, own_std in found:
         size = float(np.linalg.norm(offset))
         if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * own_std).all():

@@ -502,6 +502,7 @@ class Calibrator:
             covariance=covariance + day_covariance(model, self.parameters),
             recording_covariance=covariance,
             filter_std=np.sqrt(np.diag(covariance)) / self.inflation(model.name),
+            left_open=self._estimators[model.name].left_open,
             used=used,
             gated=gated,
             mean_nis=mean_nis,

@@ -98,6 +98,12 @@ class Estimator(ABC):
         return False
 
     @property
+    def left_open(self) -> Array:
+        """(n, n) of `of_recording`'s covariance, what the clock of the reference leaves open."""
+        n = len(self.state().x)
+        return np.zeros((n, n))
+
+    @property
     def registration(self) -> Registration | None:
         """How the instruments stand, by their data alone; None for one that does not look."""
         return None

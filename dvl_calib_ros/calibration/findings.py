@@ -412,6 +412,14 @@ _KINDS = (
         "measure where DVL and reference point are (lever_arm, reference_position), then check the IMU's axes, clock",
     ),
     FindingKind(
+        "CLOCK_OR_ARM",
+        "a reference that is late looks like a lever arm at this speed: {metres:.1f} m of it and {seconds:.1f} s of "
+        "the DVL's delay are open, and in σ",
+        "A velocity that is turned into the body by an attitude of another time turns as one of a DVL elsewhere does, "
+        "by speed times delay. Only turns at two speeds tell them apart. A reference is taken to be in time to 0.5 s.",
+        "drive turns at two speeds",
+    ),
+    FindingKind(
         "REFERENCE_OFFSET",
         "the reference is off by {millimetres:.0f} mm/s towards {course:.0f}° all along{where}",
         "An error of an inertial navigation that stays, or a current, where the DVL tracks the water. G1 and G2 have "

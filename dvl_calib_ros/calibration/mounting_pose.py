@@ -15,7 +15,7 @@ from .models import Model
 from .observability import observability, scale_std_ahead
 from .parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
 from .samples import Mask
-from .told_arm import contradicted
+from .told_arm import stands
 
 _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 
@@ -37,7 +37,8 @@ def position_in_body(model: Model, state: GaussianState, parameters: Parameters)
     """Where the DVL is in the body (3,) m, by one model's state x (n,), P (n, n); None where that is not known.
 
     The lever arm is from the reference point, of which `dvl_position` says what is known. On an axis that the data do
-    not show it is as it was given, and where they contradict it; if it was not given, nothing is known.
+    not show it is as it was given, and where they contradict it or know it worse. If it was not given, nothing is
+    known.
     """
     if parameters.dvl_position == UNKNOWN:
         return None
@@ -48,7 +49,7 @@ def position_in_body(model: Model, state: GaussianState, parameters: Parameters)
         shown: Mask = np.array([name in seen for name in _ARM])
         if not given.any() and not shown.all():
             return None
-        shown = shown & ~contradicted(model, state, parameters)
+        shown = shown & ~stands(model, state, parameters)
         arm = np.where(shown, lever_arm(model, state, given.tolist()), given)
     x, y, z = (arm + parameters.reference_position).tolist()
     return x, y, z

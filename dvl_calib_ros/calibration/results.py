@@ -25,10 +25,11 @@ class Estimate:
 
     state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n), of the next
     recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
-    more than the filter claims. filter_std: (n,) standard deviations that the filter claims. used, gated:
-    samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter.
-    heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw and of
-    twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
+    more than the filter claims. filter_std: (n,) standard deviations that the filter claims. left_open: (n, n), the
+    part of both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm.
+    used, gated: samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent
+    filter. heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw
+    and of twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
     """
 
     model: str
@@ -36,6 +37,7 @@ class Estimate:
     covariance: Array
     recording_covariance: Array
     filter_std: Array
+    left_open: Array
     used: int
     gated: int
     mean_nis: float

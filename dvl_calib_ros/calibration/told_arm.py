@@ -24,7 +24,17 @@ if TYPE_CHECKING:
 ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 # So many σ are no chance, and so many metres no tape measure's error.
 SIGMAS, MEASURED_TO = 10.0, 0.05
+# Data that know an arm so many times worse than a tape measure do not improve on it.
+WORSE_THAN_TOLD = 2.0
 FINDS_IT = "G2"
+
+
+def stands(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
+    """(3,) whether it is where it was told to be, by axis: contradicted, or known less well than by a tape measure."""
+    if not any(parameters.lever_arm) or not set(ARM) <= set(model.state_names):
+        return np.zeros(3, dtype=bool)
+    std = np.sqrt(np.diag(state.p)[[model.state_names.index(name) for name in ARM]])
+    return contradicted(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * MEASURED_TO)
 
 
 def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
@@ -41,7 +51,8 @@ def told_arm_advice(estimates: Mapping[str, Estimate], parameters: Parameters) -
     estimate = estimates.get(FINDS_IT)
     if estimate is None or not estimate.used:
         return []
-    state = GaussianState(estimate.state, estimate.covariance)
+    # a late clock, which at one speed explains as much, is one of the causes
+    state = GaussianState(estimate.state, estimate.covariance - estimate.left_open)
     off = contradicted(MODELS[FINDS_IT], state, parameters)
     if not off.any():
         return []

@@ -44,6 +44,7 @@ LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
 # recording that is played fast come sooner, and then the node waits for the worker.
 SOLVED_WITHIN_NS = 1_000_000_000
 _BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
+_OPEN = (BEYOND, BEYOND)
 AXES = ("x", "y", "z")
 # What is less than so many σ from nothing is not worth a word.
 NAMED_FROM = 4.0
@@ -91,7 +92,7 @@ class DelayFilter(Estimator):
         # by the stamp from which on they are told: those that are being solved, and the number of each among them
         self._coming: deque[tuple[int, Solved, int]] = deque()
         self._gathered_ns: list[int] = []  # the same of those that are not
-        self._is_telling = False
+        self._is_telling = self._is_settled = False
         self._suggested: tuple[Outcome, str] | None = None
         self._suggested_so_far: tuple[Outcome, str] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
@@ -145,7 +146,10 @@ class DelayFilter(Estimator):
             factor, own = np.ones(N_STATE), self._base.inflation
             factor[: len(own)] = own
             return factor
-        return np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
+        factor = np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
+        variance = np.diag(posterior.state.p)
+        more: Array = factor * np.sqrt(1.0 + np.diag(self.left_open) / np.maximum(variance, 1e-300))
+        return more
 
     @property
     def heading_deviation(self) -> GaussianState | None:
@@ -160,7 +164,24 @@ class DelayFilter(Estimator):
 
     def of_recording(self) -> GaussianState:
         """As `state`, with σ as blocks of time show it: its own has been raised."""
-        return self.state() if self.claims else self.extended(self._base.of_recording())
+        posterior = self.posterior
+        if posterior is None or not self.claims:
+            return self.extended(self._base.of_recording())
+        x, p = posterior.state
+        return GaussianState(x, p + self.left_open)
+
+    @property
+    def left_open(self) -> Array:
+        """(n, n) of what is shown of lever arm and delay, what the reference's clock leaves open.
+
+        In a result by all data, else as clocks were looked at on the way.
+        """
+        found: Array = np.zeros((N_STATE, N_STATE))
+        posterior, registration = self.posterior, self._solver.registration(fresh=self._is_settled)
+        if posterior is not None and self.claims and registration is not None:
+            shown = posterior.shown[BEYOND]
+            found[_OPEN] = registration.left_open * np.outer(shown, shown)
+        return found
 
     def extended(self, base: GaussianState) -> GaussianState:
         """The state of the model that this one extends, with the prior of what it does not have."""
@@ -254,11 +275,11 @@ class DelayFilter(Estimator):
     def settled(self) -> Iterator[None]:
         """All blocks that are complete have taken effect, in here: for a result, which no later sample decides on."""
         told = self._told
-        self._last_told = self._newest()
+        self._last_told, self._is_settled = self._newest(), True
         try:
             yield
         finally:
-            self._last_told = told
+            self._last_told, self._is_settled = told, False
 
     def _newest(self) -> Outcome:
         """The outcome of the last block that is complete; nothing is being solved then."""

@@ -125,9 +125,9 @@ class BlockSolver:
             return shared
         return self._clocks.says(fresh=fresh)
 
-    def registration(self) -> Registration | None:
-        """How the instruments stand; None where the data do not show it."""
-        return self._clocks.looked().registration
+    def registration(self, *, fresh: bool = True) -> Registration | None:
+        """How the instruments stand; None where the data do not show it. fresh: as of `suggestion`."""
+        return self._clocks.looked(fresh=fresh).registration
 
     @property
     def is_level(self) -> bool:

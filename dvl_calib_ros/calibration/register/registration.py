@@ -7,8 +7,9 @@ base: whose attitude turns the reference into the body. Who starts from an answe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,12 @@ INDEPENDENT_S, GAIN = 1.0, 8.0
 KNOWN_STD_S = 0.25
 
 
+# A reference's clock of which nobody says anything is in time to this, s (σ): receivers and filters are late by tenths.
+IN_TIME_STD_S = 0.5
+# What it leaves open of a lever arm is none to speak of below this, m (σ).
+OPEN_FROM_M = 0.08
+
+
 @dataclass(frozen=True)
 class Clock:
     """late: by how much stamps are late beside the IMU's, s. std: σ. is_shown: that they are is beyond doubt."""
@@ -55,6 +62,8 @@ class Registration:
     rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the DVL from the reference
     point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
     speed; spread: the same, m/s per axis; speed: RMS, m/s.
+    open_late: σ (s) of the reference's clock by the data alone; open_by: (4,) by how much the lever arm (m) and the
+    DVL's delay (s) are others for each second of it.
     """
 
     dvl: Clock
@@ -72,6 +81,19 @@ class Registration:
     left: float
     spread: float
     speed: float
+    open_late: float
+    open_by: Array
+
+    @property
+    def left_open(self) -> Array:
+        """What the reference's clock leaves open of the lever arm (m) and the DVL's delay (s): their covariance (4, 4).
+
+        At one speed a clock looks like a lever arm, and then neither is known. Zero where that is nothing to speak of.
+        """
+        std = 1.0 / math.hypot(1.0 / max(self.open_late, 1e-9), 1.0 / IN_TIME_STD_S)
+        open_by = self.open_by * std
+        is_little = float(np.linalg.norm(open_by[:3])) < OPEN_FROM_M
+        return np.zeros((4, 4)) if is_little else np.outer(open_by, open_by)
 
     @property
     def offsets(self) -> dict[str, float]:
@@ -118,7 +140,12 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
         return None
     in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
     if in_time[1] < NO_DOUBT:  # all that there is would show nothing more
-        return _explained(quick, best, rotation_body_from_dvl, lever_arm)
+        seen = _explained(quick, best, rotation_body_from_dvl, lever_arm)
+        if not seen.left_open.any():
+            return seen
+        # fewer references show less of a clock
+        free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
+        return seen if free is None else replace(seen, **_open(fit, free))
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
     return None if best is None else _explained(fit, best, rotation_body_from_dvl, lever_arm)
 
@@ -159,7 +186,16 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
         left=best.left,
         spread=best.level,
         speed=best.speed,
+        **_open(fit, free),
     )
+
+
+def _open(fit: Fit, free: Fitted) -> dict[str, Any]:
+    """open_late and open_by of a fit with all clocks free."""
+    if not fit.is_turned:
+        return {"open_late": 0.0, "open_by": np.zeros(4)}
+    by = free.p[:, LATE] / free.p[LATE, LATE]
+    return {"open_late": float(free.std[LATE]), "open_by": np.append(by[ARM], 1.0 + by[APART])}
 
 
 class _Off(Enum):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.delay.rows import ImuColumns
+from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.coarse import places
@@ -160,3 +161,28 @@ def test_too_little_is_none():
     assert register(short, np.eye(3), np.zeros(3)) is None
     apart = make_motion((td, v), (tg + 5000.0, g), True, (True,) * 3, imu)
     assert places(apart, np.eye(3)) == [] and register(apart, np.eye(3), np.zeros(3)) is None
+
+
+def test_at_one_speed_the_clock_of_a_reference_is_in_the_arm_and_the_delay():
+    """A boat's forward arm came out at -0.46 m ± 0.05, and is 0.0 ± 0.1 by differences of velocities."""
+    (td, v), (tg, g), imu = run("figure8", 5.0)
+    ahead = v * [1.0, 0.0, 0.0]
+    at_one_speed = make_motion((td, ahead * (1.0 / v[:, :1])), (tg, g), True, (True, True, False), ImuColumns(*imu))
+    assert at_one_speed is not None
+    turned = register(_of_its_own(at_one_speed), np.eye(3), np.zeros(3))
+    assert turned is not None
+    std = np.sqrt(np.diag(turned.left_open))
+    assert std[0] == pytest.approx(std[3] * turned.speed, rel=0.1) and std[0] > 0.08 > 10.0 * std[1]
+
+
+def _of_its_own(one: Motion) -> Motion:
+    """The same where the reference is what the DVL says, with noise."""
+    rng = np.random.default_rng(3)
+    rotation, known = attitude_at(one.imu, one.dvl.times, 2.0)
+    seen = np.einsum("nij,nj->ni", rotation, one.dvl.velocity)[known] + rng.normal(0.0, 0.05, (known.sum(), 3))
+    return replace(one, reference_times=one.dvl.times[known], reference=seen)
+
+
+def test_where_speeds_differ_nothing_of_the_arm_is_open():
+    assert not registered("free", 5.0).left_open.any()
+    assert not registered("free", 5.0, in_earth=False).left_open.any()

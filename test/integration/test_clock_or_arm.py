@@ -1,0 +1,37 @@
+"""A boat at one speed: neither its lever arm ahead nor its clocks are claimed, and that is said."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+import dvl_calib_ros as dc
+from dvl_calib_ros.files.trajectories import ImportOptions, import_folder
+
+RUNS = ("20250117163514", "20250117164453", "20250130113805")
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory):
+    named = os.environ.get("DVL_CALIB_CAPUTH")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data" / "caputh"
+    if not folder.is_dir():
+        pytest.skip(f"no data in {folder}")
+    bags = tmp_path_factory.mktemp("caputh") / "bags"
+    import_folder(folder, bags, ImportOptions(frame="flu"))
+    return bags
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
+    """It was -0.46 m ± 0.05; by differences of velocities it is 0.0 ± 0.1."""
+    run = dc.replay(bags / name, history=False)
+    estimate = run.replayed.result.estimate
+    if estimate.model != "G2":  # which claims no arm
+        return
+    arm, std = estimate.state_of("lever_arm_x"), estimate.std_of("lever_arm_x")
+    assert std is not None and abs(arm) < 2.0 * std[0]
+    assert "CLOCK_OR_ARM" in [found.code for found in run.findings]
