@@ -36,6 +36,7 @@ from .observability import convergence, observability
 from .observations import Observations
 from .observe import Observer
 from .parameters import ParameterError, Parameters
+from .register.registration import Registration
 from .results import Day, Estimate, Result
 from .robust import median
 from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
@@ -641,6 +642,11 @@ class Calibrator:
     def are_clocks_known(self) -> bool:
         """Whether the data show how the clocks stand, in time or not."""
         return any(each.registration is not None and each.registration.are_known for each in self._further)
+
+    @property
+    def registration_so_far(self) -> Registration | None:
+        """How the instruments stand, as it was seen a little ago; None where that is not known."""
+        return next((each.registration_so_far for each in self._further), None)
 
     @property
     def suggestion_so_far(self) -> str:

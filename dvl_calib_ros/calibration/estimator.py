@@ -109,6 +109,11 @@ class Estimator(ABC):
         return None
 
     @property
+    def registration_so_far(self) -> Registration | None:
+        """`registration` as it was seen a little ago, which nobody has to wait for."""
+        return None
+
+    @property
     def suggestion_so_far(self) -> str:
         """`suggestion` as it was seen a little ago, which nobody has to wait for."""
         return self.suggestion

@@ -120,6 +120,12 @@ _KINDS = (
         "set both clocks by the same source (PTP, NTP or GNSS)",
     ),
     FindingKind(
+        "CLOCK_TAKEN_OFF",
+        "{said}: taken off ({values}); the calibration began anew with it, by what came from then on",
+        "Two looks at velocities and turns agreed on it. What came before is not kept well enough to be used again.",
+        "set that clock right, or give what was found as a parameter, which then stands",
+    ),
+    FindingKind(
         "DVL_NO_REFERENCE",
         "no DVL sample has a reference velocity at its time, though both come",
         "Their stamps never come within gnss_timeout of each other, usually because the DVL stamps by its own clock.",

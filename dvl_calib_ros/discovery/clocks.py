@@ -15,23 +15,18 @@ import numpy as np
 from ..calibration.parameters import Parameters
 from ..calibration.register.far import Far, far_clocks
 from ..calibration.register.motion import Motion, motion_of
-from ..calibration.register.registration import Clock, Registration, register
+from ..calibration.register.registration import ALIKE_S, OFFSETS, Registration, register
 from ..calibration.samples import SampleBlock, Stream, Streams
 from ..messages.decode import MessageDecoder
 from ..recordings.look import Look, Survey
 from ..recordings.recording import Recording
 from ..recordings.topics import Topics
 
-OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
 # A registration that leaves less than this share of the speed is one (17 degrees of misalignment); another reading of
 # the frames is taken for it if it leaves less than this share of what the first one leaves.
 REGISTERED, CLEARLY = 0.3, 0.5
-# A DVL that is late by less is found by the calibration itself (G2), at whatever its stamps say, s.
-LEFT_TO_CALIBRATION_S = 2.5
 # What a clock leaves open of the lever arm is said from here on, m: the calibration's own σ does not hold it.
 SAID_FROM_M = 0.08
-# Clocks of recordings of one calibration are one clock if they agree to this, s.
-ALIKE_S = 0.1
 # Of a stream one sample in so long is registered, ns.
 EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
 # Samples of the DVL that are compared to find frames: no more tell more.
@@ -53,29 +48,17 @@ class FoundClocks:
     def says(self) -> Iterator[str]:
         """Of each clock that is off how late it is, and what comes of it; one sentence each."""
         r = self.registration
-        clocks = {"dvl_time_offset": r.dvl, "reference_time_offset": r.reference, "imu_time_offset": r.imu}
-        if not r.is_turned and "reference_time_offset" in r.offsets:
-            clocks["reference_time_offset"] = replace(r.apart, late=-r.apart.late)
         for name, late in r.offsets.items():
-            clock = clocks[name]
             done = (
                 f"taken off ({name} {late:.2f})" if name in self.offsets else "left to the calibration, which finds it"
             )
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
-            arm = clock.std * r.speed
-            known = (
-                f"; with it the lever arm ahead is known to {arm:.1f} m" if arm > SAID_FROM_M and r.is_turned else ""
-            )
-            yield f"{OFFSETS[name]} stamps are {_late(clock)}{which}: {done}{known if name in self.offsets else ''}"
+            yield f"{r.told(name)}{which}: {done}"
         if r.apart.is_shown and not r.offsets:
             yield (
                 f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; whose clock is "
                 "off does not show: drive turns at two speeds"
             )
-
-
-def _late(clock: Clock) -> str:
-    return f"{abs(clock.late):.2f} ± {clock.std:.2f} s {'late' if clock.late > 0.0 else 'early'}"
 
 
 def find_clocks(
@@ -121,9 +104,7 @@ def _found(
     if best is None or best[0].left >= REGISTERED:
         return None
     registration, hypothesis = best
-    offsets = {name: round(late, 3) for name, late in registration.offsets.items() if not given.intersection(OFFSETS)}
-    if offsets.keys() == {"dvl_time_offset"} and abs(offsets["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S:
-        offsets = {}
+    offsets = {} if given.intersection(OFFSETS) else registration.taken_off
     return FoundClocks(registration, offsets, hypothesis)
 
 

@@ -52,6 +52,7 @@ from .answering import AnsweringNode
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .inbox import Arrived, in_order_of_arrival, take
+from .late_clocks import LateClocks
 from .message_types import velocity_class
 from .mounting import MountingOutput
 from .parameters import declare_parameters
@@ -74,6 +75,7 @@ class CalibrationNode(AnsweringNode):
 
     def __init__(self, parameter_files: Sequence[Path] = (), **node_options: Any) -> None:
         super().__init__(NODE_NAME, automatically_declare_parameters_from_overrides=True, **node_options)
+        named = set(self.get_parameters_by_prefix(""))
         parameters = declare_parameters(self, parameter_files)
         self._parameter_files = parameter_files
         dvl_class = velocity_class("dvl_type", parameters.dvl_type)
@@ -92,6 +94,7 @@ class CalibrationNode(AnsweringNode):
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
         self._given = not_default(parameters)
+        self._late_clocks = LateClocks(named)
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._correction: Correction | None = None
@@ -165,7 +168,11 @@ class CalibrationNode(AnsweringNode):
             self._calibrator.set_parameters(parameters.replace(**place))
             return
         self.get_logger().info(f"{found.said}; the calibration begins with it (use_transforms: false does without)")
-        self._begin(parameters.replace(**found.values), None)
+        self._begin_anew(parameters.replace(**found.values))
+
+    def _begin_anew(self, parameters: Parameters) -> None:
+        """Forget all samples, and calibrate with these parameters from here on."""
+        self._begin(parameters, None)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._recent, self._correction, self._mounting_published = RecentCounts(), None, ("", 0)
 
@@ -319,10 +326,18 @@ class CalibrationNode(AnsweringNode):
         pose = mounting_pose(model, calibrator.published(model.name), parameters, decoder.turns_dvl)
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
 
+    def _take_off_late_clocks(self) -> None:
+        calibrator = self._calibrator
+        parameters = self._late_clocks.parameters(calibrator.registration_so_far, calibrator.parameters)
+        if parameters is not None:
+            self._warn(" ".join(map(str, self._late_clocks.found)))
+            self._begin_anew(parameters)
+
     def _publish_diagnostics(self) -> None:
+        self._take_off_late_clocks()
         self._publish_mounting()
         decoder = self._feed.decoder
-        problems = [*decoder.problems.values(), *self._topic_problems()]
+        problems = [*decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
         if self._save_problem:
             problems.append(self._save_problem)

@@ -210,6 +210,11 @@ class DelayFilter(Estimator):
         return self._idle_solver().is_level
 
     @property
+    def registration_so_far(self) -> Registration | None:
+        """The same, as it was seen a little ago."""
+        return self._solver.registration(fresh=False)
+
+    @property
     def suggestion_so_far(self) -> str:
         """The same, where a clock is late as it was seen a little ago: nobody waits for a look at all there is."""
         newest = self._newest()

@@ -32,6 +32,8 @@ DRAWN = math.pi / 4.0
 # Axes turned round are the right ones if they leave so much less than those given: in chi-square, were all samples
 # independent; of blocks of ten that are alike it is a tenth.
 CLEARLY = 40.0
+# ... and no more than so many times what is left with whichever clocks.
+AS_WELL = 1.1
 # A registration explains the motion with a misalignment (rad) and a scale below these.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
@@ -62,7 +64,7 @@ def fitting_configuration(
             )
     curves = Curves(motion)
     if given is not None and _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) < WRONG_FROM:
-        return _flipped(motion, curves, nominal, lever_arm)
+        return _flipped(motion, curves, nominal, lever_arm, given.spread)
     as_given = min((_left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given else math.inf), 1.0)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
@@ -110,11 +112,12 @@ def _as_if(motion: Motion, declared: VelocityFrame, frame: VelocityFrame) -> Mot
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array) -> str:
+def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, spread: float) -> str:
     """Whether y and z turned round explain more without a lever arm than the axes given do with any.
 
     A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
-    its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm.
+    its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm. spread: what
+    the axes given leave with whichever clocks, m/s: where a clock is off, neither fits with clocks in time.
     """
     fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
     found = []
@@ -122,7 +125,7 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array) -
         near = _nearest(quick, rotation, held)
         found.append(None if near is None else fit(0.0, near.dvl_late, rotation, held))
     given, turned = found
-    if given is None or turned is None:
+    if given is None or turned is None or turned.level > AS_WELL * spread:
         return ""
     gain = 6.0 * turned.rows * math.log(max(given.level, 1e-6) / max(turned.level, 1e-6))
     return "the DVL's axes look forward-right-down (dvl_axes: frd)" if gain > CLEARLY else ""

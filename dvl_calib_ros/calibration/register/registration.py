@@ -37,6 +37,11 @@ INDEPENDENT_S, GAIN = 1.0, 8.0
 KNOWN_STD_S = 0.25
 
 
+OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
+# A DVL that is late by less is found by the calibration itself (G2), at whatever its stamps say, s.
+LEFT_TO_CALIBRATION_S = 2.5
+# Clocks that are found twice are one clock if they agree to this, s.
+ALIKE_S = 0.1
 # A reference's clock of which nobody says anything is in time to this, s (σ): receivers and filters are late by tenths.
 IN_TIME_STD_S = 0.5
 # What it leaves open of a lever arm is none to speak of below this, m (σ).
@@ -105,6 +110,22 @@ class Registration:
             return {"reference_time_offset": -self.apart.late}
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference}
         return {name: clock.late for name, clock in clocks.items() if clock.is_shown}
+
+    @property
+    def taken_off(self) -> dict[str, float]:
+        """Those that a calibration takes off, s: a DVL that is late by little it finds itself, at whatever stamps."""
+        found = {name: round(late, 3) for name, late in self.offsets.items()}
+        is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
+        return {} if is_little else found
+
+    def told(self, name: str) -> str:
+        """Whose stamps are how late, in words, by the parameter that takes it off."""
+        clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference, "imu_time_offset": self.imu}
+        if not self.is_turned and name == "reference_time_offset":
+            clocks[name] = replace(self.apart, late=-self.apart.late)
+        clock = clocks[name]
+        way = "late" if clock.late > 0.0 else "early"
+        return f"{OFFSETS[name]} stamps are {abs(clock.late):.2f} ± {clock.std:.2f} s {way}"
 
     def says(self, parameters: Parameters) -> str:
         """What configuration would fit, in words, where a clock beside the DVL's is off beyond doubt; else ''."""
