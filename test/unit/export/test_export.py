@@ -214,7 +214,7 @@ def test_a_result_file_of_a_calibration_is_exported_too(tmp_path, capsys):
     dvl = READERS["stonefish"](tmp_path / "dvl.xml")
     saved = load_yaml(tmp_path / "calibration.yaml", "result file")["mounting"]
     np.testing.assert_allclose(dvl.rotation, Rotation.from_euler("xyz", saved["corrected_rpy"]).as_matrix(), atol=1e-8)
-    np.testing.assert_allclose(dvl.lever_arm, saved["lever_arm"], atol=1e-8)
+    np.testing.assert_allclose(dvl.lever_arm, saved["position"], atol=1e-8)
     assert saved["corrected_rpy"][2] == pytest.approx(math.radians(3.0), abs=0.01)
     beside = json.loads((tmp_path / "dvl.xml.missing.json").read_text())
     assert "rate" in beside["defaults"]
