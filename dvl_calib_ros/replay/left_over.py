@@ -124,13 +124,17 @@ def left_over(
     return Followed(tilt, std, slow[0][-3:], slow[1][-3:], float(fast[0][-1]), smoothed_std, lean, speed)
 
 
-def left_over_advice(found: Followed | None) -> list[tuple[Word, Finding]]:
-    """What to say of it, and what it is to the verdict."""
+def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[tuple[Word, Finding]]:
+    """What to say of it, and what it is to the verdict.
+
+    of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
+    """
     if found is None:
         return []
     seconds = math.sqrt(2.0 * abs(found.smoothed))
-    if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > SMOOTHED_FROM_S:
-        word = Word.REJECT if seconds > TOO_SMOOTH_S else Word.MARGINAL
+    is_ours = of_positions and found.smoothed > 0.0
+    if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
+        word = Word.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Word.MARGINAL
         # what else it follows then comes of that
         return [(word, finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds))]
     said = []

@@ -32,7 +32,7 @@ from ..calibration.verification import Word, verification_document
 from ..errors import InputError
 from ..files.result_file import days_document, estimate_document, load_initial_calibration
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import TWIST_TYPE
+from ..messages.drivers import REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.check import check_topics
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
@@ -145,7 +145,10 @@ def replay(
         found += deviates
         if decoder.frame_of_reference is not VelocityFrame.BODY:
             found += one_heading_advice(result.estimate, calibrator.parameters, speed)
-    left = left_over_advice(navigation.followed) if navigation is not None else []
+    of_positions = (
+        REFERENCE_TYPES[recording.types[chosen.gnss]].is_position if chosen.gnss in recording.types else False
+    )
+    left = left_over_advice(navigation.followed, of_positions) if navigation is not None else []
     found += [each for _, each in left]
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived

@@ -93,8 +93,11 @@ def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
     vehicle = Vehicle(rng)
     slow = smoothed(vehicle.earth, 1.5)
     in_time = np.column_stack([np.interp(vehicle.time + 1.5, vehicle.time, column) for column in slow.T])
-    ((verdict, said),) = left_over_advice(vehicle.found(reference=in_time))
+    found = vehicle.found(reference=in_time)
+    ((verdict, said),) = left_over_advice(found)
     assert verdict is Word.REJECT and said.code == "VELOCITY_SMOOTHED" and said.says.startswith("the reference")
+    ((verdict, said),) = left_over_advice(found, of_positions=True)
+    assert verdict is Word.MARGINAL and said.code == "VELOCITY_SMOOTHED"
 
 
 def test_an_attitude_without_tilt_and_a_short_run_say_nothing(rng):
