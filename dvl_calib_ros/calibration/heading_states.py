@@ -171,12 +171,14 @@ def heading_states(blocks: TimeBlocks, states: GaussianState, numbers: Index, be
             0.5 * (more + more.swapaxes(1, 2)),
         )
 
+    both, of_terms = np.empty((n + N_COEFFICIENTS,) * 2), np.eye(n + N_TERMS, n + N_COEFFICIENTS)
+    of_terms[n:, n:] = onto.T
+
     def inflation(root: Array) -> tuple[Array, Array, Array]:
         """Of the best one: coefficients, their covariance, and by how much σ (n + 5,) of states and them grow."""
         x, p, shift, more = (each[0] for each in deviating(root, np.array([best])))
         across = -turned[best].T @ p
-        both = np.block([[states.p[best] + more, across], [across.T, p]])
-        of_terms = np.block([[np.eye(n), np.zeros((n, N_COEFFICIENTS))], [np.zeros((N_TERMS, n)), onto.T]])
+        both[:n, :n], both[:n, n:], both[n:, :n], both[n:, n:] = states.p[best] + more, across, across.T, p
         at = of_terms @ np.concatenate([states.x[best] + shift, x])
         return x, p, blocks.inflation(int(numbers[best]), at, both @ of_terms.T, np.diag(both))
 
