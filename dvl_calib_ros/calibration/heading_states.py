@@ -39,6 +39,8 @@ _WIDTH = np.log(4.0)
 _LOGS: Array = np.arange(-6.0, 3.5, 0.35)
 _LOG_LIKELY: Array = -0.5 * (_LOGS / _WIDTH + _WIDTH) ** 2
 _FACTORS: Array = np.exp(_LOGS) / np.sqrt(np.exp(_LOG_LIKELY) @ np.exp(2.0 * _LOGS) / np.exp(_LOG_LIKELY).sum())
+# A constant of any size, rad.
+_ANY = 1.0
 # A drift is one from so long on, s.
 _SHORTEST_S = 60.0
 
@@ -185,9 +187,14 @@ def heading_states(blocks: TimeBlocks, states: GaussianState, numbers: Index, be
     # what is left where it may be of any size is noise, and whatever else: the evidence is worth as much less
     _, _, factor = inflation(_FACTORS[-1] * std * _SHARE)
     level = float((factor[n:] ** 2).mean())
+    # and a constant beside, of any size: a yaw that its own prior does not expect is no deviation for that
+    free = np.vstack([onto, np.eye(N_TERMS)[-1]])
+    beside_free = free @ told[best, n:, :n]
+    own_free = (free @ told[best, n:, n:] @ free.T - beside_free @ states.p[best] @ beside_free.T) / level
+    scores_free = (free @ vector[best, n:] - beside_free @ states.x[best]) / level
     root = std * _SHARE
     for which in (_CYCLES, _DRIFT):
-        root = np.where(which, _size(own[best] / level, scores[best] / level, root, which), 1.0) * root
+        root = np.where(which, _size(own_free, scores_free, root, which), 1.0) * root
     x, p, factor = inflation(root)
     _, _, shift, more = deviating(root, slice(None))
     # at any time of the recording, as far as data show
@@ -226,10 +233,10 @@ def _onto_coefficients(square: Array, times: Array) -> Array:
 def _size(information: Array, scores: Array, root: Array, which: Mask) -> float:
     """How many times larger the prior σ root (5,) of some coefficients is, by the evidence: root of the mean square.
 
-    information (5, 5), scores (5,): of the coefficients, without their prior. which: (5,).
+    information (6, 6), scores (6,): of the coefficients and a constant, without their prior. which: (5,).
     """
-    roots = np.where(which, _FACTORS[:, None], 1.0) * root
-    spread = np.eye(N_COEFFICIENTS) + roots[:, :, None] * information * roots[:, None]
+    roots = np.column_stack([np.where(which, _FACTORS[:, None], 1.0) * root, np.full(len(_FACTORS), _ANY)])
+    spread = np.eye(N_COEFFICIENTS + 1) + roots[:, :, None] * information * roots[:, None]
     about = roots * scores
     explained = (about * np.linalg.solve(spread, about[..., None])[..., 0]).sum(axis=1)
     likely = 0.5 * (explained - np.linalg.slogdet(spread)[1]) + _LOG_LIKELY

@@ -139,3 +139,17 @@ def test_terms_of_blocks_are_the_same_however_samples_come(rng):
             found.append(one_by_one.upto(np.array([0]))[0])
     np.testing.assert_allclose(found, expected, rtol=1e-13)
     np.testing.assert_allclose(at_once.rest(), one_by_one.rest(), rtol=1e-13)
+
+
+def test_a_yaw_that_its_prior_does_not_expect_is_no_deviation(rng):
+    blocks, h, z, _ = blocks_of(ONE, rng, np.zeros(5))
+    z = z + h @ UP * math.radians(10.0)
+    blocks = TimeBlocks()
+    for b in range(len(ONE)):
+        own = slice(b * ROWS, (b + 1) * ROWS)
+        terms = heading_terms(earth_in_body(np.full(ROWS, ONE[b])), np.ones(ROWS), DRIFT_S * b)
+        blocks.add(*with_terms((h[own].T @ h[own])[None], (h[own].T @ z[own])[None], terms, UP), ROWS)
+    alone = without_deviation(h, z, math.radians(3.0))
+    found = heading_states(blocks, alone, np.zeros(1, dtype=int), 0, STD)
+    assert abs(found.shift[0, 2]) < math.radians(0.7)
+    assert math.sqrt(alone.p[0, 2, 2] + found.more[0, 2, 2]) < 2.0 * STD
