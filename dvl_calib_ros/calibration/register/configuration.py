@@ -32,6 +32,10 @@ DRAWN = math.pi / 4.0
 # Axes turned round are the right ones if they leave so much less than those given: in chi-square, were all samples
 # independent; of blocks of ten that are alike it is a tenth.
 CLEARLY = 40.0
+# ... of which a sample counts no more than by so many times what is left of the most.
+OUTLYING = 4.0
+# Delays that differ by less read the DVL at the same times, s.
+ALIKE_S = 0.1
 # ... and no more than so many times what is left with whichever clocks.
 AS_WELL = 1.1
 # A registration explains the motion with a misalignment (rad) and a scale below these.
@@ -127,8 +131,13 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, s
     given, turned = found
     if given is None or turned is None or turned.level > AS_WELL * spread:
         return ""
-    gain = 6.0 * turned.rows * math.log(max(given.level, 1e-6) / max(turned.level, 1e-6))
-    return "the DVL's axes look forward-right-down (dvl_axes: frd)" if gain > CLEARLY else ""
+    # of the same samples but for those at the ends; outliers, and a level that is told by the middle one, judge nothing
+    most = (OUTLYING * max(min(given.level, turned.level), 1e-6)) ** 2
+    as_given, as_turned = (float(np.minimum(each.squares, most).mean()) for each in (given, turned))
+    gain = 3.0 * turned.rows * math.log(max(as_given, 1e-12) / max(as_turned, 1e-12))
+    # read at other times, the DVL's noise is another one: what is left differs by that alone
+    by_chance = math.sqrt(6.0 * turned.rows) if abs(given.dvl_late - turned.dvl_late) > ALIKE_S else 0.0
+    return "the DVL's axes look forward-right-down (dvl_axes: frd)" if gain > CLEARLY + by_chance else ""
 
 
 def _named(declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool) -> str:

@@ -138,3 +138,21 @@ def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
     )
     assert found.verdict is Word.ACCEPT
     assert "inspect the mounting: it is 2.9°" in found.mounting
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_axes_that_hardly_show_are_not_said_to_be_turned_round(seed):
+    """A DVL that is turned by little, in a vehicle that keeps level: either reading of its axes fits as well."""
+    rng = np.random.default_rng(seed)
+    turned = rotation_from_rpy(np.radians([0.5, -1.5, 1.0]))
+    samples = []
+    for at in np.arange(0.0, 300.0, 0.2):
+        stamp, rate = START_NS + round(at * 1e9), np.pi / 40.0 if at % 60.0 > 40.0 else 0.0
+        yaw = np.pi / 40.0 * (20.0 * (at // 60.0) + max(at % 60.0 - 40.0, 0.0))
+        rotation = rotation_from_rpy([0.0, 0.0, float(yaw)])
+        samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), (0.0, 0.0, rate)))
+        seen = rotation @ (1.5, 0.0, 0.0) + rng.normal(0.0, 0.03, 3)
+        samples.append(ReferenceSample(stamp, tuple(seen.tolist()), None, VelocityFrame.ENU))
+        samples.append(DvlSample(stamp, tuple((turned.T @ (1.5, 0.0, 0.0) + rng.normal(0.0, 0.01, 3)).tolist())))
+    found = calibrate(samples, PARAMETERS, verified=True, models=("G1", "G2")).verification("G1")
+    assert not any("forward-right-down" in reason for reason in found.reasons), found.reasons
