@@ -15,7 +15,7 @@ import numpy as np
 from ..calibration.parameters import Parameters
 from ..calibration.register.far import Far, far_clocks
 from ..calibration.register.motion import Motion, motion_of
-from ..calibration.register.registration import ALIKE_S, OFFSETS, Registration, register
+from ..calibration.register.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
 from ..calibration.samples import SampleBlock, Stream, Streams
 from ..messages.decode import MessageDecoder
 from ..recordings.look import Look, Survey
@@ -49,9 +49,14 @@ class FoundClocks:
         """Of each clock that is off how late it is, and what comes of it; one sentence each."""
         r = self.registration
         for name, late in r.offsets.items():
-            done = (
-                f"taken off ({name} {late:.2f})" if name in self.offsets else "left to the calibration, which finds it"
-            )
+            if name in self.offsets:
+                done = f"taken off ({name} {late:.2f})"
+            elif abs(late) < LEFT_TO_CALIBRATION_S:
+                done = "left to the calibration, which finds it"
+            else:
+                done = "not taken off"
+                if not r.are_known:
+                    done += ", for the other clocks may be off as well: drive turns at two speeds"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
             yield f"{r.told(name)}{which}: {done}"
         if r.apart.is_shown and not r.offsets:
@@ -104,7 +109,9 @@ def _found(
     if best is None or best[0].left >= REGISTERED:
         return None
     registration, hypothesis = best
-    offsets = {} if given.intersection(OFFSETS) else registration.taken_off
+    # a whole recording that does not show how all clocks stand is no reason to move one
+    is_kept = bool(given.intersection(OFFSETS)) or not registration.are_known
+    offsets = {} if is_kept else registration.taken_off
     return FoundClocks(registration, offsets, hypothesis)
 
 

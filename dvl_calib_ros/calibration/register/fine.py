@@ -57,6 +57,7 @@ MOST_OF_NOISE = 0.95
 BLOCKS = 48
 # Median of chi-square of 1, 2, 3 degrees of freedom.
 _MEDIAN_CHI2 = (0.455, 1.386, 2.366)
+_Compared = tuple[Index, tuple[Array, ...]]
 
 
 class Fitted(NamedTuple):
@@ -66,6 +67,7 @@ class Fitted(NamedTuple):
     noise makes it, by blocks of time and by how long what is left lasts.
 
     level: m/s per axis, robust, of what is left of `rows` references. speed: RMS of what was compared, m/s.
+    at: (J,) which references these are, of those that are looked at.
     """
 
     x: Array
@@ -77,11 +79,13 @@ class Fitted(NamedTuple):
     squares: Array
     axes: int
     inflation: float
+    at: Index
 
-    def cost(self, level: float) -> float:
-        """What is left, in chi-square by a level of noise (m/s), robust, and as independent as blocks show."""
+    def cost(self, level: float, among: Index) -> float:
+        """What is left of these references, in chi-square by a level of noise (m/s), robust."""
         scale = HALF_AT**2 * self.axes
-        return scale * float(np.log1p(self.squares / (scale * level**2)).sum())
+        kept = self.squares[np.searchsorted(self.at, among)]
+        return scale * float(np.log1p(kept / (scale * level**2)).sum())
 
     @property
     def left(self) -> float:
@@ -105,12 +109,12 @@ class Fitted(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """residual (J, A), jacobian (J, A, 9) of it, times (J,) s; of_noise (J,): how much of the square of the column of δ
-    is expected of noise alone; speed: RMS, m/s."""
+    """residual (J, A), jacobian (J, A, 9) of it, of references `at` (J,); of_noise (J,): how much of the square of the
+    column of δ is expected of noise alone; speed: RMS, m/s."""
 
     residual: Array
     jacobian: Array
-    times: Array
+    at: Index
     of_noise: Array
     speed: float
 
@@ -191,11 +195,13 @@ class Fit:
         apart: float,
         rotation_body_from_dvl: Array | None,
         in_time: Sequence[Array] = (),
+        among: Fitted | None = None,
     ) -> Fitted | None:
         """From ρ and δ (s) on; None where too little can be compared.
 
         rotation_body_from_dvl: (3, 3), about which turns are likely; None to find it. in_time: clocks that are in time,
         `DVL` and `REFERENCE`, or `BOTH_ALIKE`; without an attitude that turns it, the reference's is.
+        among: another place that is weighed against this one: of its references, DVL and attitudes alone.
         """
         rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
         if rotation is None:
@@ -207,7 +213,7 @@ class Fit:
         if not self.is_turned:
             in_time = (*in_time, REFERENCE)
         for _ in range(ROUNDS):
-            rows = self._rows(x, rotation)
+            rows = self._rows(x, rotation, among)
             if rows is None:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
@@ -219,17 +225,17 @@ class Fit:
             x[TURN] = 0.0
             if far < SETTLED_S and float(np.abs(step).max()) < SETTLED_S:
                 break
-        rows = self._rows(x, rotation)
+        rows = self._rows(x, rotation, among)
         if rows is None or solved is None:
             return None
         _, information, level, weight = self._solved(x, rows, nominal, rotation, in_time)
         p, factor = self._covariance(rows, information, level, weight)
         squares, axes = (rows.residual**2).sum(axis=1), rows.residual.shape[1]
         inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
-        return Fitted(x, p, rotation, level, len(rows.times), rows.speed, squares, axes, inflation)
+        return Fitted(x, p, rotation, level, len(rows.at), rows.speed, squares, axes, inflation, rows.at)
 
-    def _streams(self, reference: float, apart: float) -> tuple[Array, ...] | None:
-        """B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), times (J,), noise gain of
+    def _streams(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
+        """Which references (J,), and B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), noise gain of
         the slope (J,)."""
         m = self._motion
         own = self._times - reference
@@ -240,30 +246,41 @@ class Fit:
         rotation, oriented = attitude_at(m.imu, own, GAP_S) if needed else (np.zeros((len(own), 3, 3)), known)
         if m.in_earth:
             known = known & oriented
+        if among is not None:
+            known = known & self._shared(among, reference, apart)
         if np.count_nonzero(known) < ENOUGH:
             return None
         at = np.flatnonzero(known)
         seen, rotation = self._velocity[at], rotation[at]
         body = np.einsum("nji,nj->ni", rotation, seen) if m.in_earth else seen
-        return body, self._curves.rates(own[at]), velocity[at], slope[at], rotation, self._times[at], gain[at]
+        return at, (body, self._curves.rates(own[at]), velocity[at], slope[at], rotation, gain[at])
+
+    def _shared(self, other: Fitted, reference: float, apart: float) -> Mask:
+        """Which references (J,) are compared at another place, with DVL and attitudes that are compared there."""
+        there, shared = self._times[other.at], np.zeros(len(self._times), dtype=bool)
+        shared[other.at] = True
+        for here, elsewhere in ((apart, float(other.x[APART])), (-reference, -float(other.x[LATE]))):
+            at = self._times + here
+            shared &= (at >= there[0] + elsewhere) & (at <= there[-1] + elsewhere)
+        return shared
 
     def _best_rotation(self, reference: float, apart: float) -> Array | None:
         """C (3, 3) that fits best without a lever arm, by singular values."""
         streams = self._streams(reference, apart)
         if streams is None:
             return None
-        body, _, velocity, *_ = streams
+        _, (body, _, velocity, *_) = streams
         square = float((velocity**2).sum())
         return nearest_rotation(body.T @ velocity + 1e-3 * square * np.eye(3))
 
-    def _rows(self, x: Array, rotation: Array) -> _Rows | None:
-        streams = self._streams(float(x[LATE]), float(x[APART]))
+    def _rows(self, x: Array, rotation: Array, among: Fitted | None) -> _Rows | None:
+        streams = self._streams(float(x[LATE]), float(x[APART]), among)
         if streams is None:
             return None
-        body, rates, velocity, slope, attitude, times, gain = streams
+        at, (body, rates, velocity, slope, attitude, gain) = streams
         own = (1.0 + x[SCALE]) * velocity @ rotation.T
         residual = body + cross(rates, self._lever_arm + x[ARM]) - own
-        jacobian = np.zeros((len(times), 3, N))
+        jacobian = np.zeros((len(at), 3, N))
         jacobian[:, :, TURN] = skew(own)
         jacobian[:, :, SCALE] = -velocity @ rotation.T
         jacobian[:, :, ARM] = skew(rates)
@@ -276,7 +293,7 @@ class Fit:
                 jacobian = attitude @ jacobian
             residual, jacobian = residual[:, measured], jacobian[:, measured]
         speed = float(np.sqrt((body**2).sum(axis=1).mean()))
-        return _Rows(residual, jacobian, times, gain * self._noise * residual.shape[1], speed)
+        return _Rows(residual, jacobian, at, gain * self._noise * residual.shape[1], speed)
 
     def _solved(
         self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
@@ -305,7 +322,7 @@ class Fit:
     def _covariance(self, rows: _Rows, information: Array, level: float, weight: Array) -> tuple[Array, Array]:
         p = np.linalg.inv(information)
         blocks = TimeBlocks()
-        for part in np.array_split(np.arange(len(rows.times)), min(BLOCKS, max(1, len(rows.times) // 10))):
+        for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):
             h = rows.jacobian[part].reshape(-1, N)
             w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
             blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))

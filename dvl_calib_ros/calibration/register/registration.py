@@ -15,7 +15,7 @@ import numpy as np
 
 from ..frames import Array
 from ..parameters import Parameters
-from .coarse import places
+from .coarse import LONGEST_S, places
 from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Curves, Fit, Fitted
 from .motion import Motion
 
@@ -33,6 +33,8 @@ WORSE = 3.0, 0.02
 EARLY = 6.0
 # Of places that explain the data about as well the nearest is taken: log evidence, of samples so far apart (s).
 INDEPENDENT_S, GAIN = 1.0, 8.0
+# Against a place that compares fewer references than this share of its own another is weighed on what both compare.
+AS_MANY = 0.95
 # The place of the clocks is known where it is to this, s (σ).
 KNOWN_STD_S = 0.25
 
@@ -150,12 +152,12 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
     enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
     tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
     found = [quick(*place, rotation_body_from_dvl) for place in {*tried, (0.0, 0.0)}]
-    fitted = [each for each in found if each is not None and np.isfinite(each.x).all()]
+    fitted = [each for each in found if each is not None and _is_possible(each)]
     if not fitted:
         return None
     closest = min(fitted, key=lambda each: each.level)
     # legs that repeat agree at more than one delay
-    as_good = [each for each in fitted if _gain(motion, each, closest) < GAIN]
+    as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation_body_from_dvl)]
     best: Fitted | None = min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
     if best is None:
         return None
@@ -166,9 +168,9 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
             return seen
         # fewer references show less of a clock
         free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
-        return seen if free is None else replace(seen, **_open(fit, free))
+        return seen if free is None or not _is_possible(free) else replace(seen, **_open(fit, free))
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
-    return None if best is None else _explained(fit, best, rotation_body_from_dvl, lever_arm)
+    return None if best is None or not _is_possible(best) else _explained(fit, best, rotation_body_from_dvl, lever_arm)
 
 
 def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:
@@ -236,10 +238,11 @@ def _held(
 ) -> tuple[Fitted | None, float]:
     """The fit with some clocks in time, and by how much chi-square grows, and what it costs beside; None: nothing."""
     held = fit(reference, apart, rotation, in_time)
-    if held is None:
+    if held is None or not _is_possible(held):
         return None, math.inf
     # at other delays a sample more or less is within both streams
-    grown = (held.cost(free.level) * free.rows / held.rows - free.cost(free.level)) / free.inflation**2
+    grown = held.cost(free.level, held.at) * free.rows / held.rows - free.cost(free.level, free.at)
+    grown /= free.inflation**2
     return held, grown + costs if math.isfinite(grown) else math.inf
 
 
@@ -251,12 +254,38 @@ def _beyond(seconds: float, std: float) -> bool:
     return std < KNOWN_STD_S and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
 
 
+def _is_possible(fitted: Fitted) -> bool:
+    """Whether its clocks stand where they are looked for: what is found beyond, on the way there, is unknown."""
+    late = [fitted.x[LATE], fitted.dvl_late]
+    return bool(np.isfinite(fitted.x).all() and np.abs(late).max() <= LONGEST_S)
+
+
 def _late(clock: Clock) -> str:
     return f"{abs(clock.late):.2f} s {'late' if clock.late > 0.0 else 'early'}"
 
 
+def _is_as_good(motion: Motion, fit: Fit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
+    """Whether a place explains the data about as well as the one that leaves least, and the same data.
+
+    A delay that pushes a bad stretch of the DVL out of the overlap leaves less of the rest, as any other place does.
+    """
+    if _gain(motion, one, closest) < GAIN:
+        return True
+    if closest.rows > AS_MANY * one.rows:
+        return False
+    again = fit(float(one.x[LATE]), float(one.x[APART]), rotation, (), closest)
+    if again is None:
+        return False
+    grown = again.cost(closest.level, again.at) - closest.cost(closest.level, again.at)
+    return 0.5 * grown * min(1.0, _independent(motion, again) / again.rows) < GAIN
+
+
 def _gain(motion: Motion, one: Fitted, other: Fitted) -> float:
     """By how much the log evidence of the other is larger, of samples that are so far apart as to be independent."""
+    return 3.0 * _independent(motion, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
+
+
+def _independent(motion: Motion, fitted: Fitted) -> float:
+    """How many of the references that are compared are so far apart as to be independent."""
     times = motion.reference_times
-    independent = min(float(other.rows), (times[-1] - times[0]) / INDEPENDENT_S)
-    return 3.0 * independent * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
+    return min(float(fitted.rows), float(times[-1] - times[0]) / INDEPENDENT_S)

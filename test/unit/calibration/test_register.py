@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
-from dvl_calib_ros.calibration.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.register.coarse import places
+from dvl_calib_ros.calibration.register.coarse import LONGEST_S, places
 from dvl_calib_ros.calibration.register.motion import Motion, make_motion
 from dvl_calib_ros.calibration.register.registration import Registration, register
 from dvl_calib_ros.simulation.injection import injection
@@ -121,6 +121,43 @@ def test_a_straight_leg_at_one_speed_shows_no_clock():
         found = register(made, np.eye(3), np.zeros(3))
         assert not (found.dvl.is_shown or found.reference.is_shown or found.imu.is_shown)
         assert found.offsets == {} and found.says(Parameters()) == ""
+
+
+def leg_in_moving_water(share: float, seed: int) -> Motion:
+    """A leg at about one speed, in time, whose DVL is on moving water over the last share of it."""
+    times = np.arange(0.0, 400.0, 0.2)
+    rng = np.random.default_rng(seed)
+    roll, slow, slower = (0.05 * np.sin(2.0 * np.pi * times / period + seed) for period in (7.0, 31.0, 83.0))
+    yaw = slow + slower
+    attitudes = rotation_from_rpy(np.column_stack([roll, 0.0 * yaw, yaw]))
+    rates = np.column_stack([np.gradient(roll, times), 0.0 * yaw, np.gradient(yaw, times)])
+    body = np.column_stack([1.5 + 0.03 * np.sin(times / 11.0), 0.02 * np.sin(times / 3.0), 0.0 * yaw])
+    earth = np.einsum("nij,nj->ni", attitudes, body)
+    water = np.einsum("nji,j->ni", attitudes, [0.2, 0.15, 0.0]) * (times > 400.0 * (1.0 - share))[:, None]
+    dvl = body - water + 0.01 * rng.standard_normal(body.shape)
+    reference = earth + 0.036 * rng.standard_normal(body.shape)
+    imu = ImuColumns(times, np.array([quaternion_from_rotation(each) for each in attitudes]), rates)
+    made = make_motion((times, dvl), (times, reference), True, (True,) * 3, imu)
+    assert made is not None
+    return made
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_stretch_of_bad_velocities_is_no_clock_that_pushes_it_out_of_the_overlap(seed):
+    """Less was left of the rest there, and 42 s were taken off clocks that were in time."""
+    found = register(leg_in_moving_water(0.1, seed), np.eye(3), np.zeros(3))
+    assert found is not None
+    assert found.offsets == {} and found.taken_off == {}
+    assert abs(found.dvl.late) < 3.0 and abs(found.reference.late) < 3.0
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_nothing_is_taken_off_where_a_leg_does_not_show_its_clocks(seed):
+    """A delay of 115 s was, which no parameter takes."""
+    found = register(leg_in_moving_water(0.3, seed), np.eye(3), np.zeros(3))
+    assert found is not None
+    assert not found.are_known and found.taken_off == {}
+    assert max(abs(found.dvl.late), abs(found.reference.late)) <= LONGEST_S
 
 
 @pytest.mark.slow
