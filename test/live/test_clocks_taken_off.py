@@ -63,6 +63,7 @@ def test_a_late_reference_is_taken_off_and_calibrated_with(world, bag, tmp_path)
     assert saved["models"]["G2"]["state"][at] == pytest.approx(ARM, abs=0.2)
 
 
+@pytest.mark.slow
 def test_what_was_named_stands(world, bag, tmp_path):
     saved, said = result_of(world, bag, tmp_path / "result.yaml", "reference_time_offset:=0.0")
     assert "CLOCK_TAKEN_OFF" not in said and "a reference whose stamps are 2.5" in said
