@@ -39,6 +39,8 @@ _WIDTH = np.log(4.0)
 _LOGS: Array = np.arange(-6.0, 3.5, 0.35)
 _LOG_LIKELY: Array = -0.5 * (_LOGS / _WIDTH + _WIDTH) ** 2
 _FACTORS: Array = np.exp(_LOGS) / np.sqrt(np.exp(_LOG_LIKELY) @ np.exp(2.0 * _LOGS) / np.exp(_LOG_LIKELY).sum())
+# A block with less than this of another's information has none: rounding left it.
+NOTHING = 1e-9
 # A constant of any size, rad.
 _ANY = 1.0
 # A drift is one from so long on, s.
@@ -222,7 +224,7 @@ def _onto_coefficients(square: Array, times: Array) -> Array:
     """
     onto = np.zeros((N_COEFFICIENTS, N_TERMS))
     onto[: N_TERMS - 2, : N_TERMS - 2] = np.eye(N_TERMS - 2)
-    told = times[times[:, 1] > 0.0]
+    told = times[times[:, 1] > NOTHING * times[:, 1].max()]
     if len(told):
         at = told[:, 0] / told[:, 1]
         span = max(float(at[-1] - at[0]), _SHORTEST_S)

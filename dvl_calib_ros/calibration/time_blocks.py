@@ -59,7 +59,9 @@ class TimeBlocks:
             self._in_last += 1
             return
         if not self.count:
-            self._information, self._vector = np.empty((MOST, *information.shape)), np.empty((MOST, *vector.shape))
+            # written to, so that memory does not grow with the blocks for ten minutes
+            self._information = np.full((MOST, *information.shape), np.nan)
+            self._vector = np.full((MOST, *vector.shape), np.nan)
         if self.count == MOST:
             self.count = MOST // 2
             for each in (self._information, self._vector):

@@ -286,7 +286,7 @@ def assert_survived(fault: Fault, node: Live) -> None:
     if fault.without is not None:
         clean = Offline(PARAMETERS).feed(as_messages(fault.without)).calibrator
         for model in MODELS:
-            np.testing.assert_allclose(saved["models"][model]["state"], clean.state(model).x, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(saved["models"][model]["state"], clean.published(model).x, rtol=0, atol=1e-12)
     else:
         assert_near_truth(saved)
 
