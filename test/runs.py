@@ -10,7 +10,6 @@ import numpy as np
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.results import Estimate
 from dvl_calib_ros.calibration.samples import (
     FRAME_CODES,
     Covariances,
@@ -32,12 +31,6 @@ SECOND = 1_000_000_000
 STRETCH = 512
 # For what is tried sample by sample: as much time in fewer samples.
 ONE_HERTZ = {"dvl_every": 100, "gnss_every": 100, "imu_every": 50}
-
-
-def claimed_covariance(estimate: Estimate) -> np.ndarray:
-    """What the filter alone claims (n, n), before blocks of time raise it."""
-    lowered = estimate.filter_std / estimate.recording_std
-    return estimate.recording_covariance * np.outer(lowered, lowered)
 
 
 @dataclass(frozen=True)

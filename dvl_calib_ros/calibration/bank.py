@@ -285,14 +285,6 @@ class Group:
         self._last_stamp_ns = int(stamps_ns[-1])
         return np.diff(stamps_ns, prepend=before_ns)[:, None, None, None] * 1e-9 * rate
 
-    def inflation(self, name: str) -> Array:
-        """By how much blocks of time show σ of each state (n,) of one model to be larger than the filter's, at least 1.
-
-        That is 1 under a random walk, with which what one block told is forgotten by and by.
-        """
-        index = self.index[name]
-        return np.ones(self._x.shape[1]) if self._scatter is None else self._scatter.found(index).inflation
-
     def state(self, name: str) -> GaussianState:
         """State and covariance of one model; not to be written to."""
         if name not in self._states:  # asked for more than once per sample, live

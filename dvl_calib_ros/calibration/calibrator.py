@@ -35,7 +35,7 @@ from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
 from .observability import convergence, observability
 from .observations import Observations
 from .observe import Observer
-from .parameters import ParameterError, Parameters
+from .parameters import IAC, ParameterError, Parameters
 from .register.registration import Registration
 from .results import Day, Estimate, Result
 from .robust import median
@@ -470,12 +470,17 @@ class Calibrator:
         """State and covariance of one model."""
         return self._estimators[name].state()
 
-    def inflation(self, name: str) -> Array:
-        """By how much blocks of time raise σ of each state (n,) of one model above the filter's own."""
-        return self._estimators[name].inflation
-
     def published(self, name: str) -> GaussianState:
-        """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""
+        """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it.
+
+        Under the parameter ``model: iac`` as the paper's filters say it, which is `state`.
+        """
+        if self.parameters.model == IAC:
+            return self.state(name)
+        return self.next_recording(name)
+
+    def next_recording(self, name: str) -> GaussianState:
+        """As `of_recording`, with σ worth believing of the next recording, whatever is published."""
         state = self.of_recording(name)
         return GaussianState(state.x, state.p + day_covariance(MODELS[name], self.parameters))
 
@@ -502,7 +507,7 @@ class Calibrator:
             state=state,
             covariance=covariance + day_covariance(model, self.parameters),
             recording_covariance=covariance,
-            filter_std=np.sqrt(np.diag(covariance)) / self.inflation(model.name),
+            filter_covariance=self._estimators[model.name].filter_covariance,
             left_open=self._estimators[model.name].left_open,
             used=used,
             gated=gated,

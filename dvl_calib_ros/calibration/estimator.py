@@ -139,17 +139,17 @@ class Estimator(ABC):
 
     @property
     @abstractmethod
-    def inflation(self) -> Array:
-        """By how much blocks of time raise σ of each state (n,) above the filter's own, at least 1."""
-
-    @property
-    @abstractmethod
     def counts(self) -> ModelCounts:
         """What it did with the samples given to it."""
 
     @abstractmethod
     def of_recording(self) -> GaussianState:
         """As `state`, with σ as blocks of time show it."""
+
+    @property
+    def filter_covariance(self) -> Array:
+        """P (n, n) as the filter alone claims it: of an estimator whose `state` is no more than that."""
+        return self.state().p
 
     @abstractmethod
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
@@ -209,11 +209,6 @@ class LinearEstimator(Estimator):
         """As `Estimator`."""
         self._update(self._group)
         return self._group.state(self._model.name)
-
-    @property
-    def inflation(self) -> Array:
-        """As `Estimator`."""
-        return self._group.inflation(self._model.name)
 
     @property
     def heading_deviation(self) -> GaussianState | None:

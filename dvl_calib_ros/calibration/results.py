@@ -25,8 +25,8 @@ class Estimate:
 
     state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n), of the next
     recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
-    more than the filter claims. filter_std: (n,) standard deviations that the filter claims. left_open: (n, n), the
-    part of both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm.
+    more than the filter claims. filter_covariance: (n, n), what the filter alone claims. left_open: (n, n), the part of
+    both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm.
     used, gated: samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent
     filter. heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw
     and of twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
@@ -36,7 +36,7 @@ class Estimate:
     state: Array
     covariance: Array
     recording_covariance: Array
-    filter_std: Array
+    filter_covariance: Array
     left_open: Array
     used: int
     gated: int
@@ -60,6 +60,11 @@ class Estimate:
     def recording_std(self) -> Array:
         """Standard deviations (n,) of this recording."""
         return np.sqrt(np.diag(self.recording_covariance))
+
+    @property
+    def filter_std(self) -> Array:
+        """Standard deviations (n,) that the filter alone claims."""
+        return np.sqrt(np.diag(self.filter_covariance))
 
     @property
     def misalignment(self) -> Array:

@@ -44,6 +44,7 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
         "state": estimate.state.tolist(),
         "covariance": estimate.covariance.tolist(),
         "covariance_of_recording": estimate.recording_covariance.tolist(),
+        "covariance_of_filter": estimate.filter_covariance.tolist(),
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,

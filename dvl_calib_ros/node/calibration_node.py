@@ -323,7 +323,7 @@ class CalibrationNode(AnsweringNode):
         stamp = Time()
         _set_stamp(stamp, calibrator.last_ns)
         parameters, decoder = calibrator.parameters, self._feed.decoder
-        pose = mounting_pose(model, calibrator.published(model.name), parameters, decoder.turns_dvl)
+        pose = mounting_pose(model, calibrator.next_recording(model.name), parameters, decoder.turns_dvl)
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
 
     def _take_off_late_clocks(self) -> None:

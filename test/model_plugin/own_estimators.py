@@ -43,10 +43,6 @@ class MeanRise(Estimator):
         return self._with_mean(self._given.base.of_recording())
 
     @property
-    def inflation(self) -> np.ndarray:
-        return np.append(self._given.base.inflation, 1.0)
-
-    @property
     def counts(self) -> ModelCounts:
         return self._given.base.counts
 

@@ -139,17 +139,14 @@ class DelayFilter(Estimator):
         return self.posterior is not None and bool(self.posterior.shown[BEYOND].any())
 
     @property
-    def inflation(self) -> Array:
-        """By how much blocks of time have raised σ of each state (n,); 1 of what is not claimed."""
+    def filter_covariance(self) -> Array:
+        """As `Estimator`, with what is not known of the heading; its own has been raised by blocks of time."""
         posterior = self.posterior
         if posterior is None or not self.claims:
-            factor, own = np.ones(N_STATE), self._base.inflation
-            factor[: len(own)] = own
-            return factor
+            return self.state().p
         factor = np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
-        variance = np.diag(posterior.state.p)
-        more: Array = factor * np.sqrt(1.0 + np.diag(self.left_open) / np.maximum(variance, 1e-300))
-        return more
+        lowered: Array = posterior.state.p / np.outer(factor, factor)
+        return lowered
 
     @property
     def heading_deviation(self) -> GaussianState | None:
