@@ -36,6 +36,8 @@ from .frames import Array, rpy_from_rotation
 
 # A difference that chance brings more seldom than this is none of chance, over all that is looked at together.
 CHANCE = 0.01
+# Of a mounting: as seldom as a normal error is beyond 4 σ it has moved, beyond 2 σ that is suspicious.
+MOVED, SUSPICIOUS = chi2_sf(16.0, 1), chi2_sf(4.0, 1)
 # An axis that takes more than this share of a turn is the one that it is about.
 ABOUT = 0.9
 # What a vehicle's builder would not have let pass unseen, m: a lever arm taken as known that is off by more turns the
@@ -94,6 +96,17 @@ class Difference:
         d = self.value[at]
         return ChiSquare.of(float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d)), len(at))
 
+    def chance(self, components: NDArray[np.intp] = _ALL) -> float:
+        """How often chance makes as much of some components: of all together, or of the one that stands out most.
+
+        Both, as one angle that moved is little among five that did not; by Bonferroni. 1 if there are none.
+        """
+        at = components[self.compared[components]]
+        if len(at) <= 1:
+            return self.test(at).p if len(at) else 1.0
+        one = chi2_sf(float(((self.value / self.std)[at] ** 2).max()), 1)
+        return min(1.0, 2.0 * min(self.test(at).p, len(at) * one))
+
 
 @dataclass(frozen=True)
 class Change:
@@ -110,22 +123,29 @@ class Comparison:
     """Several calibrations of one DVL.
 
     calibrations: in order of time. pairs: every two. against_rest: each against all others taken together; empty for
-    two. moved, scale_changed, clock_changed: where mounting (turn and lever arm), scale and delay changed. scatter: of
-    all about what is common between the changes of the mounting.
+    two. moved, suspicious: where the mounting (turn and lever arm) changed by more than 4 σ, and by 2 to 4 σ.
+    scale_changed, clock_changed: where scale and delay did. scatter: of all about what is common between the changes of
+    the mounting.
     """
 
     calibrations: tuple[Extrinsics, ...]
     pairs: tuple[Difference, ...]
     against_rest: tuple[Difference, ...]
     moved: tuple[Change, ...]
+    suspicious: tuple[Change, ...]
     scale_changed: tuple[Change, ...]
     clock_changed: tuple[Change, ...]
     scatter: ChiSquare
 
     @property
+    def word(self) -> str:
+        """The answer: moved, suspicious or same."""
+        return "moved" if self.moved else "suspicious" if self.suspicious else "same"
+
+    @property
     def same_mounting(self) -> bool:
-        """Whether the mounting did not move, as far as σ can tell."""
-        return not self.moved
+        """Whether nothing says that the mounting moved, nor makes it suspicious."""
+        return self.word == "same"
 
 
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
@@ -153,12 +173,14 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
         )
     rest = [Difference.between(fused(ordered[:i] + ordered[i + 1 :]), ordered[i]) for i in range(n)] if n > 2 else []
     together, chance = _Together(), CHANCE / (n - 1)
-    moved = _changes(ordered, MOUNTING, chance, together)
+    changes = _changes(ordered, MOUNTING, SUSPICIOUS / (n - 1), together)
+    moved = [change for change in changes if change.difference.chance(MOUNTING) < MOVED / (n - 1)]
     return Comparison(
         calibrations=tuple(ordered),
         pairs=tuple(pairs),
         against_rest=tuple(rest),
         moved=tuple(moved),
+        suspicious=tuple(change for change in changes if change not in moved),
         scale_changed=tuple(_changes(ordered, ONLY_SCALE, chance, together)),
         clock_changed=tuple(_changes(ordered, ONLY_CLOCK, chance, together)),
         scatter=_scatter(ordered, [change.first_after for change in moved], together),
@@ -234,14 +256,14 @@ def _changes(
     best, at = None, 0
     for k in range(1, len(series)):
         difference = Difference.between(together(series[:k]), together(series[k:]))
-        test = difference.test(components)
         # by how surprising it is: where few components are compared, a smaller sum is as much. Beyond what a double
         # holds as a probability the sum itself decides
-        if test.freedom and test.p < chance and (best is None or (test.p, -test.value) < (best[1].p, -best[1].value)):
-            best, at = (difference, test), k
+        surprise = difference.chance(components), -difference.test(components).value
+        if surprise[0] < chance and (best is None or surprise < best):
+            best, found, at = surprise, difference, k
     if best is None:
         return []
-    change = Change(best[0], series[at - 1], series[at])
+    change = Change(found, series[at - 1], series[at])
     before, after = (_changes(part, components, chance, together) for part in (series[:at], series[at:]))
     return [*before, change, *after]
 
@@ -266,7 +288,8 @@ def _scatter(series: list[Extrinsics], starts: list[Extrinsics], together: _Toge
 
 def sentences(comparison: Comparison) -> list[str]:
     """What there is to say, the mounting first."""
-    said = [_moved(change) for change in comparison.moved] or [_same(comparison)]
+    said = [_moved(change) for change in comparison.moved]
+    said = said + [_suspicious(change) for change in comparison.suspicious] or [_same(comparison)]
     said += [
         f"The scale has changed by {100 * change.difference.value[SCALE]:+.2f} % ± "
         f"{100 * change.difference.std[SCALE]:.2f} % {_between(change)}: the speed of sound, or the DVL's settings."
@@ -305,6 +328,15 @@ def _same(comparison: Comparison) -> str:
 def _moved(change: Change) -> str:
     """The sentence on a mounting that moved."""
     return f"The mounting has moved {moved_in_words(change.difference)} {_between(change)}."
+
+
+def _suspicious(change: Change) -> str:
+    """The sentence on a mounting that may have moved."""
+    often = 1.0 / change.difference.chance(MOUNTING)
+    return (
+        f"The mounting may have moved {moved_in_words(change.difference)} {_between(change)}; chance makes as much of "
+        f"one that did not in 1 of {often:.0f} comparisons. Calibrate once more before you rely on either."
+    )
 
 
 def moved_in_words(difference: Difference) -> str:
@@ -389,6 +421,7 @@ def remarks(comparison: Comparison) -> list[str]:
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """`compare --json`: SI units, turns about the body's axes."""
     return {
+        "verdict": comparison.word,
         "same_mounting": comparison.same_mounting,
         "says": sentences(comparison),
         "remarks": remarks(comparison),
@@ -418,7 +451,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
                 }
                 for change in getattr(comparison, name)
             ]
-            for name in ("moved", "scale_changed", "clock_changed")
+            for name in ("moved", "suspicious", "scale_changed", "clock_changed")
         },
         "scatter": comparison.scatter._asdict(),
     }

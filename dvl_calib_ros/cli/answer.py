@@ -197,7 +197,7 @@ def next_commands(
     named = " ".join(shlex.quote(str(bag)) for bag in bags)
     given = "".join(f" {shlex.quote(option)}" for option in options)
     verdict = replayed.result.verifications[replayed.result.selected].verdict.value
-    if verdict == "reject" and replayed.recordings is not None and not replayed.recordings.same_mounting:
+    if verdict == "reject" and replayed.recordings is not None and replayed.recordings.moved:
         return [f"dvl-calib compare {named}{given}", f"dvl-calib doctor {named}"]
     if verdict == "reject":
         return [f"dvl-calib doctor {named}", f"dvl-calib diagnose {named}{given}"]

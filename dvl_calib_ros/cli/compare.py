@@ -4,7 +4,8 @@ Each RESULT is a result file of the node or of replay --save, or a bag, which is
 the whole corrected mounting, with lever arm, scale and delay, by the σ that each states; also of different models and
 configured mountings.
 
-Exit code 0: the same mounting within σ. 1: it has moved. 2: bad usage or input.
+Exit code 0: the same mounting within 2 σ. 1: it has moved, by more than 4 σ. 2: bad usage or input. 3: suspicious,
+between the two.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except BrokenPipeError:  # | head: the answer is the exit code all the same
         give_up(sys.stdout)
-    return 0 if comparison.same_mounting else 1
+    return {"same": 0, "moved": 1, "suspicious": 3}[comparison.word]
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -107,7 +108,8 @@ def _print(comparison: Comparison) -> None:
 
     common.print_warnings(remarks(comparison))
     out = common.console()
-    word, colour = ("same", "green") if comparison.same_mounting else ("moved", "red")
+    word = comparison.word
+    colour = {"same": "green", "suspicious": "yellow", "moved": "red"}[word]
     first, *others = sentences(comparison)
     out.print(f"[bold {colour}]{word}[/]: {escape(printable(first))}")
     for sentence in others:

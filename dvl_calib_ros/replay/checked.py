@@ -12,7 +12,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from ..calibration.comparison import Comparison, Difference, compare, moved_in_words, sentences
+from ..calibration.comparison import (
+    CHANCE,
+    MOUNTING,
+    Comparison,
+    Difference,
+    compare,
+    moved_in_words,
+    sentences,
+)
 from ..calibration.dropouts import DROPOUT_NS
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.findings import Finding, finding
@@ -63,11 +71,12 @@ class Recordings:
         if self.comparison is None:
             return found
         said = sentences(self.comparison)
-        moved = said[: len(self.comparison.moved)]
-        found += [
-            (Word.REJECT, f"{_decapitalised(sentence)}: all together are averaged, which is the mounting of neither")
-            for sentence in moved
-        ]
+        mountings = [*self.comparison.moved, *self.comparison.suspicious]
+        surely = CHANCE / (len(self.comparison.calibrations) - 1)
+        for change, sentence in zip(mountings, said, strict=False):
+            rejected = change.difference.chance(MOUNTING) < surely
+            averaged = ": all together are averaged, which is the mounting of neither" if rejected else ""
+            found.append((Word.REJECT if rejected else Word.MARGINAL, f"{_decapitalised(sentence)}{averaged}"))
         if self.comparison.clock_changed and "time_offset" in MODELS[model].state_names and not parted:
             found.append(
                 (
@@ -76,8 +85,8 @@ class Recordings:
                     "other so closely: calibrate each by itself",
                 )
             )
-        n_moved = max(1, len(moved))  # without any there is one sentence that says so
-        scales = said[n_moved : n_moved + len(self.comparison.scale_changed)]
+        n_mountings = max(1, len(mountings))  # without any there is one sentence that says so
+        scales = said[n_mountings : n_mountings + len(self.comparison.scale_changed)]
         found += [(Word.MARGINAL, _decapitalised(sentence)) for sentence in scales]
         return found
 
@@ -276,5 +285,5 @@ def _contradiction(initial: Extrinsics, found: Extrinsics) -> str | None:
     """In what the mounting that data alone show differs from an initial one; None if it does not."""
     if not (initial.shown[:6] & found.shown[:6]).any():
         return None
-    comparison = compare([initial, found])
-    return None if comparison.same_mounting else moved_in_words(Difference.between(initial, found))
+    difference = Difference.between(initial, found)
+    return moved_in_words(difference) if difference.chance(MOUNTING) < CHANCE else None

@@ -73,8 +73,8 @@ def write_comparison_report(path: Path, comparison: Comparison) -> None:
             "subtitle": ", ".join(each.name for each in comparison.calibrations),
             "written": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"),
             "verdict": {
-                "word": "same mounting" if comparison.same_mounting else "moved",
-                "kind": "accept" if comparison.same_mounting else "reject",
+                "word": "same mounting" if comparison.same_mounting else comparison.word,
+                "kind": {"same": "accept", "suspicious": "marginal", "moved": "reject"}[comparison.word],
                 "reasons": [first, *others],
             },
             "warnings": remarks(comparison),

@@ -19,13 +19,13 @@ SHORT = ("--trajectory", "box", "--duration", "120", "--gnss-std", "0.05")
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    """Bags a, b of one mounting and c of one that is turned by 1°, with result files (in JSON, which is YAML, too)."""
+    """Bags a, b of one mounting and c of one that is turned by 2°, d by 0.8°; result files (JSON, which is YAML)."""
     folder = tmp_path_factory.mktemp("compare")
-    for seed, (name, yaw) in enumerate((("a", "2"), ("b", "2"), ("c", "3"))):
+    for seed, (name, yaw) in enumerate((("a", "2"), ("b", "2"), ("c", "4"), ("d", "2.8"))):
         bag = str(folder / name)
         assert main(["simulate", bag, *SHORT, "--seed", str(seed), "--misalignment", "1", "-1", yaw]) == 0
         assert main(["replay", bag, "--save", f"{bag}.yaml"]) == 0
-    for day, name in enumerate("abc"):
+    for day, name in enumerate("abcd"):
         document = parsed((folder / f"{name}.yaml").read_text())
         for key in document["time_span"]:
             document["time_span"][key] += day * 86_400_000_000_000
@@ -44,6 +44,15 @@ def test_the_same_mounting_is_exit_code_0_and_a_moved_one_1_with_a_sentence(plac
     assert "Each less all others together" in said
 
 
+def test_what_differs_by_some_three_sigma_is_suspicious_and_exit_code_3(place, tmp_path, capsys):
+    out, page = tmp_path / "c.json", tmp_path / "c.html"
+    asked = [str(place / "b.yaml"), str(place / "d.yaml"), "--json", str(out), "--report", str(page)]
+    assert main(["compare", *asked]) == 3
+    assert capsys.readouterr().out.startswith("suspicious: The mounting may have moved by")
+    assert json.loads(out.read_text())["verdict"] == "suspicious"
+    assert "suspicious" in page.read_text()
+
+
 def test_a_bag_is_calibrated_to_be_compared(place, capsys):
     assert main(["compare", str(place / "a.yaml"), str(place / "b")]) == 0
     assert main(["compare", str(place / "a"), str(place / "c")]) == 1
@@ -59,7 +68,7 @@ def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     assert document["same_mounting"] is False and len(document["pairs"]) == 3
     (moved,) = document["moved"]
     assert (moved["last_before"], moved["first_after"]) == ("b.yaml", "c.yaml")
-    assert abs(moved["value"]["turn_z"] - 0.01745) < 3 * moved["std"]["turn_z"]
+    assert abs(moved["value"]["turn_z"] - 0.0349) < 3 * moved["std"]["turn_z"]
     text = page.read_text()
     assert document["says"][0] in text and text.count("<img") >= 2
     assert main(["compare", *results, "--report", str(png)]) == 1

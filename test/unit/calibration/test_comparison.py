@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.comparison import MOUNTING, Difference, compare, fused, remarks, sentences
+from dvl_calib_ros.calibration.comparison import (
+    MOUNTING,
+    Difference,
+    compare,
+    comparison_document,
+    fused,
+    remarks,
+    sentences,
+)
 from dvl_calib_ros.calibration.error_model import corrected_mounting
 from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of, rotation_of, turn_between
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
@@ -78,10 +86,24 @@ def test_a_dvl_that_was_put_elsewhere_is_said_by_its_lever_arm():
 
 
 @pytest.mark.parametrize("n", [2, 5])
-def test_what_only_chance_makes_differ_is_the_same_in_99_of_100(n):
+def test_what_only_chance_makes_differ_is_the_same_in_95_of_100_and_has_never_moved(n):
     rng = np.random.default_rng(n)
-    moved = sum(not compare([noisy(day, rng) for day in range(n)]).same_mounting for _ in range(100))
-    assert moved <= 4  # of 100 at 1 % or less: more than 4 by chance four times in a thousand
+    words = [compare([noisy(day, rng) for day in range(n)]).word for _ in range(200)]
+    assert words.count("moved") == 0  # of 200 at 0.006 % or less
+    assert words.count("suspicious") <= 18  # of 200 at 4.6 % or less: more by chance in one of a hundred
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "word"), [(1.0, "same"), (2.5, "same"), (3.2, "suspicious"), (4.2, "suspicious"), (4.8, "moved")]
+)
+def test_one_angle_that_differs_by_some_sigma_is_no_chance_among_five_that_do_not(sigmas, word):
+    std = Difference.between(extrinsics(0), extrinsics(1)).std[2]
+    found = compare([extrinsics(0), extrinsics(1, (0.0, 0.0, math.degrees(sigmas * std)))])
+    assert found.word == word
+    assert sentences(found)[0].startswith(
+        {"same": "The same", "suspicious": "The mounting may", "moved": "The mounting has"}[word]
+    )
+    assert comparison_document(found)["verdict"] == word
 
 
 def test_chi_square_of_a_pair_and_of_each_against_the_rest_is_that_of_the_covariances():
