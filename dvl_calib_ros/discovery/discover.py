@@ -14,11 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.directions import Directions
+from ..calibration.delay.rows import ImuColumns
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.register.arrival import limit_s
+from ..calibration.register.motion import Motion, in_order, make_motion
+from ..calibration.register.readings import (
+    CLEARLY,
+    FITS,
+    Agreement,
+    ImuFrame,
+    Reading,
+    Readings,
+    best_rotation,
+    nominal_rpy,
+    turns_right,
+)
 from ..calibration.samples import VelocityFrame
+from ..calibration.screening import unit_quaternions
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
@@ -27,22 +40,6 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from . import choose
 from .clocks import FoundClocks, find_clocks, in_time
-from .fit import (
-    CLEARLY,
-    FITS,
-    Fit,
-    Hypothesis,
-    ImuFrame,
-    Together,
-    at_delays,
-    best_rotation,
-    explained,
-    fit,
-    nominal_rpy,
-    rotation_enu_from_body,
-    together,
-    turns_right,
-)
 from .transforms import FrameTree, Placed
 
 # A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
@@ -80,8 +77,8 @@ class Discovery:
 
     found: what was found and where; notes: what was passed over; contradictions: where the recording's data do not
     bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`, beside
-    `clocks.offsets`, which a calibration takes off and a diagnosis names. fit: how
-    well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
+    `clocks.offsets`, which a calibration takes off and a diagnosis names. agreement:
+    how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
     knows_imu: whether it is known in which axes the IMU measures.
     """
 
@@ -91,7 +88,7 @@ class Discovery:
     notes: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
-    fit: Fit | None = None
+    agreement: Agreement | None = None
     reference_frame: VelocityFrame | None = None
     knows_imu: bool = False
     clocks: FoundClocks | None = None
@@ -165,7 +162,8 @@ class _Search:
         self._found: list[str] = []
         self._notes: list[str] = list(self._tree.problems)
         self._contradictions: list[str] = []
-        self._chosen: Fit | None = None
+        self._chosen: Agreement | None = None
+        self._readings: Readings  # of DVL and reference, once these are compared
 
     def run(self) -> Discovery:
         topics = self._topics()
@@ -248,9 +246,9 @@ class _Search:
         elif known is None:
             self._mounting_from_motion(dvl, turned)
         if chosen is not None and reference is not None:
-            turned = chosen.hypothesis.turned
-            self._take(chosen, known, imu_frames, dvl, reference, imu)
-            self._measure_noise(chosen, known, (dvl, reference, imu))
+            turned = chosen.reading.turned
+            self._take(chosen, known, imu_frames, reference, imu)
+            self._measure_noise(chosen, known, dvl, reference)
         elif imu_frames and imu is not None:
             self._take_imu(imu_frames[0], imu)
         if self._parameters.dvl_axes == FROM_MESSAGE and turned != self._turned_by_message(dvl):
@@ -359,9 +357,10 @@ class _Search:
         declared = self._declared_reference(reference)
         if declared is not None and declared.frame is VelocityFrame.BODY:
             return declared.points_down
-        turns = None if imu is None or imu_frame is None else turns_right(reference, imu, imu_frame)
-        if turns is not None:
-            return turns
+        if imu is not None and imu_frame is not None and reference.rates is not None:
+            turns = turns_right(reference.stamps_s, reference.rates, _imu_columns(imu), imu_frame)
+            if turns is not None:
+                return turns
         world = frame_named(reference.world, ())  # of the pose: a body in NED is forward-right-down by custom
         return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
 
@@ -381,7 +380,7 @@ class _Search:
         if placed is not None and placed.source:
             return True
         fit = self._chosen  # a reference in the body agrees whatever the IMU says
-        return fit is not None and fit.hypothesis.reference is not VelocityFrame.BODY and fit.best_left < FITS
+        return fit is not None and fit.reading.reference is not VelocityFrame.BODY and fit.best_left < FITS
 
     def _imu_frames(self, imu: Look | None) -> list[ImuFrame]:
         """How the IMU's data may be meant, the likeliest first."""
@@ -413,10 +412,12 @@ class _Search:
         turned: bool,
         imu_frames: Sequence[ImuFrame],
         placed: Placed | None,
-    ) -> Fit | None:
-        data = together(dvl, reference, imu)
-        if data is None:
+    ) -> Agreement | None:
+        position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
+        motion = _motion(dvl, reference, imu)
+        if motion is None:
             return None
+        self._readings = Readings(motion, position)
         declared = self._declared_reference(reference)
         fixed = self._parameters.gnss_frame != FROM_FRAME_ID
         references = [declared.frame] if fixed and declared is not None else list(USUAL)
@@ -425,57 +426,46 @@ class _Search:
         imus: list[ImuFrame | None] = [*imu_frames] or [None]
         down = {each: self._points_down(reference, imu, each) for each in imus}
         in_body = VelocityFrame.BODY
-        hypotheses = [
-            Hypothesis(frame, each, turn, frame is in_body and down[each])
+        tried = [
+            Reading(frame, each, turn, frame is in_body and down[each])
             for frame in references
             for each in imus
             for turn in turns
         ]
-        position = None if placed is None else placed.position - self._reference_position(reference)
-        fits = fit(data, hypotheses, None if known is None else known.T, position)
-        if not fits:
+        mounting = None if known is None else known.T
+        found = self._readings.agreements(tried, mounting)
+        if not found:
             return None
-        first = imu_frames[0] if imu_frames else None
+        first = imus[0]
         named = USUAL[0] if declared is None else declared.frame
-        wanted = Hypothesis(named, first, turned, named is in_body and down[first])
-        decided = _decided(fits, wanted, declared is not None)
-        own = next((each for each in fits if each.hypothesis == wanted), None)
+        wanted = Reading(named, first, turned, named is in_body and down[first])
+        decided = _decided(found, wanted, declared is not None)
+        own = next((each for each in found if each.reading == wanted), None)
         if decided is None:
             return None
-        if own is None or replace(own.hypothesis, turned=decided.hypothesis.turned) == decided.hypothesis:
-            declared_fit = own or decided
-            return declared_fit if said else self._upright(declared_fit, data, known, (dvl, reference, imu))
-        to_body = decided.hypothesis.reference is in_body
-        if to_body and declared is not None and declared.frame is not in_body and not self._is_in_body(data, decided):
+        if own is None or replace(own.reading, turned=decided.reading.turned) == decided.reading:
+            as_declared = own or decided
+            return as_declared if said else self._upright(as_declared, mounting)
+        to_body = decided.reading.reference is in_body
+        if to_body and declared is not None and declared.frame is not in_body and not self._is_in_body(decided):
             return own
-        mounting = None if known is None else known.T
-        delayed = at_delays(dvl, reference, imu)
-        best, as_declared = (explained(delayed, each.hypothesis, mounting).left for each in (decided, own))
-        return decided if best < CLEARLY * as_declared else own
+        best, given = (self._readings.registered(each.reading, mounting)[0] for each in (decided, own))
+        return decided if best < CLEARLY * given else own
 
-    def _upright(self, decided: Fit, data: Together, known: Array | None, looks: tuple[Look, Look, Look | None]) -> Fit:
-        """The fit, or that with the DVL's axes the other way up if only that leaves little with any lever arm.
+    def _upright(self, decided: Agreement, mounting: Array | None) -> Agreement:
+        """That with the DVL's axes the other way up if only that leaves little with any lever arm.
 
         A vehicle that goes ahead hardly shows which way is up; its turns do, by the lever arm that they ask for.
         """
-        mounting = np.eye(3) if known is None else known.T
-        other = replace(decided.hypothesis, turned=not decided.hypothesis.turned)
-        first = fit(data, [decided.hypothesis, other], mounting)[0]
-        if first.hypothesis != other:
+        other = replace(decided.reading, turned=not decided.reading.turned)
+        as_it_is = np.eye(3) if mounting is None else mounting
+        if self._readings.agreements([decided.reading, other], as_it_is)[0].reading != other:
             return decided
-        delayed = at_delays(*looks)
-        best, as_declared = (explained(delayed, each, mounting).left for each in (other, decided.hypothesis))
-        return fit(data, [other], None if known is None else known.T)[0] if best < BETTER * as_declared else decided
+        best, given = (self._readings.registered(each, as_it_is)[0] for each in (other, decided.reading))
+        return self._readings.agreements([other], mounting)[0] if best < BETTER * given else decided
 
-    def _is_in_body(self, data: Together, fit: Fit) -> bool:
-        """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
-        imu = fit.hypothesis.imu
-        if data.orientation is None or imu is None:
-            return True
-        directions = Directions()
-        dvl = data.dvl @ FLU_FROM_FRD if fit.hypothesis.turned else data.dvl
-        directions.add(dvl @ fit.rotation_dvl_from_body, rotation_enu_from_body(data.orientation, imu))
-        if directions.stay_in_the_body:
+    def _is_in_body(self, found: Agreement) -> bool:
+        if self._readings.is_in_body(found):
             return True
         self._contradictions.append(
             "DVL and reference agree as if both were in the body, and so they would if both were in the earth's frame"
@@ -484,17 +474,16 @@ class _Search:
 
     def _take(
         self,
-        chosen: Fit,
+        chosen: Agreement,
         known: Array | None,
         imu_frames: Sequence[ImuFrame],
-        dvl: Look,
         reference: Look,
         imu: Look | None,
     ) -> None:
-        """Write what a fit says into the parameters."""
-        hypothesis, parameters = chosen.hypothesis, self._parameters
+        """Write what a reading says into the parameters."""
+        reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
-        taken = DeclaredFrame(hypothesis.reference, hypothesis.reference_turned)
+        taken = DeclaredFrame(reading.reference, reading.reference_turned)
         if imu is None and declared is None and chosen.best_left >= FITS:  # no frame could be tried but the body's
             self._notes.append(f"{reference.topic}: nothing says in which frame it is, and without an IMU no data do")
         elif taken != declared:
@@ -511,35 +500,34 @@ class _Search:
                 )
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
-        if hypothesis.imu is not None and imu_frames:
-            self._take_imu(hypothesis.imu, None if hypothesis.imu is imu_frames[0] else reference)
+        if reading.imu is not None and imu_frames:
+            self._take_imu(reading.imu, None if reading.imu is imu_frames[0] else reference)
         found = chosen.rotation_dvl_from_body.T
         if known is None:
             if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-                delayed = at_delays(dvl, reference, imu)
-                as_it_is, turned = (explained(delayed, hypothesis, mounting) for mounting in (np.eye(3), None))
-                if turned.left < CLEARLY * as_it_is.left:
+                left, _ = self._readings.registered(reading, np.eye(3))
+                turned_left, rotation = self._readings.registered(reading, None)
+                if turned_left < CLEARLY * left:
                     agree = "where DVL and reference agree best"
-                    rpy = nominal_rpy(turned.rotation_dvl_from_body.T)
+                    rpy = nominal_rpy(rotation.T)
                     # a roll that a level vehicle hardly shows is none, unless the data need it
                     level = (0.0, *rpy[1:])
-                    as_level = explained(delayed, hypothesis, rotation_from_rpy(level).T)
-                    self._mounting_found(level if BETTER * as_level.left <= turned.left else rpy, agree)
+                    level_left, _ = self._readings.registered(reading, rotation_from_rpy(level).T)
+                    self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
         elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
             self._contradictions.append(
                 f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "
                 f"{_degrees(nominal_rpy(found))}: try -p mounting_rpy:={_option(nominal_rpy(found))}"
             )
 
-    def _measure_noise(self, chosen: Fit, known: Array | None, looks: tuple[Look, Look, Look | None]) -> None:
+    def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
         """The noise of a reference that claims none, or as positions one that its velocities do not have."""
         if self._gives("gnss_aided_std") or self._gives("use_message_covariance") or chosen.best_left > FITS:
             return
-        dvl, reference, _ = looks
         is_position = VELOCITY_TYPES[reference.msgtype].is_position
         if not (is_position or math.isnan(reference.claimed_std)):
             return
-        best = explained(at_delays(*looks), chosen.hypothesis, None if known is None else known.T).left
+        best, _ = self._readings.registered(chosen.reading, None if known is None else known.T)
         # of a lever arm and a delay that are yet to be found a part stays in
         left = max(min(best, chosen.best_left), 0.5 * chosen.best_left)
         shown = max(left * dvl.speed / (math.sqrt(3.0) * TRIMMED), QUIETEST)
@@ -607,32 +595,47 @@ class _Search:
             self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
 
 
-def _decided(fits: Sequence[Fit], wanted: Hypothesis, declared: bool) -> Fit | None:
-    """The fit of what is declared, unless another reading of the data fits clearly better.
+def _decided(found: Sequence[Agreement], wanted: Reading, declared: bool) -> Agreement | None:
+    """That of what is declared, unless another reading of the data found clearly better.
 
     None if what is declared cannot be tried, for want of an attitude: then it stands.
 
     declared: the recording says the reference's frame; else the usual order decides between frames that fit alike.
     """
-    best = fits[0]
-    own = [each for each in fits if each.hypothesis == wanted]
+    best = found[0]
+    own = [each for each in found if each.reading == wanted]
     if declared and not own:
         return None
     if own and not (best.left < CLEARLY * own[0].left and best.left < FITS):
         return own[0]
     if declared or best.left >= FITS:
         return best
-    alike = [each for each in fits if CLEARLY * each.left <= best.left]
-    return min(alike, key=lambda each: (USUAL.index(each.hypothesis.reference), fits.index(each)))
+    alike = [each for each in found if CLEARLY * each.left <= best.left]
+    return min(alike, key=lambda each: (USUAL.index(each.reading.reference), found.index(each)))
 
 
 def _difference(dvl: Look, reference: Look) -> float | None:
     """What no rotation explains of the difference of two velocities, both taken as in the body."""
-    data = together(dvl, reference, None)
-    if data is None:
+    motion = _motion(dvl, reference, None)
+    if motion is None:
         return None
-    fits = fit(data, [Hypothesis(VelocityFrame.BODY, None, False)], None)
-    return fits[0].best_left if fits else None
+    found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY, None, False)], None)
+    return found[0].best_left if found else None
+
+
+def _motion(dvl: Look, reference: Look, imu: Look | None) -> Motion | None:
+    """What was looked at, as messages have it; None where there is too little."""
+    columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
+    if imu is not None and imu.has_orientation:
+        columns = _imu_columns(imu)
+    measured = True, True, bool(reference.values[:, 2].any())
+    own, other = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
+    return make_motion(own, other, False, measured, columns)
+
+
+def _imu_columns(imu: Look) -> ImuColumns:
+    times, values = in_order(imu.stamps_s, imu.values)
+    return ImuColumns(times, unit_quaternions(values[:, :4]), values[:, 4:7])
 
 
 def _degrees(rpy: Iterable[float]) -> str:

@@ -13,9 +13,9 @@ import numpy as np
 from ..calibration.findings import Finding, Severity
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
+from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
-from ..discovery.fit import FITS
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look
 from ..recordings.recorded import Recorded
@@ -237,9 +237,9 @@ def _disagreement(discovery: Discovery, noise: float) -> list[Finding]:
 
     noise: of the reference per axis, as a share of the speed.
     """
-    if discovery.fit is None or discovery.fit.best_left**2 - 3.0 * noise**2 < FITS**2:
+    if discovery.agreement is None or discovery.agreement.best_left**2 - 3.0 * noise**2 < FITS**2:
         return []
-    return [named("DOCTOR_DISAGREE", left=discovery.fit.best_left)]
+    return [named("DOCTOR_DISAGREE", left=discovery.agreement.best_left)]
 
 
 _NEEDS = {

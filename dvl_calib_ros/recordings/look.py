@@ -19,7 +19,7 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.robust import median
-from ..calibration.samples import Index, Mask, Stamps
+from ..calibration.samples import Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
@@ -273,23 +273,3 @@ def _differences(messages: Iterable[tuple[int, int, Any]]) -> list[tuple[int, in
                 (arrival, log_ns, SimpleNamespace(velocity=velocity, header=header, covariance=fixed.covariance))
             )
     return found
-
-
-def comparable(a: Look, at_s: Array, longest_gap_s: float = 1.5) -> tuple[Array, Mask]:
-    """Columns of a look at other times: (M, k) and whether they lie between two samples that are close (M,)."""
-    n = len(a.stamps_s)
-    if n < 2:
-        return np.full((len(at_s), a.values.shape[1]), np.nan), np.zeros(len(at_s), dtype=bool)
-    after = np.clip(np.searchsorted(a.stamps_s, at_s), 1, n - 1)
-    t0, t1 = a.stamps_s[after - 1], a.stamps_s[after]
-    near = (t1 - t0 <= longest_gap_s) & (at_s >= t0) & (at_s <= t1) & (t1 > t0)
-    share = np.divide(at_s - t0, t1 - t0, out=np.zeros(len(at_s)), where=t1 > t0)[:, None]
-    before, later = a.values[after - 1], a.values[after].copy()
-    if a.msgtype == IMU_TYPE:  # the shorter way round; samples are close, so that a straight line will do
-        other_way = (before[:, :4] * later[:, :4]).sum(axis=1) < 0.0
-        later[other_way, :4] *= -1.0
-    values = before + share * (later - before)
-    if a.msgtype == IMU_TYPE:
-        with np.errstate(divide="ignore", invalid="ignore"):  # an orientation of zeros is none, and becomes nan
-            values[:, :4] /= np.linalg.norm(values[:, :4], axis=1, keepdims=True)
-    return values, near

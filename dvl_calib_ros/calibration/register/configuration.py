@@ -67,17 +67,18 @@ def fitting_configuration(
                 "them in its own axes)"
             )
     curves = Curves(motion)
-    if given is not None and _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) < WRONG_FROM:
+    as_given = _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given is not None else 1.0
+    if as_given < WRONG_FROM:
+        assert given is not None
         return _flipped(motion, curves, nominal, lever_arm, given.spread)
-    as_given = min((_left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given else math.inf), 1.0)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
         fit = Fit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
         # the mountings that have a name, and whichever fits
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
-        each = [_nearest(fit, rotation) for rotation in likely]
-        if (turned := each[1]) is not None and _misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
+        each = [nearest(fit, rotation) for rotation in likely]
+        if (turned := each[1]) is not None and misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
             also_turned.add(frame)
         if some := [one for one in each if one is not None]:
             found[frame] = min(some, key=lambda one: one.level)
@@ -85,25 +86,28 @@ def fitting_configuration(
         return ""
     # of two that fit alike the frame given is the likelier
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
-    if found[best].left > min(FITS_BELOW, BETTER_BY * as_given):
+    if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return ""
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
 
-def _nearest(fit: Fit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM) -> Fitted | None:
+def nearest(fit: Fit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM) -> Fitted | None:
     """The best with a DVL that is late by no more than a calibration finds; None without any."""
     each = (fit(0.0, late, rotation_body_from_dvl, held) for late in LATE_S)
     found = [one for one in each if one is not None and np.isfinite(one.x).all()]
     return min(found, key=lambda one: one.level, default=None)
 
 
-def _misfit(one: Fitted, nominal: Array) -> float:
-    return _left(one.left, float(one.x[SCALE]), one.rotation_body_from_dvl, nominal)
+def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
+    """What is left, as a share of the speed, with a mounting (3, 3): what a turn explains that is no misalignment is.
+
+    left: as another measure than its own has it.
+    """
+    return _left(one.left if left is None else left, float(one.x[SCALE]), one.rotation_body_from_dvl, nominal)
 
 
 def _left(left: float, scale: float, rotation: Array, nominal: Array) -> float:
-    """What is left with the mounting given: what is explained by a turn that is none of a misalignment is not."""
-    turned = _angle(rotation, nominal)
+    turned = angle_between(rotation, nominal)
     is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
     return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
 
@@ -126,7 +130,7 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, s
     fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
     found = []
     for rotation, held in ((nominal, (REFERENCE,)), (nominal @ FLU_FROM_FRD, WITHOUT_ARM)):
-        near = _nearest(quick, rotation, held)
+        near = nearest(quick, rotation, held)
         found.append(None if near is None else fit(0.0, near.dvl_late, rotation, held))
     given, turned = found
     if given is None or turned is None or turned.level > AS_WELL * spread:
@@ -142,7 +146,7 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, s
 
 def _named(declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool) -> str:
     """also_turned: the axes of the body turned round fit as well."""
-    same_frame, as_given = best is declared, _angle(rotation, nominal) < SAME_WITHIN
+    same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
     if same_frame and as_given:  # a large misalignment, for the calibration to find
         return ""
     frame, body = best.value, VelocityFrame.BODY
@@ -155,9 +159,9 @@ def _named(declared: VelocityFrame, best: VelocityFrame, rotation: Array, nomina
     if as_given:  # the frame explains it
         if earth and not same_frame and also_turned:
             otherwise = ", or the IMU's orientation looks like NED (imu_frame: ned): only sway tells these apart"
-    elif not same_frame and earth and _angle(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
+    elif not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
         about, parameters = ["the IMU's orientation looks like NED, forward-right-down"], {"imu_frame": "ned"}
-    elif _angle(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
+    elif angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
         about.append("the DVL's axes look forward-right-down")
         parameters["dvl_axes"] = "frd"
     else:
@@ -171,9 +175,9 @@ def _named(declared: VelocityFrame, best: VelocityFrame, rotation: Array, nomina
 def _as_drawn(rotation: Array) -> Array:
     """The rotation by multiples of `DRAWN` that a mounting (3, 3) is the same as; itself if it is of none."""
     drawn = rotation_from_rpy(np.round(rpy_from_rotation(rotation) / DRAWN) * DRAWN)
-    return drawn if _angle(rotation, drawn) < SAME_WITHIN else rotation
+    return drawn if angle_between(rotation, drawn) < SAME_WITHIN else rotation
 
 
-def _angle(a: Array, b: Array) -> float:
+def angle_between(a: Array, b: Array) -> float:
     """Angle of the rotation between two rotations (3, 3), rad."""
     return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(a.T @ b)) - 1.0))))

@@ -55,9 +55,9 @@ def far_clocks(motion: Motion, rotation_dvl_from_body: Array) -> Far | None:
     body = velocity @ rotation_dvl_from_body
     reference_times, reference = motion.reference_times, motion.reference
     own, others = _steps(dvl_times), _steps(reference_times)
-    known, covered = (_covered(t, at).astype(float) for t, at in ((reference_times, others), (dvl_times, own)))
+    known, is_own = (covered(t, at).astype(float) for t, at in ((reference_times, others), (dvl_times, own)))
     late, is_far = lag(
-        _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0], known, covered
+        _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0], known, is_own
     )
     if is_far:
         return Far("the DVL's", "the reference's", late)
@@ -66,13 +66,13 @@ def far_clocks(motion: Motion, rotation_dvl_from_body: Array) -> Far | None:
     at = np.arange(max(dvl_times[0] - late, reference_times[0]), min(dvl_times[-1] - late, reference_times[-1]), STEP_S)
     if not len(at):
         return None
-    course: Series = (_at(reference_times, reference, at)[:, :2] @ [1.0, 1j]) * np.conj(
-        _at(dvl_times, body, at + late)[:, :2] @ [1.0, 1j]
+    course: Series = (velocity_at(reference_times, reference, at)[:, :2] @ [1.0, 1j]) * np.conj(
+        velocity_at(dvl_times, body, at + late)[:, :2] @ [1.0, 1j]
     )
     turned = _steps(motion.imu.times)
     rotation, _ = attitude_at(motion.imu, turned, HOLE_S)
     ahead: Series = rotation[:, :2, 0] @ [1.0, 1j]
-    moving = ((np.abs(course) > MOVING_MPS**2) & _covered(reference_times, at)).astype(float)
+    moving = ((np.abs(course) > MOVING_MPS**2) & covered(reference_times, at)).astype(float)
     late, is_far = lag(_unit(ahead), motion.imu.times[0], _unit(course), at[0], moving)
     return Far("the IMU's", "those of DVL and reference", late) if is_far else None
 
@@ -86,19 +86,21 @@ def _steps(times: Array) -> Array:
     return np.arange(times[0], times[-1], STEP_S)
 
 
-def _covered(times: Array, at: Array) -> NDArray[np.bool_]:
-    """Whether there are samples near (M,): across an outage a velocity is anything."""
+def covered(times: Array, at: Array) -> NDArray[np.bool_]:
+    """Whether (M,) is within samples that are near each other: across an outage a velocity is anything."""
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    return np.asarray(times[after] - times[after - 1] <= max(HOLE_S, 3.0 * float(median(np.diff(times)))))
+    is_near = times[after] - times[after - 1] <= max(HOLE_S, 3.0 * float(median(np.diff(times))))
+    return np.asarray(is_near & (at >= times[0]) & (at <= times[-1]))
 
 
-def _at(times: Array, values: Array, at: Array) -> Array:
+def velocity_at(times: Array, values: Array, at: Array) -> Array:
+    """(M, 3) of a stream of (N, 3) at times (M,), on straight lines."""
     return np.column_stack([np.interp(at, times, column) for column in values.T])
 
 
 def _speed(times: Array, velocity: Array) -> Series:
     """(N,) horizontal speed, m/s, every STEP_S from the first sample on."""
-    values = _at(times, velocity, _steps(times))
+    values = velocity_at(times, velocity, _steps(times))
     around = np.pad(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS // 2)
     windows = np.lib.stride_tricks.sliding_window_view(around, SPIKE_STEPS)
     return np.asarray(median(windows.T), dtype=complex)

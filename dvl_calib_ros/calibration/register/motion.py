@@ -53,9 +53,9 @@ def motion_of(streams: Streams, parameters: Parameters) -> Motion | None:
     code = int(np.bincount(reference.frames).argmax())
     reference = reference.part(reference.frames == code)
     times = 1e-9 * (clocks.dvl(dvl.stamps_ns, first_ns) - first_ns)
-    dvl_times, velocity = _in_order(times, dvl.values)
-    reference_times, seen = _in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
-    imu_times, numbers = _in_order(
+    dvl_times, velocity = in_order(times, dvl.values)
+    reference_times, seen = in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
+    imu_times, numbers = in_order(
         1e-9 * (imu.stamps_ns - clocks.imu_ns - first_ns),
         np.hstack([unit_quaternions(imu.orientation), imu.angular_velocity]),
     )
@@ -100,7 +100,8 @@ def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:
     return times, velocity
 
 
-def _in_order(times: Array, values: Array) -> tuple[Array, Array]:
+def in_order(times: Array, values: Array) -> tuple[Array, Array]:
+    """Without samples (N, k) whose times (N,) go back."""
     later = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
     return times[later], values[later]
 
