@@ -411,6 +411,13 @@ _KINDS = (
         "record the velocity before it is filtered",
     ),
     FindingKind(
+        "CIRCULAR_REFERENCE",
+        "the reference follows the DVL's own noise for {seconds:.1f} s: a filter made it from this DVL",
+        "No two instruments share noise. A navigation filter that takes the DVL in takes its mounting in as well, so "
+        "its velocity shows no error of it, or that of an earlier calibration.",
+        "take a reference that has not seen the DVL: velocity or positions of GNSS alone",
+    ),
+    FindingKind(
         "LEVER_ARM_CONTRADICTED",
         "the data show another lever arm than the one that was given: {axes}",
         "The place that was given is wrong, or something else is that looks like it: heading, turn rates or clock of "

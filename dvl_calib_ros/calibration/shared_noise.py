@@ -8,7 +8,8 @@ the differences of the DVL are
 
     v₂ = 6 N + 2 Q,    v₄ = 70 N + 20 Q,    and with a share κ of its noise in the reference    c₄ = 70 κ N + 20 Q,
 
-of which κ follows. Smoother motion only makes κ look smaller.
+of which κ follows. Smoother motion only makes κ look smaller. A reference that is too slow for differences is held
+against the DVL's sample beside it: the DVL's fourth difference times r - d is -6 N (1 - κ), whatever the motion is.
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ from .frames import Array
 from .robust import median
 from .samples import Mask
 
-# Streams slower than this, s, show what waves do in their differences.
-SLOWEST_S = 0.3
+# Streams slower than this, s, show what waves do in their differences; a reference may be this slow beside a fast DVL.
+SLOWEST_S, SLOWEST_REFERENCE_S = 0.3, 1.2
 # Shifts of the reference against the DVL that are tried, s, a filter and its transport being late by some.
 SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
 # A difference's samples are as far apart as usual, within this share, and those of both streams no further than this.
 EVEN, NEAR = 0.25, 0.6
 # Differences of a smaller noise (m/s) are those of rounding.
 LEAST_NOISE_MPS = 1e-4
-# So many stretches, of so many differences each (three axes), tell anything.
-ENOUGH, FEWEST = 12, 30
+# So many stretches, of so many differences each (three axes), tell anything; of a slow reference, so many samples.
+ENOUGH, FEWEST, FEWEST_SLOW = 12, 30, 12
 # Share of the noise from which it is said, and by how many standard deviations, of the stretches' scatter, it is more.
 SHARED_FROM, SURE_FROM = 0.1, 4.0
 # ... and the same where the vehicle's own steps are taken to be as found, and not as large as they may be.
@@ -63,14 +64,20 @@ class SharedNoise:
         if min(len(times), len(reference_times)) <= 2 * ORDER:
             return
         step, reference_step = float(median(np.diff(times))), float(median(np.diff(reference_times)))
-        if max(step, reference_step) > SLOWEST_S:
+        if step > SLOWEST_S or reference_step > SLOWEST_REFERENCE_S:
             return
         fourth = np.diff(velocity, ORDER, axis=0)
         differences = fourth[_windows(_even(times, step), ORDER)]
         self._later += [(differences[lag:] * differences[:-lag]).sum() for lag in _LATER]
         self._square += float((differences**2).sum())
         # at the slower stream's times, of the faster one the samples next to them
-        if reference_step < step:
+        if reference_step > SLOWEST_S:
+            beside = np.column_stack([velocity, np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)])[2:-2]
+            seen = np.column_stack([beside, np.where(_evenly(times, step), fourth, np.nan)])
+            dvl, dvl_2, dvl_4 = np.split(_beside(reference_times, step, times[2:-2], seen, -SHIFTS_S), 3, axis=2)
+            # as if it were a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
+            other_4 = dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl)
+        elif reference_step < step:
             even = _evenly(times, step)
             dvl_4 = np.where(even, fourth, np.nan)
             dvl_2 = np.diff(velocity, 2, axis=0)[1:-1]
@@ -85,8 +92,9 @@ class SharedNoise:
         c_4, v_4, v_2 = np.stack([dvl_4 * other_4, dvl_4 * dvl_4, dvl_2 * dvl_2]).sum(axis=(2, 3)) / np.maximum(
             count, 1
         )
-        found = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * (count >= FEWEST)[:, None]
-        self._stretches += count >= FEWEST
+        enough = count >= (FEWEST if reference_step <= SLOWEST_S else FEWEST_SLOW)
+        found = np.column_stack([c_4, v_4, 70.0 * v_2 - 6.0 * v_4]) * enough[:, None]
+        self._stretches += enough
         self._sums += found
         self._squares += found**2
 
@@ -118,6 +126,13 @@ class SharedNoise:
             f"the data fit a reference that a filter made from this DVL (it holds {100.0 * min(share, 1.0):.0f} % of "
             "the DVL's own noise; take the GNSS velocity alone)"
         )
+
+
+def _about_mean(values: Array) -> Array:
+    """Values (S, N, k), nan among them, about their means over N; each as large as without the mean, on average."""
+    known = np.isfinite(values)
+    n = np.maximum(np.count_nonzero(known, axis=1, keepdims=True), 2)
+    return (values - np.where(known, values, 0.0).sum(axis=1, keepdims=True) / n) * (n / (n - 1.0))
 
 
 def _beside(times: Array, step: float, other_times: Array, other: Array, shifts: Array) -> Array:

@@ -5,6 +5,12 @@ velocity does not turn with the vehicle as the IMU's orientation says (a driver 
 the wrong sign); where it is the same at every speed, the DVL has a bias; where it follows how the velocity bends, one
 of the two is smoothed. All three turn angles by what σ does not hold, so they are looked for, by least squares beside
 all that the calibration has found already.
+
+And where it follows what the DVL's noise was before, the reference is a filter's that took the DVL in. With d = s + n
+of the DVL and r = s + m of an instrument of its own, r - d = m - n, and noise n that is new with each sample is not
+foretold by any d before it. A filter that keeps h of the noise makes r - d = m - n + h ∗ n, which is. The noise that
+was is what past d did not foretell of d (an autoregression). A smoothed reference lags the motion, and gives the other
+sign.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ import numpy as np
 from ..calibration.attitude_rates import LEVEL_BELOW
 from ..calibration.findings import Finding, finding
 from ..calibration.frames import Array, cross, skew
-from ..calibration.robust import median
+from ..calibration.robust import median, robust_std
 from ..calibration.samples import Index
 from ..calibration.verification import Word
 
@@ -46,6 +52,12 @@ SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 OUTLYING, ROUNDS = 4.0, 3
 # What is left is noise of so much at least, m/s.
 QUIETEST_MPS = 1e-3
+# A filter forgets the DVL over one of these, s. Of slower streams (s) what is new in a sample is the motion's.
+FORGOTTEN_S, SLOWEST_S = (0.4, 1.0, 3.0), 0.3
+# Samples that foretell the next; more than so many σ of it is no noise but an outlier.
+FORETOLD_BY, NEW_AT_MOST = 12, 4.0
+# So many σ of the noise being followed are no chance, of three that are looked at and one sign; and a share of it.
+FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
 
 
 class Followed(NamedTuple):
@@ -54,7 +66,8 @@ class Followed(NamedTuple):
     tilt, tilt_std: (2,) share of roll and of pitch that the DVL's velocity leaves out, 0 of a right one, 1 of a
     levelled one, 2 or -2 where a sign is wrong. bias, bias_std: (3,) m/s of the DVL, body. smoothed, smoothed_std: s²,
     half the square of the reference's time constant; below 0 the DVL's. lean: (2,) mean roll and pitch, rad. speed:
-    m/s, rms.
+    m/s, rms. circular, circular_std: share of the DVL's noise that is still there with the next sample, and circular_s
+    what it is forgotten over, s: the surest of `FORGOTTEN_S`.
     """
 
     tilt: Array
@@ -65,6 +78,21 @@ class Followed(NamedTuple):
     smoothed_std: float
     lean: Array
     speed: float
+    circular: float
+    circular_std: float
+    circular_s: float
+
+
+class _Fit(NamedTuple):
+    """x (n,), and σ by the scatter of stretches; P (n, n) of the noise alone, weights (N,), what is left (N, 3), and
+    where stretches start."""
+
+    x: Array
+    std: Array
+    p: Array
+    weight: Array
+    rest: Array
+    starts: Index
 
 
 def left_over(
@@ -107,21 +135,25 @@ def left_over(
     bend = _at(time, turning, BEND_S) - 2.0 * turning + _at(time, turning, -BEND_S)
     quick[:, :, 2] = _turned(body_from_enu, bend / BEND_S**2)
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
-    fast = _fitted(time, np.concatenate([known, quick], axis=2), error, np.concatenate([KNOWN, QUICK]))
+    both = np.concatenate([known, quick], axis=2)
+    fast = _fitted(time, both, error, np.concatenate([KNOWN, QUICK]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     means = [_means(each, starts) for each in (time, np.concatenate([known, constant], axis=2), error)]
     slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, CONSTANT]))
     if fast is None or slow is None:
         return None
-    tilt, std = fast[0][-3:-1], fast[1][-3:-1]
+    tilt, std = fast.x[-3:-1], fast.std[-3:-1]
     std[[each.std() < LEAST_TILT for each in changing]] = math.inf
     lean = np.array([roll.mean(), pitch.mean()])
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
     # without tilt, what waves do to it looks like turning
     shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
-    smoothed_std = float(fast[1][-1]) if shows else math.inf
-    return Followed(tilt, std, slow[0][-3:], slow[1][-3:], float(fast[0][-1]), smoothed_std, lean, speed)
+    smoothed_std = float(fast.std[-1]) if shows else math.inf
+    return Followed(
+        tilt, std, slow.x[-3:], slow.std[-3:], float(fast.x[-1]), smoothed_std, lean, speed,
+        *_circular(time, velocity - error, both, fast),
+    )  # fmt: skip
 
 
 def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[tuple[Word, Finding]]:
@@ -131,6 +163,8 @@ def left_over_advice(found: Followed | None, of_positions: bool = False) -> list
     """
     if found is None:
         return []
+    if found.circular > max(FOLLOWED_SURELY * found.circular_std, FOLLOWED_FROM):
+        return [(Word.REJECT, finding("CIRCULAR_REFERENCE", seconds=found.circular_s))]
     seconds = math.sqrt(2.0 * abs(found.smoothed))
     is_ours = of_positions and found.smoothed > 0.0
     if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
@@ -162,8 +196,8 @@ def _smoothed_one(found: Followed) -> str:
     return "reference" if found.smoothed > 0.0 else "DVL"
 
 
-def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> tuple[Array, Array] | None:
-    """x (n,) and σ (n,) by the scatter of stretches of time, of error (N, 3) = columns (N, 3, n) x."""
+def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | None:
+    """Of error (N, 3) = columns (N, 3, n) x; None for too few stretches of time."""
     stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(stretch, prepend=-1))
     if len(starts) < ENOUGH:
@@ -181,11 +215,48 @@ def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> tuple[A
         x = p @ (weighted.reshape(-1, n).T @ z)
         rest = error - columns @ x
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
-    m = len(starts)
-    scatter = p @ scores.T
+    return _Fit(x, _std(p @ scores.T), p, weight, rest, starts)
+
+
+def _std(scatter: Array) -> Array:
+    """σ (n,) by what each of M stretches, or of pairs of them, says (n, M)."""
+    n, m = scatter.shape
     together = scatter[:, : m // 2 * 2].reshape(n, -1, 2).sum(axis=2)
-    variance = np.maximum((scatter**2).sum(axis=1), (together**2).sum(axis=1)) * (m / (m - 1.0))
-    return x, np.sqrt(variance)
+    return np.sqrt(np.maximum((scatter**2).sum(axis=1), (together**2).sum(axis=1)) * (m / (m - 1.0)))
+
+
+def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
+    """Share of the DVL's noise (velocity (N, 3), body) that the reference still holds, its σ, and over how long, s."""
+    step = float(median(np.diff(time)))
+    if step > SLOWEST_S:
+        return 0.0, math.inf, 0.0
+    new = np.column_stack([_unforetold(each) for each in dvl.T])
+    new[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
+    weighted = columns * fit.weight[:, None, None]
+    found = []
+    for seconds in FORGOTTEN_S:
+        kernel = np.exp(-np.arange(1.0, math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
+        past = np.column_stack([np.convolve(np.append(0.0, each), kernel)[: len(time)] for each in new.T])
+        past -= columns @ (fit.p @ np.einsum("nij,ni->j", weighted, past))
+        square = float(np.einsum("n,ni,ni->", fit.weight, past, past))
+        if square <= 0.0:
+            continue
+        share = float(np.einsum("n,ni,ni->", fit.weight, past, fit.rest)) / square
+        scores = np.add.reduceat(fit.weight * (past * (fit.rest - share * past)).sum(axis=1), fit.starts)
+        found.append((share, float(_std(scores[None] / square)[0]), seconds))
+    return max(found, key=lambda each: each[0] / max(each[1], 1e-12), default=(0.0, math.inf, 0.0))
+
+
+def _unforetold(values: Array) -> Array:
+    """What the samples before do not foretell of each (N,); without outliers."""
+    values = values - values.mean()
+    before = np.lib.stride_tricks.sliding_window_view(values, FORETOLD_BY)[:-1]
+    after = values[FORETOLD_BY:]
+    square = before.T @ before
+    level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # a simulator's may be foretold exactly
+    new = after - before @ np.linalg.solve(square + level * np.eye(FORETOLD_BY), before.T @ after)
+    most = NEW_AT_MOST * float(robust_std(new))
+    return np.concatenate([np.zeros(FORETOLD_BY), np.clip(new, -most, most)])
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:

@@ -44,6 +44,21 @@ def test_a_reference_that_the_dvl_went_into_is_told_by_its_noise(rates, late):
     assert "made from this DVL" in found.says()
 
 
+@pytest.mark.parametrize("late", [0.0, 0.4])
+@pytest.mark.parametrize("rates", [(5.0, 1.0), (8.0, 2.0), (25.0, 1.0)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_slow_reference_is_told_by_the_noise_of_the_samples_beside_it(rates, late, seed):
+    assert "made from this DVL" in judged(*streams(*rates, shared=1.0, late=late, seed=seed)).says()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("rates", [(5.0, 1.0), (8.0, 2.0), (25.0, 1.0)])
+@pytest.mark.parametrize("waves", [{"amplitude": 0.3, "period": 4.0}, {"amplitude": 0.1, "period": 1.0}, {}])
+def test_a_slow_instrument_of_its_own_shares_none(rates, waves, seed):
+    found = judged(*streams(*rates, seed=seed, reference_std=0.003, dvl_std=0.005, **waves))
+    assert found.says() == ""
+
+
 def test_half_of_it_is_told_as_well():
     assert 0.25 < judged(*streams(shared=0.5)).share() < 0.6
 

@@ -105,3 +105,29 @@ def test_an_attitude_without_tilt_and_a_short_run_say_nothing(rng):
     found = vehicle.found(turns=vehicle.level)
     assert np.isinf(found.tilt_std).all() and math.isinf(found.smoothed_std)
     assert Vehicle(rng, seconds=60.0).found() is None and left_over_advice(None) == []
+
+
+def past_noise(noise, seconds):
+    """What a filter that an IMU carries over the vehicle's own motion keeps of the DVL's noise."""
+    return smoothed(noise, seconds)
+
+
+@pytest.mark.parametrize("seconds", [0.4, 1.0])
+def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seconds):
+    vehicle = Vehicle(rng)
+    kept = past_noise(vehicle.noise[1], seconds)
+    vehicle.noise = 0.3 * vehicle.noise[0], vehicle.noise[1]
+    found = vehicle.found(reference=vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, kept))
+    assert found.circular > 0.0
+    ((verdict, said),) = left_over_advice(found)
+    assert verdict is Word.REJECT and said.code == "CIRCULAR_REFERENCE"
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_of_their_own_is_not_followed(seed):
+    rng = np.random.default_rng(seed)
+    vehicle = Vehicle(rng, wave_deg=3.0)
+    lasting = smoothed(rng.normal(0.0, 0.2, vehicle.body.shape), 10.0)
+    vehicle.noise = 0.3 * vehicle.noise[0] + lasting, vehicle.noise[1]
+    found = vehicle.found()
+    assert found.circular < 4.5 * found.circular_std
