@@ -20,6 +20,7 @@ COMMANDS = {
     "size": "lines of code, modules, arrows between the rooms of the package",
     "stacks": "bags as real stacks record them, each with its truth, judged through the command line",
     "surveys": "surveys drawn at random, by physics of their own: usable and wrong, right and rejected",
+    "trial": "the diagnosis, blindly, on bags whose truth stays sealed until it has answered",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
 

@@ -34,7 +34,6 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "simulation": (*_READ, "effects", "export"),
     "evaluation": (*_READ, "parallel", "files", "replay", "simulation"),
     "report": (*_CORE, "disk", "files", "effects", "replay", "diagnosis", "unpaired", "evaluation"),
-    "trial": (*_READ, "parallel", "disk", "diagnosis", "unpaired"),
     "node": (*_CORE, "streams", "disk", "messages", "files", "discovery", "simulation"),
     "demo": (*_READ, "files", "node"),
     "api": (
@@ -43,7 +42,7 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     ),
     "cli": (
         *_READ, "streams", "parallel", "disk", "files", "effects", "discovery", "examination", "replay", "diagnosis",
-        "unpaired", "export", "simulation", "evaluation", "report", "trial", "node", "demo",
+        "unpaired", "export", "simulation", "evaluation", "report", "node", "demo",
     ),
     "__init__": ("api",),
 }  # fmt: skip

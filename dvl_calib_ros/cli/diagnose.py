@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from . import common, trial, unpaired
+from . import common, unpaired
 from .reporting import add_report_option, report_writer
 from .tables import intervals, titled
 
@@ -29,7 +29,7 @@ MAX_PLACES = 8
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument(
         "--apply", type=Path, metavar="FILE",
@@ -43,21 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_parameter_options(parser)
     common.add_discovery_options(parser)
     unpaired.add_arguments(parser)
-    parser.add_argument("--trial", action="store_true", help="try the diagnosis itself, blindly, on simulated bags")
-    trial.add_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Diagnose, print, save; or run the trial."""
-    from ..errors import InputError
-
-    if arguments.trial:
-        if arguments.bags:
-            raise InputError("--trial makes its own bags; name none")
-        trial.run(arguments)
-        return
-    if not arguments.bags:
-        raise InputError("name a bag, or try --trial")
+    """Diagnose, print, save."""
     if arguments.simulator:
         unpaired.run(arguments, DEFAULTS)
         return

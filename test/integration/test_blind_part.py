@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.trial.motion import RECORDED
-from dvl_calib_ros.trial.plan import KINDS, Case, Family, plan
-from dvl_calib_ros.trial.run import Trial
-from dvl_calib_ros.trial.scored import join
-from dvl_calib_ros.trial.truth import Category, unseal
-from dvl_calib_ros.trial.vehicle import of_one_recording
+from validation.trial.motion import RECORDED
+from validation.trial.plan import KINDS, Case, Family, plan
+from validation.trial.run import Trial
+from validation.trial.scored import join
+from validation.trial.truth import Category, unseal
+from validation.trial.vehicle import of_one_recording
 
 pytestmark = pytest.mark.trial
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -65,7 +65,16 @@ def measurement(
 
 def dvl_calib(*arguments: object, cwd: Path = ROOT, codes: tuple[int, ...] = (0,)) -> str:
     """Output of a command of this tree. Raises CalledProcessError with what it said."""
-    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", *map(str, arguments)]
+    return _run(["dvl_calib_ros.cli.main", *map(str, arguments)], cwd, codes)
+
+
+def validation(*arguments: object) -> str:
+    """Output of another command of `python -m validation`. Raises CalledProcessError with what it said."""
+    return _run(["validation", *map(str, arguments)], ROOT, (0,))
+
+
+def _run(module: Sequence[str], cwd: Path, codes: Sequence[int]) -> str:
+    command = [sys.executable, "-m", *module]
     done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env={**os.environ, "PYTHONPATH": str(ROOT)})
     if done.returncode not in codes:
         raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)

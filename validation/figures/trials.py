@@ -5,26 +5,26 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from .registry import LONG, Found, dvl_calib, measurement, snapir_ins
+from .registry import LONG, Found, measurement, snapir_ins, validation
 
 CASES, PAIRS, SEED = 120, 30, 20261122
 
 
-@measurement(cost=LONG, command=f"dvl-calib diagnose --trial --cases {CASES} --seed {SEED} --page FILE", tolerances={})
+@measurement(cost=LONG, command=f"python -m validation trial --cases {CASES} --seed {SEED} --page FILE", tolerances={})
 def trial(folder: Path) -> Found:
     """The first tables of the page that the trial writes: by family, by strength."""
     snapir_ins()  # real motion is a half of it
     page = folder / "page.md"
-    dvl_calib("diagnose", "--trial", "--cases", CASES, "--seed", SEED, "--out", folder / "trial", "--page", page)
+    validation("trial", "--cases", CASES, "--seed", SEED, "--out", folder / "trial", "--page", page)
     parts = re.split(r"^\*\*(.*?)\*\*$", page.read_text(), flags=re.MULTILINE)
     tables = dict(zip(parts[1::2], parts[2::2], strict=True))
     kept = [f"**{title}**\n\n{text.strip()}" for title, text in tables.items() if title.startswith("Blind trial")]
     return {"tables": "\n\n".join(kept)}
 
 
-@measurement(cost=LONG, command=f"dvl-calib diagnose --trial --pairs {PAIRS} --seed {SEED}", tolerances={})
+@measurement(cost=LONG, command=f"python -m validation trial --pairs {PAIRS} --seed {SEED}", tolerances={})
 def pairs(folder: Path) -> Found:
     """How often the comparison with a simulator is right: the table that the trial of pairs writes."""
-    dvl_calib("diagnose", "--trial", "--pairs", PAIRS, "--seed", SEED, "--out", folder / "pairs")
+    validation("trial", "--pairs", PAIRS, "--seed", SEED, "--out", folder / "pairs")
     lines = (folder / "pairs" / "pairs.txt").read_text().splitlines()
     return {"table": "\n".join(line for line in lines if line.endswith(" right") or "wanted" in line)}

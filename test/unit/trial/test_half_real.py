@@ -8,19 +8,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from yaml_text import parsed
 
-from dvl_calib_ros.trial import generator, recorded
-from dvl_calib_ros.trial.cases import draw
-from dvl_calib_ros.trial.generator import VERTICALS, Noise
-from dvl_calib_ros.trial.half_real import HORIZONTAL, MIN_DISTANCE, MIN_Q
-from dvl_calib_ros.trial.plan import Case, Family, plan
-from dvl_calib_ros.trial.recorded import recordings_folder
-from dvl_calib_ros.trial.strength import Yardstick
-from dvl_calib_ros.trial.truth import Category
-from dvl_calib_ros.trial.vehicle import dvl_stamps, in_recording
+from validation.trial import generator, recorded
+from validation.trial.cases import draw
+from validation.trial.generator import VERTICALS, Noise
+from validation.trial.half_real import HORIZONTAL, MIN_DISTANCE, MIN_Q
+from validation.trial.plan import Case, Family, plan
+from validation.trial.recorded import recordings_folder
+from validation.trial.strength import Yardstick
+from validation.trial.truth import Category
+from validation.trial.vehicle import dvl_stamps, in_recording
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("snapir_ins")]
 
@@ -175,8 +176,8 @@ def test_without_the_recordings_their_cases_are_left_out_and_told(tmp_path, monk
     assert recordings_folder() is None
     assert {each.family for each in plan(kinds=("box",))} == {Family.SIMULATED}
     done = subprocess.run(
-        [sys.executable, "-m", "dvl_calib_ros.cli.main", "diagnose", "--trial", "--family", "half_real",
+        [sys.executable, "-m", "validation", "trial", "--family", "half_real",
          "--out", str(tmp_path / "trial")],
-        capture_output=True, text=True, check=False,
+        capture_output=True, text=True, check=False, cwd=ROOT,
     )  # fmt: skip
     assert done.returncode == 0 and recorded.NO_RECORDINGS.split(";")[0] in done.stderr

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvl_calib_ros.trial.scored import join
-from dvl_calib_ros.trial.tables import score
-from dvl_calib_ros.trial.truth import Category, Truth, seal, unseal
+from validation.trial.scored import join
+from validation.trial.tables import score
+from validation.trial.truth import Category, Truth, seal, unseal
 
 
 def truth(number: int, category: Category, faults=(), q=0.0, **rest) -> Truth:
@@ -245,6 +245,6 @@ def test_a_horizontal_reference_is_compared_with_its_twin_of_all_axes(by_family)
 
 
 def test_the_page_says_what_has_measured_it(hand_made):
-    page = hand_made.page("dvl-calib diagnose --trial --seed 5 --cases 16", "1.2.3")
-    assert "dvl-calib diagnose --trial --seed 5 --cases 16\n" in page and "version 1.2.3" in page
+    page = hand_made.page("python -m validation trial --seed 5 --cases 16", "1.2.3")
+    assert "python -m validation trial --seed 5 --cases 16\n" in page and "version 1.2.3" in page
     assert f"over {len(HAND_MADE)} cases" in page and "| false alarms, nulls | <= 1% | 25.0% |" in page

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.trial.pairs import ROWS, WHAT, make_pair
-from dvl_calib_ros.trial.pairs_run import figures, run_pairs, score_pair
+from validation.trial.pairs import ROWS, WHAT, make_pair
+from validation.trial.pairs_run import figures, run_pairs, score_pair
 
 
 def truth(vehicle=(), simulator=(), **noise):

@@ -9,8 +9,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from ..disk.atomic import save_text
-from ..errors import InputError
+from dvl_calib_ros.disk.atomic import save_text
+from dvl_calib_ros.errors import InputError
 
 
 class Category(str, Enum):

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from ..errors import InputError
+from dvl_calib_ros.errors import InputError
+
 from .motion import MARGIN_S, RATE_HZ, Floats, Motion, attitude, sampled_motion
 
 DVL_FOLDER, INS_FOLDER = "snapir", "snapir_ins"

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from ..bags.writer import BagWriter
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from ..messages.encode import SampleWriter
+from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.messages.encode import SampleWriter
+
 from .cases import Drawn, draw
 from .motion import Floats, Motion
 from .plan import Case

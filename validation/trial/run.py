@@ -18,10 +18,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..calibration.parameters import Parameters
-from ..disk.atomic import save_text
-from ..errors import InputError
-from ..parallel import outcomes_on_cores
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.disk.atomic import save_text
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.parallel import outcomes_on_cores
+
 from .cases import NotDrawnError
 from .generator import record
 from .plan import Case
@@ -47,7 +48,7 @@ GENERATOR_VERSION = 6
 
 def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
     """What `dvl-calib diagnose` says of the bags."""
-    from ..diagnosis.diagnose import diagnose, diagnosis_document
+    from dvl_calib_ros.diagnosis.diagnose import diagnose, diagnosis_document
 
     return diagnosis_document(diagnose(paths, parameters))
 

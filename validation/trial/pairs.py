@@ -17,8 +17,9 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from ..errors import InputError
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.errors import InputError
+
 from .generator import BETWEEN_RECORDINGS_NS, START_NS, Noise, Sample, _dvl, _gnss, _imu, _write
 from .motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS, Floats, manoeuvre
 from .simulated import vehicle as drawn_vehicle

@@ -19,11 +19,12 @@ from typing import Any
 
 from scipy.stats import binomtest
 
-from ..calibration.parameters import Parameters
-from ..disk.atomic import save_text
-from ..errors import InputError
-from ..recordings.recording import open_recording
-from ..recordings.topics import Topics
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.disk.atomic import save_text
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
+
 from .pairs import make_pair, pair_id
 from .run import read_answers
 from .scored import NOT_SCORED_PARAMETERS
@@ -36,9 +37,9 @@ SAME_LEVEL = 1.02
 
 def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[float]]) -> Document:
     """What `dvl-calib diagnose VEHICLE --simulator SIMULATOR` says, as in its JSON."""
-    from ..unpaired.compare import compare
-    from ..unpaired.logs import Source
-    from ..unpaired.results import unpaired_document
+    from dvl_calib_ros.unpaired.compare import compare
+    from dvl_calib_ros.unpaired.logs import Source
+    from dvl_calib_ros.unpaired.results import unpaired_document
 
     def source(side: str, path: Path) -> Source:
         roll, pitch, yaw = mounting[side]

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from dvl_calib_ros.errors import InputError
+
 from . import half_real, simulated
 from .plan import Case, Family
 from .strength import Scene, Yardstick

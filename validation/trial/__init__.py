@@ -6,3 +6,9 @@ was built on would be tested for nothing. They share no code with `effects`, `si
 `plan` says which cases there are, `simulated` and `half_real` draw them (`cases`), `generator` records them, `run`
 asks, `scored`, `figures` and `tables` join the answers with the truth.
 """
+
+from __future__ import annotations
+
+from .command import main
+
+__all__ = ["main"]

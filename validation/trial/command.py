@@ -1,31 +1,41 @@
-"""The blind trial of the diagnosis: options and output of ``dvl-calib diagnose --trial``."""
+"""`python -m validation trial`: options and output of the blind trial of the diagnosis."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from . import common
-from .tables import titled
+from rich.markup import escape
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from dvl_calib_ros import __version__
+from dvl_calib_ros.cli import common
+from dvl_calib_ros.cli.tables import titled
+from dvl_calib_ros.disk.atomic import save_text
+from dvl_calib_ros.errors import InputError
 
-    from ..trial.plan import Case
-    from ..trial.tables import Table
+from .motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
+from .pairs_run import by_row, figures, misses, run_pairs, score_pair
+from .plan import KINDS, Case, Family, plan
+from .recorded import NO_RECORDINGS, has_ins, recordings_folder
+from .run import Trial
+from .scored import join
+from .tables import Table, score
+from .truth import Category, unseal
 
 DEFAULT_CASES = 100
-KIND_CHOICES = ("all", "tuning", "held-out")
-CATEGORY_CHOICES = ("null", "hard_null", "single", "pair", "triple", "unknown", "unidentifiable")
-FAMILY_CHOICES = ("simulated", "half_real", "horizontal", "several")
+KIND_CHOICES = {"all": KINDS, "tuning": TUNING_KINDS, "held-out": HELD_OUT_KINDS}
+CATEGORIES = [each.value for each in Category]
+FAMILIES = [each.value for each in Family]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options that make sense with --trial only."""
-    group = parser.add_argument_group("blind trial (--trial)")
-    amount = group.add_mutually_exclusive_group()
+def main(argv: Sequence[str]) -> int:
+    """Run what is left of the trial, score it, print the tables and write them to the folder. Raises InputError."""
+    parser = argparse.ArgumentParser(
+        prog="python -m validation trial", description="Try the diagnosis itself, blindly, on bags made for it."
+    )
+    amount = parser.add_mutually_exclusive_group()
     amount.add_argument("--cases", type=int, metavar="N", help=f"a fair part of the trial; default: {DEFAULT_CASES}")
     amount.add_argument(
         "--case", action="append", metavar="KEY", help="one case, by its key or id (as in sealed/); may be given again"
@@ -35,50 +45,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pairs", type=int, metavar="N",
         help="instead: N pairs of logs of a vehicle and a simulator, for --simulator; 60 are a whole round",
     )  # fmt: skip
-    group.add_argument("--kinds", choices=KIND_CHOICES, default="all", help="of trajectory; default: %(default)s")
-    group.add_argument(
-        "--family", choices=FAMILY_CHOICES, action="append",
+    parser.add_argument("--kinds", choices=KIND_CHOICES, default="all", help="of trajectory; default: %(default)s")
+    parser.add_argument(
+        "--family", choices=FAMILIES, action="append",
         help="simulated manoeuvres, real motion, the same with a horizontal reference, or several recordings of one "
         "vehicle; may be given again; default: all, in turns",
     )  # fmt: skip
-    group.add_argument(
-        "--category", choices=CATEGORY_CHOICES, action="append", help="of cases; may be given again; default: all"
+    parser.add_argument(
+        "--category", choices=CATEGORIES, action="append", help="of cases; may be given again; default: all"
     )
-    group.add_argument(
+    parser.add_argument(
         "--out", type=Path, default=Path("dvl_calib_trial"), metavar="FOLDER",
         help="folder of the trial, which goes on where it was stopped; default: %(default)s",
     )  # fmt: skip
-    group.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
-    group.add_argument("--seed", type=int, default=0, metavar="S", help="of the trial; default: %(default)s")
-    group.add_argument("--minutes", type=float, default=math.inf, metavar="M", help="begin no case after this time")
-    group.add_argument("--page", type=Path, metavar="FILE", help="write the page of the documentation (Markdown)")
-    group.add_argument("--keep-bags", action="store_true", help="leave the bags in the folder")
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Run what is left of the trial, score it, print the tables and write them to the folder."""
-    from .. import __version__
-    from ..disk.atomic import save_text
-    from ..errors import InputError
-    from ..trial.motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
-    from ..trial.plan import KINDS, Family, plan
-    from ..trial.recorded import NO_RECORDINGS, has_ins, recordings_folder
-    from ..trial.run import Trial
-    from ..trial.scored import join
-    from ..trial.tables import score
-    from ..trial.truth import unseal
-
+    parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
+    parser.add_argument("--seed", type=int, default=0, metavar="S", help="of the trial; default: %(default)s")
+    parser.add_argument("--minutes", type=float, default=math.inf, metavar="M", help="begin no case after this time")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write the page of the documentation (Markdown)")
+    parser.add_argument("--keep-bags", action="store_true", help="leave the bags in the folder")
+    arguments = parser.parse_args(argv)
     _check(arguments)
     if arguments.pairs is not None:
         _run_pairs(arguments)
-        return
-    kinds = {"all": KINDS, "tuning": TUNING_KINDS, "held-out": HELD_OUT_KINDS}[arguments.kinds]
+    else:
+        _run(arguments)
+    return 0
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    kinds = KIND_CHOICES[arguments.kinds]
     errors = common.console(stderr=True)
     if RECORDED in kinds and not has_ins(recordings_folder()):
         kinds = tuple(kind for kind in kinds if kind != RECORDED)
         errors.print(f"[yellow]note:[/] {NO_RECORDINGS}")
-    cases = plan(kinds, [Family(name) for name in arguments.family or FAMILY_CHOICES])
-    cases = [case for case in cases if case.category.value in (arguments.category or CATEGORY_CHOICES)]
+    cases = plan(kinds, [Family(name) for name in arguments.family or FAMILIES])
+    cases = [case for case in cases if case.category.value in (arguments.category or CATEGORIES)]
     if arguments.case:
         cases = _chosen(cases, arguments.case)
     elif not arguments.full:
@@ -103,9 +104,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _run_pairs(arguments: argparse.Namespace) -> None:
     """Compare what is left of the pairs, print the figures and what was not right, write both to the folder."""
-    from ..disk.atomic import save_text
-    from ..trial.pairs_run import by_row, figures, misses, run_pairs, score_pair
-
     with common.progress("pairs") as on_progress:
         numbers = range(arguments.pairs)
         found = run_pairs(arguments.out, arguments.seed, numbers, on_progress, 60.0 * arguments.minutes)
@@ -118,8 +116,6 @@ def _run_pairs(arguments: argparse.Namespace) -> None:
 
 def _chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
     """Cases by key or id, in the order of the names. Raises InputError."""
-    from ..errors import InputError
-
     by_name = {name: case for case in cases for name in (case.key, case.id)}
     if unknown := [name for name in names if name not in by_name]:
         raise InputError(f"--case {unknown[0]}: no such case; give a key or an id as in the folder's sealed/*.json")
@@ -128,7 +124,7 @@ def _chosen(cases: Sequence[Case], names: Sequence[str]) -> list[Case]:
 
 def _command(arguments: argparse.Namespace) -> str:
     """The command line that runs the same cases again."""
-    words = ["dvl-calib diagnose --trial", f"--seed {arguments.seed}"]
+    words = ["python -m validation trial", f"--seed {arguments.seed}"]
     if arguments.case:
         words += [f"--case {name}" for name in arguments.case]
     else:
@@ -141,8 +137,6 @@ def _command(arguments: argparse.Namespace) -> str:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from ..errors import InputError
-
     if arguments.cases is not None and arguments.cases < 1:
         raise InputError(f"--cases: {arguments.cases} is no number of cases; give 1 or more, or --full")
     if arguments.pairs is not None and arguments.pairs < 1:
@@ -156,8 +150,6 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _rich(table: Table) -> object:
-    from rich.markup import escape
-
     first, *others = map(escape, table.columns)
     shown = titled(table.title, [first], others)
     for row in table.rows:
