@@ -307,9 +307,9 @@ class Fit:
         w = np.repeat(weight, axes) / level2
         prior = LIKELY**-2.0
         information = (h * w[:, None]).T @ h + np.diag(prior)
-        information[APART, APART] -= min(
-            float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * float(information[APART, APART])
-        )
+        # what is known of δ beside all else: more than that taken off, and it would be less than nothing
+        told = 1.0 / float(np.linalg.inv(information)[APART, APART])
+        information[APART, APART] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * told)
         away = x.copy()
         away[TURN] = turn_between(nominal, rotation)
         away[[APART, LATE]] = 0.0
