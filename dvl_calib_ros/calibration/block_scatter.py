@@ -33,7 +33,7 @@ class BlockScatter:
         self._terms = BlockTerms() if up.any() and heading_std > 0.0 else None
         self._last: int | None = None
         self._state = GaussianState(x, p)
-        self._told = _information(x, p)
+        self._told = self._state.information
         self._found: dict[int, HeadingStates] = {}
 
     def cuts(self, stamps_ns: Stamps, earth_in_body: Array | None) -> Index:
@@ -77,7 +77,7 @@ class BlockScatter:
         self._add([None if self._terms is None else self._terms.rest()], before.x[None], before.p[None], last)
         known = self._told if self._terms is None else all_told(*self._told, self._blocks)
         self._blocks.end_day(of_day, *known, np.arange(len(before.x)))
-        self._told = _information(*after)
+        self._told = after.information
         self._last = None
         self._found.clear()
 
@@ -92,17 +92,12 @@ class BlockScatter:
 def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array] | None]:
     """Of E states x (K, n), P (K, n, n); None of those whose numbers ran away: the filter goes on from before them."""
     try:
-        yield from zip(*_information(x, p), strict=True)
+        yield from zip(*GaussianState(x, p).information, strict=True)
         return
     except np.linalg.LinAlgError:
         pass
     for each in zip(x, p, strict=True):
         try:
-            yield _information(*each)
+            yield GaussianState(*each).information
         except np.linalg.LinAlgError:
             yield None
-
-
-def _information(x: Array, p: Array) -> tuple[Array, Array]:
-    information = np.linalg.inv(p)
-    return information, (information @ x[..., None])[..., 0]

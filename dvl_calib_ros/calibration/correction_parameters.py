@@ -160,7 +160,7 @@ class PriorOnErrors:
 
     def __init__(self, start: GaussianState, prior: GaussianState) -> None:
         """Both (n,), or (K, n) for filters with a prior each."""
-        self._started, self._started_state = _information(start)
+        self._started, self._started_state = start.information
         self._information = np.linalg.inv(prior.p)
         self._mean = prior.x
 
@@ -176,7 +176,7 @@ class PriorOnErrors:
 
         Raises numpy.linalg.LinAlgError where the maximum is not found.
         """
-        information, state = _information(held)
+        information, state = held.information
         gained, gained_state = information - self._started, state - self._started_state
         x = held.x
         for n in range(_STEPS):
@@ -236,12 +236,6 @@ def _no_longer(step: Array) -> Array:
     """Steps (..., n), shortened to `_LONGEST_STEP`."""
     longest = np.abs(step[..., :_N]).max(axis=-1, keepdims=True)
     return step * (_LONGEST_STEP / np.maximum(longest, _LONGEST_STEP))
-
-
-def _information(state: GaussianState) -> tuple[Array, Array]:
-    """P⁻¹ and P⁻¹x."""
-    inverse = np.linalg.inv(state.p)
-    return inverse, product(inverse, state.x)
 
 
 def _extended(jacobian: Array, n: int) -> Array:

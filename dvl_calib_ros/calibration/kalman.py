@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import Array
+from .frames import Array, product
 
 Mask = NDArray[np.bool_]
 
@@ -38,6 +38,12 @@ class GaussianState(NamedTuple):
 
     x: Array
     p: Array
+
+    @property
+    def information(self) -> tuple[Array, Array]:
+        """P⁻¹ and P⁻¹x, of (..., n) states; raises LinAlgError where P has no inverse."""
+        inverse = np.linalg.inv(self.p)
+        return inverse, product(inverse, self.x)
 
     def raised(self, factor: Array) -> GaussianState:
         """The same with each standard deviation times a factor (n,); symmetric to the last bit, as P is."""

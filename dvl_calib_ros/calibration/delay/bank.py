@@ -137,7 +137,7 @@ class DelayBank:
         self._process_rate = process_rate
         self._solved: Hypotheses | None = None
         self._begin_day()
-        self._information, self._vector = _information(self._start)
+        self._information, self._vector = self._start.information
         self._ended: list[_Ended] = []
         self._square = np.einsum("ki,ki->k", self._vector, self._start.x)
         self._log_det = np.linalg.slogdet(self._information)[1]
@@ -174,7 +174,7 @@ class DelayBank:
         shown = self._shown(best, inflation)
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
-        begins = [_information(_around_each_delay(with_states_of(each, self._unknown, OF_DAY))) for each in known]
+        begins = [_around_each_delay(with_states_of(each, self._unknown, OF_DAY)).information for each in known]
         total = all_told(found.information, found.vector, self.blocks)
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
@@ -541,12 +541,6 @@ def _one(states: GaussianState, kept: Index, share: Array) -> GaussianState:
     apart = x - mean
     p = np.einsum("k,kij->ij", share, states.p) + np.einsum("k,ki,kj->ij", share, apart, apart)
     return GaussianState(mean, 0.5 * (p + p.T))
-
-
-def _information(states: GaussianState) -> tuple[Array, Array]:
-    """Λ (K, n, n) and Λx (K, n)."""
-    inverse = np.linalg.inv(states.p)
-    return inverse, (inverse @ states.x[..., None])[..., 0]
 
 
 def _around_each_delay(prior: GaussianState) -> GaussianState:
