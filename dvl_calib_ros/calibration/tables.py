@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -9,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALLEST = 128
+# What is held fills no more than this of the room, so that rows are moved a few times in all.
+FULL = 0.75
 
 
 class Table:
@@ -39,14 +42,27 @@ class Table:
         self.size += n
         return slice(first, self.size)
 
-    def _make_room(self, n: int) -> None:
+    def reserve(self, n: int) -> None:
+        """Take room for n rows at a time, and write to it: memory that is only taken grows as it is filled."""
         held = self.size - self.begin
+        if n > FULL * self._capacity:
+            self._move(math.ceil(n / FULL))
+            for name in self.LAYOUT:
+                getattr(self, name)[held:] = 0
+
+    def _make_room(self, n: int) -> None:
         capacity = self._capacity
-        while capacity < 2 * (held + n):
+        while self.size - self.begin + n > FULL * capacity:
             capacity *= 2
+        self._move(capacity)
+
+    def _move(self, capacity: int) -> None:
+        """Have what is held at the beginning of so much room; of the same it goes on in the memory that it has."""
+        held = self.size - self.begin
         for name, (dtype, shape) in self.LAYOUT.items():
-            grown = np.empty((capacity, *shape), dtype)
-            grown[:held] = getattr(self, name)[self.begin : self.size]
+            before = getattr(self, name)
+            grown = before if capacity == self._capacity else np.empty((capacity, *shape), dtype)
+            grown[:held] = before[self.begin : self.size]
             setattr(self, name, grown)
         self.base += self.begin
         self.begin, self.size, self._capacity = 0, held, capacity

@@ -46,6 +46,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         from ..errors import InputError
         from .calibration_node import CalibrationNode
         from .executor import ReceivingExecutor
+        from .memory import give_back_at_once
     except ImportError as error:
         return _refused(
             f"ROS 2 is not available ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
@@ -57,6 +58,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
         return _refused(error)
     node = None
+    give_back_at_once()
     sys.setswitchinterval(GIVES_WAY_S)
     try:
         node = CalibrationNode(parameter_files(args))

@@ -39,6 +39,8 @@ from .solver import BlockSolver, Outcome
 from .workers import AtOnce, Solved
 
 BLOCK_NS = 10_000_000_000
+# How fast the DVL is shows after so long; room for so many times as many of its samples is taken then.
+RATE_FROM_NS, ROOM = 3_000_000_000, 1.1
 LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
 # From a block's last data until its outcome takes effect, in stamps. A worker needs a hundredth of it; the stamps of a
 # recording that is played fast come sooner, and then the node waits for the worker.
@@ -83,6 +85,7 @@ class DelayFilter(Estimator):
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _Dvl()
+        self._has_room = False
         self._n_taken = 0  # rows of the aligner that have been looked at
         self._block_ns: int | None = None  # start of the next block
         self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
@@ -413,6 +416,17 @@ class DelayFilter(Estimator):
         self._dvl.velocity[slots] = rows.velocity_dvl[at]
         self._dvl.covariance[slots] = rows.covariance[at]
         self._n_taken = aligner.partners.n_judged
+        if not self._has_room:
+            self._take_room()
+
+    def _take_room(self) -> None:
+        """Take all room that the DVL's samples will need at once, as soon as it is known how fast they come."""
+        stamps_ns = self._dvl.stamps_ns[self._dvl.begin : self._dvl.size]
+        span_ns = int(stamps_ns[-1] - stamps_ns[0]) if len(stamps_ns) else 0
+        if span_ns >= RATE_FROM_NS:
+            self._has_room = True
+            longest_ns = BLOCK_NS + MARGIN_NS + self._wait_ns
+            self._dvl.reserve(round(ROOM * len(stamps_ns) * longest_ns / span_ns))
 
     def _dvl_is_silent(self, stamp_ns: int) -> bool:
         """Whether the DVL stops here for so long that tracks forget what was before."""

@@ -1,0 +1,67 @@
+"""Columns that grow at their end: how much room they take, and when."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.delay.filter import DelayFilter
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.calibration.tables import Table
+
+
+class Numbers(Table):
+    """One column."""
+
+    LAYOUT: ClassVar = {"number": (np.int64, ())}
+    number: np.ndarray
+
+
+def filled(table: Numbers, n: int) -> Numbers:
+    for number in range(table.end, table.end + n):
+        table.number[table.extend(1)] = number
+    return table
+
+
+def test_what_holds_few_rows_goes_on_in_the_memory_that_it_has():
+    table = filled(Numbers(), 128)
+    memory = table.number
+    for _ in range(20):
+        table.forget_before(table.size - 10)
+        filled(table, 50)
+        held = table.number[table.begin : table.size]
+        np.testing.assert_array_equal(held, np.arange(table.end - len(held), table.end))
+        assert table.number is memory
+
+
+def test_rows_up_to_what_was_reserved_need_no_more_memory():
+    table = filled(Numbers(), 100)
+    table.reserve(3000)
+    memory = table.number
+    np.testing.assert_array_equal(memory[:100], np.arange(100))
+    for _ in range(5):
+        filled(table, 2900)
+        table.forget_before(table.size - 100)
+    assert table.number is memory
+
+
+@pytest.mark.parametrize("rate_hz", [5, 200])
+def test_live_the_room_for_samples_is_taken_before_they_come(rate_hz):
+    calibrator = Calibrator(Parameters())
+    (keeper,) = (each for each in calibrator._further if isinstance(each, DelayFilter))
+
+    def feed(from_s: int, to_s: int) -> None:
+        for number in range(from_s * rate_hz, to_s * rate_hz):
+            stamp_ns = number * 1_000_000_000 // rate_hz
+            calibrator.feed_dvl(DvlSample(stamp_ns, (1.0, 0.0, 0.001 * (number % 7))))
+            if number % (rate_hz // 5) == 0:
+                calibrator.feed_reference(ReferenceSample(stamp_ns, (1.0, 0.01, 0.001 * (number % 5))))
+
+    feed(0, 20)
+    memory = keeper._dvl.velocity
+    feed(20, 80)
+    assert keeper._dvl.base > 0 and keeper._dvl.velocity is memory
