@@ -87,61 +87,24 @@ def _headline(replayed: Replayed) -> str:
     )
 
 
-def _angle(degrees: float) -> str:
-    return f"{round(degrees, 2) + 0.0:.2f}°"
-
-
 def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
 def _table(replayed: Replayed) -> Table:
-    """Nominal and corrected mounting with its standard deviation, and the scale."""
-    import numpy as np
+    """Nominal and corrected mounting, and what was found beside, with their standard deviations."""
     from rich import box
     from rich.table import Table
 
-    from ..calibration.comparison import date
-    from ..calibration.frames import rpy_from_rotation
-    from ..calibration.models import MODELS
-    from ..calibration.mounting_pose import rpy_std
-    from ..calibration.observability import OBSERVED_SHARE, scale_std_ahead
-    from ..calibration.parameters import Parameters
+    from ..calibration.quantities import quantities
 
-    result = replayed.result
-    estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
-    nominal = np.degrees(parameters.mounting_rpy) + 0.0
-    corrected = np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)))
-    std = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
-    unseen = {entry.axis for entry in estimate.observability if not entry.observed}
-    unknown = OBSERVED_SHARE * math.degrees(parameters.initial_std_misalignment)
     table = Table(box=box.SIMPLE_HEAD)
     for column in ("", "nominal", "corrected", "±1σ"):
         table.add_column(column, justify="right", no_wrap=True)
-    for index, name in enumerate(("roll", "pitch", "yaw")):
-        mark = " ?" if std[index] > unknown else ""
-        table.add_row(name, _angle(nominal[index]), _angle(corrected[index]), f"{std[index]:.2f}°{mark}")
-    model = MODELS[estimate.model]
-    scale_std = scale_std_ahead(model, estimate.covariance, parameters)
-    if len(scale_std):
-        ahead = float(parameters.rotation_dvl_from_body[:, 0] ** 2 @ estimate.scale)
-        mark = " ?" if "scale" in unseen else ""
-        table.add_row("scale", "0.00 %", f"{100 * ahead:+.2f} %", f"{100 * scale_std[0]:.2f} %{mark}")
-    arm = estimate.lever_arm(parameters.lever_arm)
-    arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
-    if arm_std is not None:
-        for index, axis in enumerate("xyz"):
-            mark = " ?" if f"lever arm {axis}" in unseen else ""
-            table.add_row(
-                f"lever arm {axis}", f"{parameters.lever_arm[index]:.2f} m", f"{arm[index]:+.2f} m",
-                f"{arm_std[index]:.2f} m{mark}",
-            )  # fmt: skip
-    for delay in result.delays:
-        of_day = "" if delay.day is None else f", {delay.day.name or date(delay.day.first_ns)}"
-        table.add_row(
-            f"stamps late{of_day}", f"{parameters.dvl_time_offset:.2f} s", f"{delay.seconds:+.2f} s",
-            f"{delay.std:.2f} s{'' if delay.shown else ' ?'}",
-        )  # fmt: skip
+    for each in quantities(replayed.result):
+        corrected = each.in_unit(each.value, signed=each.unit != "°")
+        mark = "" if each.shown else " ?"
+        table.add_row(each.name, each.in_unit(each.nominal), corrected, f"{each.in_unit(each.std)}{mark}")
     return table
 
 
