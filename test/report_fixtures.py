@@ -102,7 +102,8 @@ def assert_described(images, figures) -> None:
     assert len(images) == len(figures)
     assert all(len(image["alt"]) > 10 for image in images)
     for figure in figures:
-        (axes,) = figure.axes
+        axes, *bars = figure.axes
+        assert all(bar.get_ylabel() for bar in bars)
         has_names = isinstance(axes.yaxis.get_major_locator(), FixedLocator | StrCategoryLocator)
         assert axes.get_xlabel() and (axes.get_ylabel() or has_names)
 

@@ -268,14 +268,14 @@ def objections(navigation: Navigation | None) -> list[tuple[Word, str]]:
         return []
     before, after, noise = navigation.before.per_km, navigation.after.per_km, navigation.noise_per_km
     if after < WORSE * before or after**2 - before**2 < (2.0 * noise) ** 2:
-        if float(_figure(after)) <= float(_figure(before)):
+        if float(metres(after)) <= float(metres(before)):
             return []
-        figures = f"{_figure(after)} m per km with it, {_figure(before)} as mounted"
+        figures = f"{metres(after)} m per km with it, {metres(before)} as mounted"
         return [(Word.MARGINAL, f"on data held out dead reckoning gets no better: {figures}")]
     return [
         (
             Word.REJECT,
-            f"on data held out dead reckoning drifts by {_figure(after)} m per km with it, by {_figure(before)} as "
+            f"on data held out dead reckoning drifts by {metres(after)} m per km with it, by {metres(before)} as "
             "mounted: an effect is missing from the model (dvl-calib diagnose looks for it)",
         )
     ]
@@ -286,16 +286,17 @@ def in_words(navigation: Navigation) -> list[str]:
     n, before, after = navigation, navigation.before, navigation.after
     over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
     said = [
-        f"Dead reckoning on data held out, {over}: {_figure(before.per_km)} m of drift per km as mounted "
-        f"({before.percent:.2g} % of distance), {_figure(after.per_km)} m corrected ({after.percent:.2g} %); of that "
-        f"noise of reference and DVL may be {_figure(n.noise_per_km)} m."
+        f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
+        f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %); of that "
+        f"noise of reference and DVL may be {metres(n.noise_per_km)} m."
     ]
     said.append(
-        f"After {n.distance_m:.0f} m it is {_figure(before.end)} m off as mounted, {_figure(after.end)} m corrected"
+        f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"
         + ("." if n.on_a_map else "; without headings, as on one course.")
     )
     return said
 
 
-def _figure(value: float) -> str:
+def metres(value: float) -> str:
+    """A distance, m, with as many digits as people read."""
     return f"{value:.0f}" if value >= 10.0 else f"{value:.1f}"

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
@@ -41,7 +43,8 @@ def navigation_pictures(
     if one.on_a_map:
         figures.append(
             picture(f"Track{where}", f"Map of the track {alt}", track_map, one, corrected, time,
-                    caption="From the same start; the corrected track by estimates that had not seen the data.")
+                    caption="From the same start; the corrected track by estimates that had not seen the data, its "
+                    "colour by how far it is off the reference.")
         )  # fmt: skip
     figures.append(picture(f"Error of position{where}", f"Error of dead reckoning {alt}", error_along, one, corrected))
     return figures
@@ -58,6 +61,9 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
     lines += axes.plot(*one.track_before.T, color=BAD, linewidth=1.2, label="as mounted")
     for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
         lines += axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
+    if len(corrected) == 1:
+        lines[-1].set(alpha=0.0, label="_corrected")  # the bar of colours says it
+        _coloured(figure, axes, one)
     if time is not None:
         for line in lines:
             axes.add_line(Track(line, time.run, time(one.stamps_ns)))
@@ -70,6 +76,19 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
     axes.set_ylabel("north, m")
     legend_above(axes)
     return figure
+
+
+def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
+    """The corrected track, by its distance from the reference's."""
+    off = np.linalg.norm(one.track_after - one.reference, axis=1)
+    parts = np.stack([one.track_after[:-1], one.track_after[1:]], axis=1)
+    track = LineCollection(list(parts), cmap="viridis", linewidths=1.6, zorder=3.0)
+    track.set_array(0.5 * (off[:-1] + off[1:]))
+    track.set_clim(0.0, max(float(off.max()), 1e-3))
+    axes.add_collection(track)
+    bar = figure.colorbar(track, ax=axes, shrink=0.6, aspect=24, pad=0.02)
+    bar.outline.set_visible(False)
+    bar.set_label("corrected: off by, m")
 
 
 def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
 from ..calibration.parameters import Parameters
+from ..calibration.quantities import quantities
 from ..calibration.results import Estimate, Result
 from ..calibration.samples import VelocityFrame
 from ..calibration.verification import HeldOutError, Verification, Word
 from ..files.result_file import result_document
+from ..replay.navigation import Navigation, metres
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
 from . import replay_figures as figures
+from .mounting_figures import mounting_pictures
 from .navigation_figures import navigation_section
 from .page import VERDICT_KINDS, Cell, Table, parameter_texts, signed, write_page
 from .style import Picture, picture
@@ -54,6 +57,13 @@ SCALES = (
     Term(5, "δk z", "Scale error along z", " %", 100.0),
 )
 _ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
+# Which way is plus, for who mounts it
+_AXES = {
+    "scale": "scale of motion ahead",
+    "lever arm x": "lever arm, ahead",
+    "lever arm y": "lever arm, to port",
+    "lever arm z": "lever arm, up",
+}
 BODY_AXES = ("ahead", "to port", "up")
 FAMILIES = ((True, "Models with GNSS"), (False, "Models without GNSS"))
 
@@ -77,15 +87,20 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
     names = ", ".join(bag.name or str(bag) for bag in bags)
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Word.REJECT
+    others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
+    notes = [note for note in replayed.notes if not note.startswith(others)]
     return {
         "title": "DVL calibration",
         "subtitle": names,
         "written": document["written"].replace("T", " ").replace("+00:00", " UTC"),
         "verdict": _verdict(verification),
-        "numbers": [] if rejected else _numbers(result.estimate),
-        "facts": _facts(replayed, document["mounting"], bags),
+        "drift": None if rejected else _drift(replayed.navigation),
+        "numbers": [] if rejected else _numbers(result),
+        "mounting": [] if rejected else mounting_pictures(result),
+        "facts": _facts(replayed, bags),
         "static_transform": None if rejected else document["mounting"]["static_transform_publisher"],
-        "warnings": replayed.notes,
+        "warnings": notes,
+        "other_warnings": [note for note in replayed.notes if note not in notes],
         "held_out": _held_out(result, shown),
         "navigation": navigation_section(replayed.navigation, time),
         "estimates": _estimate_table(result, shown),
@@ -122,35 +137,36 @@ def _scale_terms(model: Model) -> list[Term]:
     return terms
 
 
-def _numbers(estimate: Estimate) -> list[dict[str, str]]:
-    """What the selected model found, large."""
-    model = MODELS[estimate.model]
-    value, std, _ = _error_terms(estimate)
-    numbers = []
-    for term in (*ANGLES, *_scale_terms(model)):
-        observed = estimate.observability[_state_of(model, term)].observed
-        numbers.append(
-            {
-                "name": f"{term.name} – {term.in_words.lower()}",
-                "value": signed(term.factor * value[term.row]) + term.unit,
-                "std": f"± {term.factor * std[term.row]:.2f}{term.unit} (1σ)",
-                "note": "" if observed else "not shown by this data",
-            }
-        )
-    return numbers
+def _numbers(result: Result) -> list[dict[str, str]]:
+    """What the selected model found, large, as the DVL is mounted."""
+    return [
+        {
+            "name": _AXES.get(each.name, each.name),
+            "value": each.in_unit(each.value, signed=True).replace("-", "−"),
+            "std": f"± {each.in_unit(each.std)} (1σ)",
+            "note": "" if each.shown else "not shown by this data",
+            "nominal": f"configured {each.in_unit(each.nominal).replace('-', '−')}",
+        }
+        for each in quantities(result)
+    ]
 
 
-def _facts(replayed: Replayed, mounting: Mapping[str, Any], bags: Sequence[Path]) -> list[tuple[str, str]]:
+def _drift(navigation: Navigation | None) -> dict[str, str] | None:
+    """What the calibration is worth, the largest of all."""
+    if navigation is None:
+        return None
+    before, after = (metres(each.per_km) for each in (navigation.before, navigation.after))
+    return {"before": before, "after": after}
+
+
+def _facts(replayed: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
     result = replayed.result
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     estimate = result.estimate
     missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
     return [
         ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
-        ("Corrected mounting", _rpy(mounting["corrected_rpy"])),
-        ("Nominal mounting", _rpy(mounting["nominal_rpy"])),
         *([("Yaw", "against the IMU's heading")] if replayed.reference_frame in EARTH else []),
-        *_place_and_clock(result),
         ("Recorded", _when(result)),
         ("DVL data", replayed.dvl_data),
         ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
@@ -158,32 +174,6 @@ def _facts(replayed: Replayed, mounting: Mapping[str, Any], bags: Sequence[Path]
         *([("Not shown yet", "; ".join(dict.fromkeys(missing)))] if missing else []),
         ("Bags", ", ".join(map(str, bags))),
     ]
-
-
-def _rpy(angles: Iterable[float]) -> str:
-    named = zip(("roll", "pitch", "yaw"), angles, strict=True)
-    return ", ".join(f"{name} {signed(math.degrees(angle), 3)}°" for name, angle in named)
-
-
-def _place_and_clock(result: Result) -> Iterator[tuple[str, str]]:
-    """Lever arm and delays, of a model that has them."""
-    estimate = result.estimate
-    std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
-    if std is not None:
-        unseen = {entry.axis for entry in estimate.observability if not entry.observed}
-        arm = estimate.lever_arm(result.parameters["lever_arm"])
-        each = [
-            f"{axis} {signed(value, 2)} m ± {sigma:.2f}{' (not shown)' if f'lever arm {axis}' in unseen else ''}"
-            for axis, value, sigma in zip("xyz", arm.tolist(), std.tolist(), strict=True)
-        ]
-        yield "Lever arm", ", ".join(each)
-    if result.delays:
-        names = ["" if each.day is None else f"{each.day.name or _utc(each.day.first_ns)} " for each in result.delays]
-        delays = [
-            f"{name}{signed(delay.seconds, 2)} s ± {delay.std:.2f}{'' if delay.shown else ' (not shown)'}"
-            for name, delay in zip(names, result.delays, strict=True)
-        ]
-        yield "DVL stamps late by", ", ".join(delays)
 
 
 def _when(result: Result) -> str:

@@ -166,6 +166,12 @@ def test_the_cursor_moves_a_point_along_each_track_of_the_map(browser, tmp_path)
         assert all(frame["x"] < box["x"] < frame["x"] + frame["width"] for box in boxes)
         seen.append([(box["x"], box["y"]) for box in boxes])
     assert all(first != second for first, second in zip(*seen, strict=True))
+    slider = page.locator(".slider")
+    at = slider.input_value()
+    assert 0 < int(at) < int(slider.get_attribute("max"))  # it follows the cursor
+    slider.fill("1")
+    moved = [point.bounding_box() for point in points.all()]
+    assert all((box["x"], box["y"]) != before for box, before in zip(moved, seen[-1], strict=True))
     page.close()
 
 

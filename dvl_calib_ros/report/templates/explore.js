@@ -139,7 +139,16 @@
       place.append(point);
       return point;
     });
-    return at => {
+    // by hand as well: the charts of the run follow
+    const slider = document.createElement("input");
+    Object.assign(slider, { type: "range", min: 0, max: plot.times.length - 1, value: 0, className: "slider" });
+    slider.setAttribute("aria-label", "time along the track");
+    place.after(slider);
+    slider.addEventListener("input", () => {
+      const at = plot.times[+slider.value], [chart] = runs.get(plot.run) ?? [];
+      if (chart) chart.setCursor({ left: chart.valToPos(at, "x"), top: 10 }); else show(at);
+    });
+    const show = at => {
       let low = 0, high = plot.times.length - 1;
       while (low < high) {
         const middle = (low + high) >> 1;
@@ -150,7 +159,9 @@
         point.style.left = `${plot.tracks[i].x[low]}%`;
         point.style.top = `${plot.tracks[i].y[low]}%`;
       });
+      if (at != null) slider.value = low;
     };
+    return show;
   }
 
   // ---------------------------------------------------------------- what is shown, and the way back

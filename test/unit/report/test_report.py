@@ -19,7 +19,9 @@ from report_fixtures import FEW, Page, assert_described, drawn, evaluation, reco
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.report import write_evaluation_report
@@ -84,12 +86,37 @@ def test_the_table_holds_every_models_estimates_in_degrees_and_per_cent(made):
         assert row[-4:-2] == [str(estimate.used), str(estimate.gated)]
 
 
-def test_the_selected_models_errors_stand_large_on_top(made):
+def test_the_mounting_stands_large_on_top_as_a_user_mounts_it(made):
     page, replayed = made
-    state, std = replayed.result.estimate.state, replayed.result.estimate.std
-    summary = page.text[: page.text.index("Corrected mounting")].replace("−", "-")
-    assert f"φz – misalignment about z {np.degrees(state[2]):+.2f}° ± {np.degrees(std[2]):.2f}°" in summary
-    assert f"{100 * state[3]:+.2f} % ± {100 * std[3]:.2f} %" in summary
+    summary = page.text[: page.text.index("Recorded")].replace("−", "-")
+    found = quantities(replayed.result)
+    assert {each.name for each in found} >= {"roll", "pitch", "yaw", "scale"}
+    for each in found:
+        assert f"{each.in_unit(each.value, signed=True)} ± {each.in_unit(each.std)} (1σ)" in summary
+    assert "φ" not in summary and "from above" in summary and "from starboard" in summary
+
+
+def test_after_a_reject_there_is_no_mounting_and_no_drift_that_it_would_be_worth(tmp_path, monkeypatch):
+    drawn(monkeypatch)
+    bag = write_bag(tmp_path / "bag", run())
+    replayed = recorded(bag, mounting_rpy=(0.0, 0.0, 0.3))
+    assert replayed.result.verifications[replayed.result.selected].verdict is Word.REJECT
+    write_replay_report(tmp_path / "report.html", replayed, [bag], FEW)
+    text = Page(tmp_path / "report.html").text
+    first = text[: text.index("Estimates")]
+    assert "reject" in first and "configured" not in first and "DVL on the vehicle" not in first
+    assert "ready to paste" not in text and "Dead reckoning drifts by" not in text
+
+
+def test_warnings_of_models_that_were_not_chosen_are_folded_away(tmp_path, made, monkeypatch):
+    drawn(monkeypatch)
+    own = f"{made[1].result.selected}: says something"
+    replayed = replace(made[1], notes=[own, "M7: is not the one", "all: of everything"])
+    write_replay_report(tmp_path / "report.html", replayed, [tmp_path], FEW)
+    html = (tmp_path / "report.html").read_text()
+    folded = html[html.index("<details>") : html.index("</details>")]
+    assert "not chosen (1)" in folded and "M7: is not the one" in folded
+    assert own not in folded and "all: of everything" not in folded
 
 
 def test_the_static_transform_can_be_pasted(made):
