@@ -8,6 +8,8 @@ second pass, constant memory.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +33,12 @@ class FoldSums:
     def __init__(self, *shapes: tuple[int, ...]) -> None:
         self._each = [np.zeros((FOLDS, *shape)) for shape in shapes]
         self._total: tuple[Array, ...] | None = None
+
+    def copy(self) -> FoldSums:
+        """The same, which goes its own way."""
+        made = copy(self)
+        made._each = [sums.copy() for sums in self._each]
+        return made
 
     def add(self, fold: int | slice, *more: Array | float) -> None:
         """Add to one fold, or to several (F, ...)."""

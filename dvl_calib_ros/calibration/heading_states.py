@@ -15,6 +15,7 @@ No row has a column more; blocks of time have (time_blocks.py). On one heading �
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ import numpy as np
 from .frames import Array, product
 from .kalman import GaussianState
 from .samples import Index, Mask, Stamps
-from .time_blocks import TimeBlocks
+from .time_blocks import BlocksOfOne, TimeBlocks, inflations
 
 # Terms of a block: sine and cosine of its heading and of twice that, time (s), and one, where references are of the
 # earth, else zeros.
@@ -143,68 +144,154 @@ class HeadingStates(NamedTuple):
     inflation: Array
 
 
-def heading_states(blocks: TimeBlocks, states: GaussianState, numbers: Index, best: int, std: float) -> HeadingStates:
-    """The deviation by blocks of time that are `with_terms`; none by others, which say no more than `inflation`.
+class Seen(NamedTuple):
+    """M hypotheses as they stood once: x (M, n), P (M, n, n) without a deviation, and what blocks of time told of them.
 
-    states: x (M, n), P (M, n, n) without it, of the hypotheses with these numbers (M,) in the blocks. best: place among
-    them of the one that says how large it is. std: rad, `heading_deviation_std`.
+    best: place of the one that says how large it is. information (M, n + 6, n + 6), vector (M, n + 6): of all blocks
+    `with_terms`. blocks: those of the best one.
     """
-    m, n = states.x.shape
-    if not blocks.count or blocks.total[1].shape[1] == n:  # blocks without terms
-        factor = blocks.inflation(int(numbers[best]), states.x[best], states.p[best])
-        return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), 0.0, factor)
-    told, vector = (each[numbers] for each in blocks.total)
-    onto = _onto_coefficients(told[best, n:, n:], blocks.kept[0][:, numbers[best], -1, -2:])
-    beside = onto @ told[:, n:, :n]
-    turned = beside @ states.p
-    own = onto @ told[:, n:, n:] @ onto.T - turned @ beside.swapaxes(1, 2)
-    scores = vector[:, n:] @ onto.T - product(beside, states.x)
-    if not _is_definite(own, std):  # numbers that ran away say nothing of the heading
-        return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), 0.0, np.ones(n))
 
-    def deviating(root: Array, which: slice | Index) -> tuple[Array, Array, Array, Array]:
-        """Coefficients, their covariance, shift and more of some hypotheses, where their prior has σ root (5,)."""
-        p = root[:, None] * np.linalg.inv(np.eye(N_COEFFICIENTS) + root[:, None] * own[which] * root) * root
-        x = product(p, scores[which])
-        gain = p @ turned[which]
-        more = turned[which].swapaxes(1, 2) @ gain
-        return (
-            x,
-            0.5 * (p + p.swapaxes(1, 2)),
-            -product(turned[which].swapaxes(1, 2), x),
-            0.5 * (more + more.swapaxes(1, 2)),
+    states: GaussianState
+    best: int
+    information: Array
+    vector: Array
+    blocks: BlocksOfOne
+
+    @staticmethod
+    def of(blocks: TimeBlocks, states: GaussianState, numbers: Index, best: int) -> Seen:
+        """Of hypotheses with these numbers (M,) in the blocks, as of now."""
+        information, vector = blocks.total
+        some = numbers if blocks.count else numbers[:0]
+        return Seen(states, best, information[some], vector[some], blocks.of(int(numbers[best])))
+
+    @property
+    def has_terms(self) -> bool:
+        """Whether there are blocks, and these are `with_terms`."""
+        return self.vector.shape[1] > self.states.x.shape[1]
+
+
+def heading_states(seen: Sequence[Seen], std: float) -> list[HeadingStates]:
+    """The deviation each time; none where blocks are without terms, which say no more than `inflation`.
+
+    std: rad, `heading_deviation_std`.
+    """
+    found: dict[int, HeadingStates] = {}
+    with_them = [number for number, each in enumerate(seen) if each.has_terms]
+    if with_them:
+        deviations = [_Deviation.of(seen[number]) for number in with_them]
+        sound = [place for place, each in enumerate(deviations) if _is_definite(each.information, std)]
+        states = _deviating([deviations[place] for place in sound], std) if sound else []
+        found = {with_them[place]: each for place, each in zip(sound, states, strict=True)}
+    return [found[number] if number in found else _none(each) for number, each in enumerate(seen)]
+
+
+def _none(seen: Seen) -> HeadingStates:
+    """Of blocks without terms; and numbers that ran away say nothing of the heading."""
+    m, n = seen.states.x.shape
+    factor: Array = np.ones(n)
+    if not seen.has_terms and len(seen.blocks.vector):
+        best = slice(seen.best, seen.best + 1)
+        factor = inflations([seen.blocks], seen.states.x[best], seen.states.p[best])[0]
+    return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), 0.0, factor)
+
+
+class _Deviation(NamedTuple):
+    """What M hypotheses know of the coefficients. onto: (5, 6), from terms to coefficients. turned: (M, 5, n), by how
+    much the states turn them. information (M, 5, 5), scores (M, 5): theirs, whatever the states are."""
+
+    seen: Seen
+    onto: Array
+    turned: Array
+    information: Array
+    scores: Array
+
+    @staticmethod
+    def of(seen: Seen) -> _Deviation:
+        """By what was seen."""
+        x, p = seen.states
+        n, told = x.shape[1], seen.information
+        onto = _onto_coefficients(told[seen.best, n:, n:], seen.blocks.information[:, -1, -2:])
+        beside = onto @ told[:, n:, :n]
+        turned = beside @ p
+        own = onto @ told[:, n:, n:] @ onto.T - turned @ beside.swapaxes(1, 2)
+        return _Deviation(seen, onto, turned, own, seen.vector[:, n:] @ onto.T - product(beside, x))
+
+
+def _deviating(each: Sequence[_Deviation], std: float) -> list[HeadingStates]:
+    """S times the deviation."""
+    sizes = np.array([len(one.scores) for one in each])
+    owner, ends = np.repeat(np.arange(len(each)), sizes), np.cumsum(sizes)
+    best = ends - sizes + [one.seen.best for one in each]
+    turned, own, scores, told, vector = (
+        np.concatenate(parts)
+        for parts in zip(
+            *((one.turned, one.information, one.scores, one.seen.information, one.seen.vector) for one in each),
+            strict=True,
         )
+    )
+    x, p = (
+        np.stack(parts) for parts in zip(*((s.states.x[s.best], s.states.p[s.best]) for s, *_ in each), strict=True)
+    )
+    onto = np.stack([one.onto for one in each])
+    n, of_best = x.shape[1], told[best]
+    to_terms = np.zeros((len(each), n + N_TERMS, n + N_COEFFICIENTS))
+    to_terms[:, :n, :n] = np.eye(n)
+    to_terms[:, n:, n:] = onto.swapaxes(1, 2)
 
-    both, of_terms = np.empty((n + N_COEFFICIENTS,) * 2), np.eye(n + N_TERMS, n + N_COEFFICIENTS)
-    of_terms[n:, n:] = onto.T
+    def deviating(root: Array, at: Index) -> tuple[Array, Array, Array, Array]:
+        """Coefficients, their covariance, shift and more of some hypotheses, where their prior has σ root (S, 5)."""
+        std_of = root[owner[at]]
+        spread = np.eye(N_COEFFICIENTS) + std_of[:, :, None] * own[at] * std_of[:, None]
+        p = std_of[:, :, None] * np.linalg.inv(spread) * std_of[:, None]
+        x = product(p, scores[at])
+        across = turned[at].swapaxes(1, 2)
+        more = across @ (p @ turned[at])
+        return x, 0.5 * (p + p.swapaxes(1, 2)), -product(across, x), 0.5 * (more + more.swapaxes(1, 2))
 
     def inflation(root: Array) -> tuple[Array, Array, Array]:
-        """Of the best one: coefficients, their covariance, and by how much σ (n + 5,) of states and them grow."""
-        x, p, shift, more = (each[0] for each in deviating(root, np.array([best])))
-        across = -turned[best].T @ p
-        both[:n, :n], both[:n, n:], both[n:, :n], both[n:, n:] = states.p[best] + more, across, across.T, p
-        at = of_terms @ np.concatenate([states.x[best] + shift, x])
-        return x, p, blocks.inflation(int(numbers[best]), at, both @ of_terms.T, np.diag(both))
+        """Of the best ones: coefficients, their covariance, and by how much σ (S, n + 5) of states and them grow."""
+        found, own_p, shift, more = deviating(root, best)
+        both = np.empty((len(each), n + N_COEFFICIENTS, n + N_COEFFICIENTS))
+        across = -turned[best].swapaxes(1, 2) @ own_p
+        both[:, :n, :n], both[:, :n, n:], both[:, n:, :n], both[:, n:, n:] = (
+            p + more,
+            across,
+            across.swapaxes(1, 2),
+            own_p,
+        )
+        at = product(to_terms, np.concatenate([x + shift, found], axis=1))
+        variance = np.diagonal(both, axis1=1, axis2=2)
+        return found, own_p, inflations([s.blocks for s, *_ in each], at, both @ to_terms.swapaxes(1, 2), variance)
 
     # what is left where it may be of any size is noise, and whatever else: the evidence is worth as much less
-    _, _, factor = inflation(_FACTORS[-1] * std * _SHARE)
-    level = float((factor[n:] ** 2).mean())
+    root: Array = np.broadcast_to(_FACTORS[-1] * std * _SHARE, (len(each), N_COEFFICIENTS))
+    _, _, factor = inflation(root)
+    level = (factor[:, n:] ** 2).mean(axis=1)
     # and a constant beside, of any size: a yaw that its own prior does not expect is no deviation for that
-    free = np.vstack([onto, np.eye(N_TERMS)[-1]])
-    beside_free = free @ told[best, n:, :n]
-    own_free = (free @ told[best, n:, n:] @ free.T - beside_free @ states.p[best] @ beside_free.T) / level
-    scores_free = (free @ vector[best, n:] - beside_free @ states.x[best]) / level
-    root = std * _SHARE
+    free = np.concatenate([onto, np.broadcast_to(np.eye(N_TERMS)[-1:], (len(each), 1, N_TERMS))], axis=1)
+    across = free.swapaxes(1, 2)
+    beside = free @ of_best[:, n:, :n]
+    own_free = free @ of_best[:, n:, n:] @ across - beside @ p @ beside.swapaxes(1, 2)
+    scores_free = product(free, vector[best, n:]) - product(beside, x)
+    root = np.broadcast_to(std * _SHARE, (len(each), N_COEFFICIENTS))
     for which in (_CYCLES, _DRIFT):
-        root = np.where(which, _size(own_free, scores_free, root, which), 1.0) * root
-    x, p, factor = inflation(root)
-    _, _, shift, more = deviating(root, slice(None))
-    # at any time of the recording, as far as data show
-    is_turned = bool(told[best, -1, -1] > 0.0)
-    drifted = (x[-1] ** 2 + p[-1, -1]) / 12.0 if is_turned else 0.0
-    in_time = np.append(np.ones(N_COEFFICIENTS - 1), onto[-1, -2])
-    of_one = GaussianState(x * in_time, p * np.outer(in_time, in_time)).raised(factor[n:])
-    return HeadingStates(of_one if is_turned else None, shift, more, float(drifted), factor[:n])
+        size = _size(own_free / level[:, None, None], scores_free / level[:, None], root, which)
+        root = np.where(which, size[:, None], 1.0) * root
+    found, own_p, factor = inflation(root)
+    _, _, shift, more = deviating(root, np.arange(len(owner)))
+    states = []
+    for number, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True)):
+        at = slice(end - size, end)
+        one, p_one = found[number], own_p[number]
+        # at any time of the recording, as far as data show
+        is_turned = bool(of_best[number, -1, -1] > 0.0)
+        drifted = (one[-1] ** 2 + p_one[-1, -1]) / 12.0 if is_turned else 0.0
+        in_time = np.append(np.ones(N_COEFFICIENTS - 1), onto[number, -1, -2])
+        of_one = GaussianState(one * in_time, p_one * np.outer(in_time, in_time)).raised(factor[number, n:])
+        states.append(
+            HeadingStates(of_one if is_turned else None, shift[at], more[at], float(drifted), factor[number, :n])
+        )
+    return states
 
 
 def _is_definite(information: Array, std: float) -> bool:
@@ -232,15 +319,19 @@ def _onto_coefficients(square: Array, times: Array) -> Array:
     return onto
 
 
-def _size(information: Array, scores: Array, root: Array, which: Mask) -> float:
-    """How many times larger the prior σ root (5,) of some coefficients is, by the evidence: root of the mean square.
+def _size(information: Array, scores: Array, root: Array, which: Mask) -> Array:
+    """How many times larger (S,) the prior σ root (S, 5) of some coefficients is, by the evidence: root mean square.
 
-    information (6, 6), scores (6,): of the coefficients and a constant, without their prior. which: (5,).
+    information (S, 6, 6), scores (S, 6): of the coefficients and a constant, without their prior. which: (5,).
     """
-    roots = np.column_stack([np.where(which, _FACTORS[:, None], 1.0) * root, np.full(len(_FACTORS), _ANY)])
-    spread = np.eye(N_COEFFICIENTS + 1) + roots[:, :, None] * information * roots[:, None]
-    about = roots * scores
-    explained = (about * np.linalg.solve(spread, about[..., None])[..., 0]).sum(axis=1)
+    factors = np.where(which, _FACTORS[:, None], 1.0)
+    roots = np.full((len(root), *factors.shape[:1], N_COEFFICIENTS + 1), _ANY)
+    roots[..., :-1] = factors * root[:, None]
+    spread = np.eye(N_COEFFICIENTS + 1) + roots[..., None] * information[:, None] * roots[..., None, :]
+    about = roots * scores[:, None]
+    explained = (about * np.linalg.solve(spread, about[..., None])[..., 0]).sum(axis=2)
     likely = 0.5 * (explained - np.linalg.slogdet(spread)[1]) + _LOG_LIKELY
-    share = np.exp(likely - likely.max())
-    return float(np.sqrt(share @ _FACTORS**2 / share.sum()))
+    share = np.exp(likely - likely.max(axis=1, keepdims=True))
+    # not by `@`, which sums in another order for one than for several
+    size: Array = np.sqrt((share * _FACTORS**2).sum(axis=1) / share.sum(axis=1))
+    return size

@@ -16,6 +16,7 @@ would not do: what is kept are sums, joined with the filter's state when somebod
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -78,6 +79,12 @@ class HeaveRows:
         self._sums.clear()
         self._count, self._seconds = 0, 0.0
         self._sum = np.zeros_like(self._sum)
+
+    def copy(self) -> HeaveRows:
+        """The same, which goes its own way."""
+        made = copy(self)
+        made._folds, made._sums = self._folds.copy(), {}
+        return made
 
     def starts(self, stamps_ns: Stamps) -> Index:
         """Which samples (of N) begin a block that is not the one before."""

@@ -9,6 +9,9 @@ estimation of misspecified models", 1982).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,46 +96,74 @@ class TimeBlocks:
         if self.count:
             self.total = self.kept[0].sum(axis=0), self.kept[1].sum(axis=0)
 
-    def inflation(self, index: int, x: Array, p: Array, variance: Array | None = None) -> Array:
-        """By how much σ of each state (n,) has to grow, at least 1. index: which of the K. x (n,), P (n, n) of it.
+    def of(self, index: int) -> BlocksOfOne:
+        """What the blocks so far say of one of the K."""
+        if not self.count:
+            return BlocksOfOne(np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
+        information, vector = (each[:, index].copy() for each in self.kept)
+        return BlocksOfOne(information, vector, self.total[0][index])
 
-        The largest over blocks as they are, and over two and four of them together. variance: (r,) of r quantities that
-        are judged instead, whose covariance with the states p (r, n) then is.
-        """
-        variance = np.diag(p) if variance is None else variance
-        factor = np.ones(len(variance))
-        if self.count < FEWEST:
-            return factor
-        information, vector = (each[:, index] for each in self.kept)
-        scores = vector - information @ x
-        claimed = np.diag(p @ information.sum(axis=0) @ p.T)
-        while len(scores) >= FEWEST:
-            m = len(scores)
-            scatter = p @ scores.T
-            found = (scatter**2).sum(axis=1) * (m / (m - 1.0)) * _lasting(scatter)
-            ratio = found / np.maximum(claimed, 1e-300)
-            beyond_chance = ratio > chi2_isf(CHANCE, m - 1) / (m - 1)
-            # the prior's part of P is not the data's to judge
-            total = 1.0 + (found - claimed) / np.maximum(variance, 1e-300)
-            factor = np.maximum(factor, np.where(beyond_chance, np.sqrt(np.maximum(total, 1.0)), 1.0))
-            if m % 2:
-                scores = np.vstack([scores[:-2], scores[-2:].sum(axis=0)])[: m - 1]
-                m -= 1
-            scores = scores[0::2][: m // 2] + scores[1::2][: m // 2]
-        return factor
+    def inflation(self, index: int, x: Array, p: Array) -> Array:
+        """`inflations` of one of the K, x (n,), P (n, n)."""
+        return inflations([self.of(index)], x[None], p[None])[0]
+
+
+class BlocksOfOne(NamedTuple):
+    """Of one hypothesis or model what each block told, Λ_b (B, n, n) and y_b (B, n), and the sum of all Λ_b (n, n)."""
+
+    information: Array
+    vector: Array
+    total: Array
+
+
+def inflations(blocks: Sequence[BlocksOfOne], x: Array, p: Array, variance: Array | None = None) -> Array:
+    """By how much σ of each state has to grow, at least 1, by S times blocks (S, n). x (S, n), P (S, n, n).
+
+    The largest over blocks as they are, and over two and four of them together. variance: (S, r) of r quantities that
+    are judged instead, whose covariance with the states p (S, r, n) then is.
+    """
+    variance = np.diagonal(p, axis1=1, axis2=2) if variance is None else variance
+    factor = np.ones(variance.shape)
+    counts = np.array([len(each.vector) for each in blocks])
+    for count in sorted(set(counts[counts >= FEWEST].tolist())):
+        at = np.flatnonzero(counts == count)
+        scores = np.stack([blocks[number].vector - blocks[number].information @ x[number] for number in at.tolist()])
+        total = np.stack([blocks[number].total for number in at.tolist()])
+        factor[at] = _inflations(scores, total, p[at], variance[at])
+    return factor
+
+
+def _inflations(scores: Array, total: Array, p: Array, variance: Array) -> Array:
+    """(S, r), by scores (S, m, n) and their information (S, n, n)."""
+    factor = np.ones(variance.shape)
+    claimed = ((p @ total) * p).sum(axis=2)
+    while scores.shape[1] >= FEWEST:
+        m = scores.shape[1]
+        scatter = p @ scores.swapaxes(1, 2)
+        found = (scatter**2).sum(axis=2) * (m / (m - 1.0)) * _lasting(scatter)
+        ratio = found / np.maximum(claimed, 1e-300)
+        beyond_chance = ratio > chi2_isf(CHANCE, m - 1) / (m - 1)
+        # the prior's part of P is not the data's to judge
+        more = 1.0 + (found - claimed) / np.maximum(variance, 1e-300)
+        factor = np.maximum(factor, np.where(beyond_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
+        pairs = scores[:, 0 : m - m % 2 : 2] + scores[:, 1::2]
+        if m % 2:
+            pairs[:, -1] += scores[:, -1]
+        scores = pairs
+    return factor
 
 
 def _lasting(scatter: Array) -> Array:
-    """By how much the variance of the sum of each of n series (n, m) is more than that of their terms.
+    """By how much the variance of the sum of each of series (S, n, m) is more than that of their terms.
 
     What lasts longer than a block is in neighbours alike, and where few blocks are left it is not seen otherwise.
     As of a process of first order, by the correlation of neighbours, which a mean that was taken off makes smaller by
     (1 + 4 ρ) / m (Kendall, 1954).
     """
-    m = scatter.shape[1]
+    m = scatter.shape[-1]
     if m < LASTING_FROM:
-        return np.ones(len(scatter))
-    beside = (scatter[:, 1:] * scatter[:, :-1]).sum(axis=1) / np.maximum((scatter**2).sum(axis=1), 1e-300)
+        return np.ones(scatter.shape[:-1])
+    beside = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
     rho = np.clip((beside + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
     more = (1.0 + rho) / (1.0 - rho)
     return np.asarray(np.where(beside > LASTS / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))

@@ -12,24 +12,24 @@ show (time_blocks.py). (Long, because what a hypothesis knows, of heave and over
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from ..correction_parameters import PriorOnErrors, to_correction
 from ..folds import FOLDS, FoldSums, folds_of, with_states_of
-from ..frames import Array
-from ..heading_states import HeadingStates, all_told, heading_states, heading_terms, upwards, with_terms
+from ..frames import Array, product
+from ..heading_states import Seen, all_told, heading_states, heading_terms, upwards, with_terms
 from ..heave import HeaveRows, HeaveSums, with_heave
-from ..kalman import GaussianState, distance_squared
+from ..kalman import GaussianState
 from ..parameters import Parameters
 from ..robust import median
-from ..samples import Index, Mask, Stamps
+from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
-from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, OF_DELAY, OF_NONE, DelayedRows
+from .known import After, BlockRows, DayState, Ended, Found, Hypotheses, Known, Posterior, Sums, Told
+from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, DelayedRows
+from .told import innovation_squared, told_by
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
 CELL_STD_S = 0.2
@@ -44,75 +44,6 @@ WIDER, SHOWN_SHARE = 100.0, 0.5
 
 
 _BEYOND: Index = np.arange(N_STATE)[BEYOND]
-# Columns of what rows hold for each delay, and the states that they say anything of.
-_MOVING: Index = np.append(OF_DELAY, N_STATE)
-_SHOWN_BY_ROWS: Index = np.concatenate([OF_NONE, OF_DELAY])
-
-
-class Hypotheses(NamedTuple):
-    """State (K, n) and covariance (K, n, n), on ψ and κ, with the last state relative to the hypothesis' own delay.
-
-    misfit: (K,) zᵀR⁻¹z that is left, prior included. log_evidence: (K,), of the data as claimed. information, vector:
-    Λ (K, n, n) and Λx (K, n).
-    """
-
-    x: Array
-    p: Array
-    misfit: Array
-    log_evidence: Array
-    information: Array
-    vector: Array
-
-
-class Found(NamedTuple):
-    """What is known at some time: the likely hypotheses x (M, n), P (M, n, n), on ψ and κ, the numbers kept (M,) of
-    their delays, and the share (M,) of each; shown, inflation and heading as of `Posterior`;
-    drifted as of `HeadingStates`."""
-
-    likely: GaussianState
-    kept: Index
-    share: Array
-    shown: Mask
-    inflation: Array
-    heading: GaussianState | None
-    drifted: float
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """What the bank says.
-
-    state: x (n,), P (n, n) of G2's states. shown: (n,) which of them the data alone shows. inflation: (n,) by how much
-    its standard deviations were raised above the filter's own. turned: (3,) by how much 1 m of lever arm along the
-    axis that matters most turns each misalignment, rad; by_lever_arm: (3,) variance of each that comes with what is not
-    known of the lever arm, in variances without. heading: coefficients of its deviation, as of `HeadingStates`.
-    """
-
-    state: GaussianState
-    shown: Mask
-    inflation: Array
-    turned: Array
-    by_lever_arm: Array
-    heading: GaussianState | None
-
-
-class _Ended(NamedTuple):
-    """A day that is over.
-
-    known: of all, and without each fold, the state as the filter has it, x (n,), P (n, n). shown: (n,) which of the
-    states the data showed. inflation: (n,) by how much σ was to be raised.
-    """
-
-    known: list[GaussianState]
-    shown: Mask
-    inflation: Array
-
-
-class DayState(NamedTuple):
-    """G2's states on one day, x (n,), P (n, n), by all data; and which (n,) of them are shown."""
-
-    state: GaussianState
-    shown: Mask
 
 
 class DelayBank:
@@ -137,13 +68,13 @@ class DelayBank:
         self._process_rate = process_rate
         self._solved: Hypotheses | None = None
         self._begin_day()
-        self._information, self._vector = self._start.information
-        self._ended: list[_Ended] = []
-        self._square = np.einsum("ki,ki->k", self._vector, self._start.x)
-        self._log_det = np.linalg.slogdet(self._information)[1]
+        information, vector = self._start.information
+        self._ended: list[Ended] = []
+        square = np.einsum("ki,ki->k", vector, self._start.x)
+        self._sums = Sums(information, vector, square, 0.0, parameters.motion_std**2)
+        self._log_det = np.linalg.slogdet(information)[1]
         self._parameters = parameters
         self._heave = HeaveRows(len(DELAYS_S), N_STATE, parameters)
-        self._heave_variance = parameters.motion_std**2
         self._regressor_noise = np.zeros(4)
         self._recent: list[float] = []
         self.used = self.gated = 0
@@ -170,8 +101,7 @@ class DelayBank:
         """
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
-        inflation = self._inflation(best, found)
-        shown = self._shown(best, inflation)
+        inflation, shown = self._shown_now(best, found)
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
         begins = [_around_each_delay(with_states_of(each, self._unknown, OF_DAY)).information for each in known]
@@ -179,67 +109,176 @@ class DelayBank:
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
         self.blocks.end_day(OF_DAY, *total, source)
-        self._ended.append(_Ended(known, shown, inflation))
+        self._ended.append(Ended(known, shown, inflation))
         self._heave.close()
         self._heave.absorb()  # its rows are in what is known
         self._heave.learn_from(source)
         self.prior = with_states_of(self.prior, self._unknown, OF_DAY)
         self._begin_day()
-        self._information, self._vector = begins[0]
+        before = self._sums
         if self._folds is not None:
             self._folds.clear()
             for fold, (information, vector) in enumerate(begins[1:]):
-                self._folds.add(fold, self._information - information, self._vector - vector)
-        x = np.linalg.solve(self._information, self._vector[..., None])[..., 0]
-        self._square = found.misfit[best] + np.einsum("ki,ki->k", self._vector, x)
-        self._log_det = np.linalg.slogdet(self._information)[1]
-        self._regressor_noise[-1] = 0.0
+                self._folds.add(fold, begins[0][0] - information, begins[0][1] - vector)
+        information, vector = begins[0]
+        x = np.linalg.solve(information, vector[..., None])[..., 0]
+        square = found.misfit[best] + np.einsum("ki,ki->k", vector, x)
+        self._sums = before._replace(information=information, vector=vector, square=square)
+        self._log_det = np.linalg.slogdet(information)[1]
+        self._regressor_noise = np.append(self._regressor_noise[:-1], 0.0)
         self._solved = None
+
+    @property
+    def sums(self) -> Sums:
+        """What the rows so far told."""
+        return self._sums
+
+    @property
+    def heave(self) -> HeaveRows:
+        """Rows of heave so far."""
+        return self._heave
+
+    @property
+    def hypotheses(self) -> Hypotheses:
+        """All of them, by what is known."""
+        return self._solve()
 
     @property
     def mean_nis(self) -> float:
         """Mean νᵀS⁻¹ν of the samples used, against the hypothesis that explained each best; nan if none."""
         return self._nis_sum / self.used if self.used else float("nan")
 
-    def add(self, rows: DelayedRows, stamps_ns: Stamps, seconds: float) -> Mask:
-        """Take the rows of a block of time; which (J,) of them it used. stamps_ns: (J,) of each row. seconds: of it."""
+    def add(self, blocks: Sequence[BlockRows]) -> list[After]:
+        """Take the rows of blocks of time, in order, and say what is known after each.
+
+        Many at once come to the same as one after the other: what they tell is summed up first.
+        """
+        if len(blocks) > 1:
+            # what a row tells ages with each block under a random walk
+            if self._process_rate is None and all(len(each.rows) for each in blocks):
+                with suppress(np.linalg.LinAlgError):
+                    return self._taken(blocks)
+            return [self.add([each])[0] for each in blocks]
+        if not blocks:
+            return []
         if self._process_rate is not None:
             self._absorb_heave()
-            self._drift(seconds)
-        if not len(rows):
-            return np.zeros(0, dtype=bool)
-        use = self._gated(rows)
-        folds = folds_of(stamps_ns, self._parameters)
-        # by folds also where nobody verifies: sums in one order are the same to the last bit
-        by_fold = [(fold, _told(rows, use & (folds == fold))) for fold in sorted(set(folds[use].tolist()))]
-        nothing = np.zeros_like(self._information), np.zeros_like(self._vector), np.zeros_like(self._square)
-        (total, total_vector, square), *others = (told for _, told in by_fold) if by_fold else (nothing,)
-        for information, vector, one in others:
-            total, total_vector, square = total + information, total_vector + vector, square + one
-        if not (np.isfinite(total).all() and np.isfinite(total_vector).all() and np.isfinite(square).all()):
-            return np.zeros(len(rows), dtype=bool)  # it goes on as before these rows
-        self._solved = None
-        self._square += square
-        self._information += total
-        self._regressor_noise += rows.weight[use] @ rows.regressor_noise[use]
-        self._vector += total_vector
-        weight = rows.weight * use
-        self.blocks.add(*self._with_terms(total, total_vector, rows, weight, stamps_ns), float(weight.sum()))
-        self._heave.add_sums(stamps_ns, rows.heave, use)
-        self._learn_heave()
-        if self._folds is not None:
-            for fold, (information, vector, _) in by_fold:
-                self._folds.add(fold, information, vector)
-        return use
+            self._drift(blocks[0].seconds)
+        return self._taken(blocks) if len(blocks[0].rows) else [After(self.used, self.gated, self.mean_nis)]
 
-    def _with_terms(
-        self, information: Array, vector: Array, rows: DelayedRows, weight: Array, stamps_ns: Stamps
-    ) -> tuple[Array, Array]:
-        """What rows of this weight (J,) and with these stamps (J,) told, with what it says of the heading's error."""
-        if self._epoch_ns is None:
-            self._epoch_ns = int(stamps_ns[0])
-        seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
-        return with_terms(information, vector, heading_terms(rows.motion.earth, weight, seconds), self._up)
+    def _taken(self, blocks: Sequence[BlockRows]) -> list[After]:
+        """`add`. Raises numpy.linalg.LinAlgError, and is as before, where numbers of several blocks run away."""
+        expected = _Expected(self, blocks)
+        if not expected.is_finite:
+            if len(blocks) > 1:
+                raise np.linalg.LinAlgError("what a block tells is not finite")
+            self._count(expected.nis[0], expected.use[0])  # it goes on as before these rows
+            return [After(self.used, self.gated, self.mean_nis, self.known())]
+        after = []
+        for (rows, stamps_ns, _), use, nis, told, (sums, found) in zip(
+            blocks, expected.use, expected.nis, expected.told, expected.steps, strict=True
+        ):
+            self._count(nis, use)
+            self._sums, self._solved = sums, found
+            self._regressor_noise = self._regressor_noise + rows.weight[use] @ rows.regressor_noise[use]
+            weight = rows.weight * use
+            if self._epoch_ns is None:
+                self._epoch_ns = int(stamps_ns[0])
+            seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
+            terms = heading_terms(rows.motion.earth, weight, seconds)
+            self.blocks.add(*with_terms(told.information, told.vector, terms, self._up), told.weight)
+            if self._folds is not None:
+                for fold, (information, vector, _) in told.by_fold:
+                    self._folds.add(fold, information, vector)
+            after.append(After(self.used, self.gated, self.mean_nis, self.known()))
+        self._heave = expected.heave
+        return after
+
+    def _count(self, nis: Array, use: Mask) -> None:
+        self._recent = (self._recent + nis.tolist())[-RECENT:]
+        self.used += int(use.sum())
+        self.gated += int((~use).sum())
+        self._nis_sum += float(nis[use].sum())
+
+    def gated_by(self, nis: Sequence[Array]) -> list[Mask]:
+        """Which rows of blocks to come are used, by their innovations (J,): not those that no hypothesis explains.
+
+        A wrong hypothesis must not throw out what contradicts it, so all use the same samples; a lever arm that is not
+        known yet is in S. The level is that of recent innovations.
+        """
+        recent, uses = self._recent, []
+        for each in nis:
+            use = np.ones(len(each), dtype=bool)
+            if len(recent) >= ENOUGH:
+                level = max(1.0, float(median(np.array(recent))) / MEDIAN_NIS)
+                use = each <= self._gate * level
+            recent = (recent + each.tolist())[-RECENT:]
+            uses.append(use)
+        return uses
+
+    def told_by(self, block: BlockRows, use: Mask) -> Told:
+        """What the rows of a block tell that are used (J,)."""
+        folds = folds_of(block.stamps_ns, self._parameters)
+        # by folds also where nobody verifies: sums in one order are the same to the last bit
+        by_fold = [(fold, told_by(block.rows, use & (folds == fold))) for fold in sorted(set(folds[use].tolist()))]
+        sums = self._sums
+        total = [np.zeros_like(each) for each in (sums.information, sums.vector, sums.square)]
+        for number, (_, one) in enumerate(by_fold):
+            total = [each + more for each, more in zip(total, one, strict=True)] if number else list(one)
+        information, vector, square = total
+        return Told(information, vector, square, float((block.rows.weight * use).sum()), by_fold)
+
+    def steps(self, start: Sums, told: Sequence[Told], heave: Sequence[HeaveSums]) -> list[tuple[Sums, Hypotheses]]:
+        """What is summed up, and all hypotheses by it, after each of some blocks. heave: rows of heave by then."""
+        if not told:
+            return []
+        information, vector, square, weight = (
+            np.add.accumulate(np.stack([np.asarray(first), *more]))[1:]
+            for first, more in zip(start[:4], zip(*(each[:4] for each in told), strict=True), strict=True)
+        )
+        rows = HeaveSums.stacked(heave)
+
+        def solved(variance: Array) -> Hypotheses:
+            return self._hypotheses(information, vector, square, rows.told / variance[:, None, None, None])
+
+        # one variance of heave for all hypotheses, that of the best: else a wrong one would excuse itself by its own
+        before = np.full(len(told), start.heave_variance)
+        best: Index | None = None
+        while True:
+            found = solved(before)
+            newly_best = np.argmax(self._log_shares(found, weight), axis=1)
+            if best is not None and (newly_best == best).all():
+                break
+            best = newly_best
+            variance = self._learnt(information, vector, best, rows, before)
+            of_block_before = np.append(before[:1], variance[:-1])
+            if (of_block_before == before).all():
+                break
+            before = of_block_before
+        if (variance != before).any():
+            found = solved(variance)
+        return [
+            (Sums(told_by_then, y, z2, float(of), float(moves)), Hypotheses(*each))
+            for told_by_then, y, z2, of, moves, each in zip(
+                information, vector, square, weight, variance, zip(*found, strict=True), strict=True
+            )
+        ]
+
+    def _learnt(self, information: Array, vector: Array, best: Index, heave: HeaveSums, before: Array) -> Array:
+        """Variance (S,) of heave after S blocks, by the best hypothesis each time, which was `before`."""
+        at = np.arange(len(best)), best
+        p = np.linalg.inv(information[at])
+        x = product(p, vector[at])
+        own = HeaveSums(heave.told[at], heave.scatter[at], heave.weight[:, 0])
+        try:
+            _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
+        except np.linalg.LinAlgError:
+            if len(best) > 1:
+                raise
+            return before  # numbers that run away: what was learnt before is kept
+        if len(best) > 1 and not np.isfinite(variance).all():
+            raise np.linalg.LinAlgError("a variance of heave that is not finite")
+        return np.where(np.isfinite(variance), variance, before)
 
     def misfits(self, rows: DelayedRows) -> tuple[Array, Array]:
         """What all hypotheses would make of further rows, nothing being changed.
@@ -247,108 +286,119 @@ class DelayBank:
         Returns by how much the rows raise zᵀR⁻¹z of each (K,), and the logarithm (K,) of how likely each then is.
         """
         found = self._solve()
-        level = self._level(found, int(np.argmax(found.log_evidence)))
-        told, told_vector, square = _told(rows, np.ones(len(rows), dtype=bool))
+        level = self._level(found, self._sums.weight)
+        told, told_vector, square = told_by(rows, np.ones(len(rows), dtype=bool))
         information, vector = found.information + told, found.vector + told_vector
         x = np.linalg.solve(information, vector[..., None])[..., 0]
         raised = square + np.einsum("ki,ki->k", found.x, found.vector) - np.einsum("ki,ki->k", x, vector)
         log_det = np.linalg.slogdet(information)[1] - np.linalg.slogdet(found.information)[1]
         return raised, (found.log_evidence - 0.5 * (raised + log_det)) / level + self._log_prior
 
-    def _learn_heave(self) -> None:
-        """One variance for all hypotheses, that of the best: else a wrong one would excuse itself by its own."""
-        best = [int(np.argmax(self._shares()[1]))]
-        p = np.linalg.inv(self._information[best])
-        x = (p @ self._vector[best][..., None])[..., 0]
-        sums = self._heave.sums()
-        own = HeaveSums(sums.told[best], sums.scatter[best], sums.weight)
-        with suppress(np.linalg.LinAlgError):  # numbers that run away: what was learnt before is kept
-            _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
-            if np.isfinite(variance[0]) and variance[0] != self._heave_variance:
-                self._heave_variance = float(variance[0])
-                self._solved = None
-
     def _absorb_heave(self) -> None:
         """Under a random walk what a row tells ages with the rest."""
-        sums, by_fold = self._heave.absorb()
-        told = sums.told / self._heave_variance
+        rows, by_fold = self._heave.absorb()
+        sums, variance = self._sums, self._sums.heave_variance
+        told = rows.told / variance
         if self._folds is not None:
             of_all = slice(None)
-            weighed = by_fold / self._heave_variance
+            weighed = by_fold / variance
             self._folds.add(of_all, weighed[..., :N_STATE, :N_STATE], weighed[..., :N_STATE, N_STATE])
-        self._information += told[:, :N_STATE, :N_STATE]
-        self._vector += told[:, :N_STATE, N_STATE]
-        self._square += told[:, N_STATE, N_STATE]
+        self._sums = sums._replace(
+            information=sums.information + told[:, :N_STATE, :N_STATE],
+            vector=sums.vector + told[:, :N_STATE, N_STATE],
+            square=sums.square + told[:, N_STATE, N_STATE],
+        )
         self._solved = None
 
     def _drift(self, seconds: float) -> None:
         """Random walk over so many seconds: P grows, x stays, and so does the misfit."""
         assert self._process_rate is not None
-        p = np.linalg.inv(self._information)
-        x = (p @ self._vector[..., None])[..., 0]
-        misfit = self._square - np.einsum("ki,ki->k", x, self._vector)
-        before = np.linalg.slogdet(self._information)[1]
-        self._information = np.linalg.inv(p + self._process_rate * seconds)
-        self._log_det += np.linalg.slogdet(self._information)[1] - before
-        self._vector = (self._information @ x[..., None])[..., 0]
-        self._square = misfit + np.einsum("ki,ki->k", self._vector, x)
+        sums = self._sums
+        p = np.linalg.inv(sums.information)
+        x = product(p, sums.vector)
+        misfit = sums.square - np.einsum("ki,ki->k", x, sums.vector)
+        before = np.linalg.slogdet(sums.information)[1]
+        information = np.linalg.inv(p + self._process_rate * seconds)
+        self._log_det += np.linalg.slogdet(information)[1] - before
+        vector = product(information, x)
+        square = misfit + np.einsum("ki,ki->k", vector, x)
+        self._sums = sums._replace(information=information, vector=vector, square=square)
         self._solved = None
-
-    def _gated(self, rows: DelayedRows) -> Mask:
-        """Which rows are used (J,): those that any hypothesis explains, by the level of recent innovations.
-
-        A wrong hypothesis must not throw out what contradicts it, so all use the same samples; a lever arm that is not
-        known yet is in S.
-        """
-        nis = _innovation_squared(self._solve(), rows).min(axis=0)
-        use = np.ones(len(rows), dtype=bool)
-        if len(self._recent) >= ENOUGH:
-            level = max(1.0, float(median(np.array(self._recent))) / MEDIAN_NIS)
-            use = nis <= self._gate * level
-        self._recent = (self._recent + nis.tolist())[-RECENT:]
-        self.used += int(use.sum())
-        self.gated += int((~use).sum())
-        self._nis_sum += float(nis[use].sum())
-        return use
 
     def _solve(self, without: int | None = None) -> Hypotheses:
         """All hypotheses by what is known; remembered, but for those without a fold, until more is."""
         if without is None and self._solved is not None:
             return self._solved
-        information, vector = self._information, self._vector
+        sums = self._sums
+        information, vector = sums.information, sums.vector
         if without is not None:
             assert self._folds is not None
             told, told_vector = self._folds.of(without)
             information, vector = information - told, vector - told_vector
-        heave = self._heave.sums(without).told / self._heave_variance
-        information, vector = information + heave[:, :N_STATE, :N_STATE], vector + heave[:, :N_STATE, N_STATE]
-        log_det = np.linalg.slogdet(information)[1] - self._log_det
-        p = np.linalg.inv(information)
-        p = 0.5 * (p + p.swapaxes(1, 2))
-        x = (p @ vector[..., None])[..., 0]
-        misfit = self._square + heave[:, N_STATE, N_STATE] - np.einsum("ki,ki->k", x, vector)
-        found = Hypotheses(x, p, misfit, -0.5 * (misfit + log_det), information, vector)
+        heave = self._heave.sums(without).told / sums.heave_variance
+        found = self._hypotheses(information, vector, sums.square, heave)
         if without is None:
             self._solved = found
         return found
 
-    def _level(self, found: Hypotheses, best: int) -> float:
-        freedom = 3.0 * self.blocks.weight - N_STATE
-        return max(1.0, float(found.misfit[best]) / freedom) if freedom > 0.0 else 1.0
+    def _hypotheses(self, information: Array, vector: Array, square: Array, heave: Array) -> Hypotheses:
+        """By Λ (..., K, n, n), Λx (..., K, n), zᵀR⁻¹z (..., K) of rows, and rows of heave (..., K, n+1, n+1)."""
+        information, vector = information + heave[..., :N_STATE, :N_STATE], vector + heave[..., :N_STATE, N_STATE]
+        log_det = np.linalg.slogdet(information)[1] - self._log_det
+        p = np.linalg.inv(information)
+        p = 0.5 * (p + p.swapaxes(-1, -2))
+        x = product(p, vector)
+        misfit = square + heave[..., N_STATE, N_STATE] - np.einsum("...i,...i->...", x, vector)
+        return Hypotheses(x, p, misfit, -0.5 * (misfit + log_det), information, vector)
 
-    def found(self) -> Found:
-        """What is known as of now."""
+    def _level(self, found: Hypotheses, weight: Array | float) -> Array:
+        """(...,) by how much more the best hypothesis misses the data than they claim. weight (...,): of the data."""
+        best = np.argmax(found.log_evidence, axis=-1)
+        misfit = np.take_along_axis(found.misfit, best[..., None], axis=-1)[..., 0]
+        freedom = np.asarray(3.0 * weight - N_STATE)
+        return np.where(freedom > 0.0, np.maximum(1.0, misfit / np.where(freedom > 0.0, freedom, 1.0)), 1.0)
+
+    def _log_shares(self, found: Hypotheses, weight: Array | float) -> Array:
+        """The logarithm (..., K) of how likely each hypothesis is."""
+        # a first level from the best as claimed; tempering does not change which that is but for the prior
+        shares: Array = found.log_evidence / self._level(found, weight)[..., None] + self._log_prior
+        return shares
+
+    def known(self) -> Known:
+        """What is known as of now, to be `found`."""
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
         kept, share = _likely(log_share)
         likely = GaussianState(found.x[kept], found.p[kept])
-        if self._process_rate is not None:
-            ones: Array = np.ones(N_STATE)
-            return Found(likely, kept, share, self._shown(best, ones), ones, None, 0.0)
-        deviation = self._deviation(likely, kept, int(np.searchsorted(kept, best)))
-        likely = GaussianState(likely.x + deviation.shift, likely.p + deviation.more)
-        shown = self._shown(best, deviation.inflation)
-        return Found(likely, kept, share, shown, deviation.inflation, deviation.coefficients, deviation.drifted)
+        place = int(np.searchsorted(kept, best))
+        seen = None if self._process_rate is not None else Seen.of(self.blocks, likely, kept, place)
+        return Known(likely, kept, share, best, found.information[best], self._regressor_noise, seen)
+
+    def found(self, known: Sequence[Known]) -> list[Found | None]:
+        """What was known at times of this day, with what that makes of the heading; None where numbers ran away."""
+        if not known:
+            return []
+        try:
+            return [*self._found(known)]
+        except np.linalg.LinAlgError:
+            return [None] if len(known) == 1 else [self.found([each])[0] for each in known]
+
+    def _found(self, known: Sequence[Known]) -> Iterator[Found]:
+        seen = [each.seen for each in known if each.seen is not None]
+        deviations = heading_states(seen, self._parameters.heading_deviation_std)
+        inflations: Array = np.ones((len(known), N_STATE))
+        if deviations:
+            inflations = np.stack([each.inflation for each in deviations])
+        information, noise = (
+            np.stack(each) for each in zip(*((k.information, k.regressor_noise) for k in known), strict=True)
+        )
+        shown = self._shown([each.best for each in known], information, noise, inflations)
+        for number, each in enumerate(known):
+            likely, heading, drifted = each.likely, None, 0.0
+            if deviations:
+                _, shift, more, drifted, _ = deviations[number]
+                likely, heading = GaussianState(likely.x + shift, likely.p + more), deviations[number].coefficients
+            yield Found(likely, each.kept, each.share, shown[number], inflations[number], heading, drifted)
 
     def posteriors(self, found: Sequence[Found]) -> list[Posterior]:
         """The mixture of all hypotheses, as it was found on this day each time.
@@ -399,7 +449,7 @@ class DelayBank:
         """
         of_all, log_share = self._shares()
         best = int(np.argmax(log_share))
-        shown = self._shown(best, self._inflation(best, of_all))
+        _, shown = self._shown_now(best, of_all)
         nothing = np.zeros((N_STATE, N_STATE))
         known, unknown = GaussianState(self.prior.x, nothing), GaussianState(self._unknown.x, nothing)
         is_of_day = np.isin(np.arange(N_STATE), OF_DAY)
@@ -418,7 +468,7 @@ class DelayBank:
     def _on_days_before(self, last: GaussianState, held: GaussianState, fold: int) -> list[GaussianState]:
         """The states (n,) of days that are over, by what later ones say of the vehicle (Rauch, Tung, Striebel).
 
-        last: of this day, in the errors; held: the same as the filter has it. fold: place in `_Ended.known`.
+        last: of this day, in the errors; held: the same as the filter has it. fold: place in `Ended.known`.
         """
         on = np.delete(np.arange(N_STATE), OF_DAY)
         states = []
@@ -440,20 +490,15 @@ class DelayBank:
     def _shares(self) -> tuple[Hypotheses, Array]:
         """All hypotheses, and the logarithm (K,) of how likely each is."""
         found = self._solve()
-        # a first level from the best as claimed; tempering does not change which that is but for the prior
-        level = self._level(found, int(np.argmax(found.log_evidence)))
-        return found, found.log_evidence / level + self._log_prior
+        return found, self._log_shares(found, self._sums.weight)
 
     def _inflation(self, best: int, found: Hypotheses) -> Array:
         """By how much blocks of time raise σ of each state (n,)."""
         if self._process_rate is not None:
             return np.ones(N_STATE)
         of_one = np.array([best])
-        return self._deviation(GaussianState(found.x[of_one], found.p[of_one]), of_one, 0).inflation
-
-    def _deviation(self, states: GaussianState, numbers: Index, best: int) -> HeadingStates:
-        """How the heading deviates by hypotheses x (M, n), P (M, n, n) with these numbers (M,); best: place of one."""
-        return heading_states(self.blocks, states, numbers, best, self._parameters.heading_deviation_std)
+        seen = Seen.of(self.blocks, GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
+        return heading_states([seen], self._parameters.heading_deviation_std)[0].inflation
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """All hypotheses as one, in the errors."""
@@ -466,63 +511,85 @@ class DelayBank:
         kept, share = _likely(log_share)
         return _one(GaussianState(found.x[kept], found.p[kept]), kept, share)
 
-    def _shown(self, best: int, inflation: Array) -> Mask:
-        """Which states (n,) the data show even if everything else were known much worse than the prior says."""
+    def _shown_now(self, best: int, found: Hypotheses) -> tuple[Array, Mask]:
+        """By how much blocks of time raise σ of each state (n,), and which (n,) the data show."""
+        inflation = self._inflation(best, found)
+        return inflation, self._shown(
+            [best], found.information[best][None], self._regressor_noise[None], inflation[None]
+        )[0]
+
+    def _shown(self, best: Sequence[int], information: Array, regressor_noise: Array, inflation: Array) -> Mask:
+        """Which states (S, n) the data show even if everything else were known much worse than the prior says."""
         prior_std = np.sqrt(np.diag(self.prior.p))
         known_before = prior_std <= SHOWN_SHARE * self._unknown_std
-        heave = self._heave.sums().told[best, :N_STATE, :N_STATE] / self._heave_variance
-        data = self._information[best] + heave - np.linalg.inv(self._start.p[best])
+        data = information - np.linalg.inv(self._start.p[best])
         # what noise of regressors seems to tell is told by nothing
-        share = np.ones(N_STATE)
-        share[BEYOND] = np.clip(1.0 - self._regressor_noise / np.maximum(np.diag(data)[BEYOND], 1e-300), 0.0, 1.0)
-        data = data * np.sqrt(share)[:, None] * np.sqrt(share)
+        share: Array = np.ones(inflation.shape)
+        told = np.maximum(np.diagonal(data, axis1=1, axis2=2)[:, BEYOND], 1e-300)
+        share[:, BEYOND] = np.clip(1.0 - regressor_noise / told, 0.0, 1.0)
+        data = data * np.sqrt(share)[:, :, None] * np.sqrt(share)[:, None]
         wide = np.diag((WIDER * self._unknown_std) ** -2)
-        variance = np.diag(np.linalg.inv(data + wide))  # below zero where a random walk has taken more than data gave
+        # below zero where a random walk has taken more than data gave
+        variance = np.diagonal(np.linalg.inv(data + wide), axis1=1, axis2=2)
         std = np.sqrt(np.where(variance > 0.0, variance, np.inf)) * inflation
         shown: Mask = (std <= SHOWN_SHARE * self._unknown_std) | known_before
         return shown
 
 
+class _Expected:
+    """What blocks of rows make of a bank, found before it takes them.
+
+    Which rows are used depends on the state before their block, and that on which rows were used before. So all are
+    expected to be used at first; the states by that say which are, and again, until nothing changes: every time one
+    block more is settled, and nearly always all of them are.
+
+    use (J,), nis (J,), told, steps: of each block. heave: rows of heave with theirs.
+    """
+
+    def __init__(self, bank: DelayBank, blocks: Sequence[BlockRows]) -> None:
+        self._bank, self._blocks = bank, blocks
+        self.use: list[Mask] = [np.ones(len(each.rows), dtype=bool) for each in blocks]
+        self.nis: list[Array] = [np.zeros(len(each.rows)) for each in blocks]
+        found: dict[int, Told] = {}
+        settled, last = 0, len(blocks) - 1
+        while True:
+            for number in range(last):
+                if number not in found:
+                    found[number] = bank.told_by(blocks[number], self.use[number])
+            self.told = [found[number] for number in range(last)]
+            self.is_finite = all(each.is_finite for each in self.told)
+            if not self.is_finite:
+                return
+            self.heave = bank.heave.copy() if last else bank.heave
+            rows = [self._heave_after(number) for number in range(last)]
+            self.steps = bank.steps(bank.sums, self.told, rows)
+            for number in range(settled, last + 1):
+                before = self.steps[number - 1][1] if number else bank.hypotheses
+                state = GaussianState(before.x, before.p)
+                self.nis[number] = innovation_squared(state, blocks[number].rows).min(axis=0)
+            used = bank.gated_by(self.nis)
+            wrong = [number for number in range(last + 1) if (used[number] != self.use[number]).any()]
+            self.use = used
+            if not wrong or wrong[0] == last:
+                break
+            settled = wrong[0] + 1
+            for number in wrong:
+                found.pop(number, None)
+        self.told.append(bank.told_by(blocks[last], self.use[last]))
+        self.is_finite = self.told[last].is_finite
+        if self.is_finite:
+            start = self.steps[-1][0] if last else bank.sums
+            self.steps += bank.steps(start, self.told[last:], [self._heave_after(last)])
+
+    def _heave_after(self, number: int) -> HeaveSums:
+        rows, stamps_ns, _ = self._blocks[number]
+        self.heave.add_sums(stamps_ns, rows.heave, self.use[number])
+        return self.heave.sums()
+
+
 def _without(shown: Mask, of: Index) -> Index:
     """Those `of` the states that are not shown (n,)."""
     return of[~shown[of]]
-
-
-def _told(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:
-    """What some rows tell each hypothesis: HᵀWH (K, n, n), HᵀWz (K, n), zᵀWz (K,)."""
-    some = rows if use.all() else rows.part(use)
-    k = len(some.moving)
-    moving, standing = some.moving.reshape(k, len(_MOVING), -1), some.standing.reshape(len(OF_NONE), -1)
-    weight = np.concatenate([some.weight] * 3)
-    weighted = moving * weight
-    told = np.zeros((k, N_STATE + 1, N_STATE + 1))
-    across = (weighted.reshape(-1, len(weight)) @ standing.T).reshape(k, len(_MOVING), len(OF_NONE))
-    told[:, _MOVING[:, None], _MOVING] = weighted @ moving.swapaxes(1, 2)
-    told[:, _MOVING[:, None], OF_NONE], told[:, OF_NONE[:, None], _MOVING] = across, across.swapaxes(1, 2)
-    told[:, OF_NONE[:, None], OF_NONE] = (standing * weight) @ standing.T
-    return told[:, :N_STATE, :N_STATE], told[:, :N_STATE, N_STATE], told[:, N_STATE, N_STATE]
-
-
-def _innovation_squared(found: Hypotheses, rows: DelayedRows) -> Array:
-    """νᵀS⁻¹ν (K, J) of rows, each by itself, with S = HPHᵀ + 1 and P = LLᵀ: HPHᵀ is the square of LᵀHᵀ."""
-    k, _, _, n = rows.moving.shape
-    h, z = rows.moving[:, :-1].reshape(k, len(OF_DELAY), 3 * n), rows.moving[:, -1]
-    standing = rows.standing.reshape(len(OF_NONE), 3 * n)
-    expected = found.x[:, None, OF_DELAY] @ h
-    expected[:, 0] += found.x[:, OF_NONE] @ standing
-    innovation = z - expected.reshape(z.shape)
-    # what is the same for all delays first: then most of the root is none of its business
-    low = np.linalg.cholesky(found.p[:, _SHOWN_BY_ROWS[:, None], _SHOWN_BY_ROWS]).swapaxes(1, 2)
-    m = len(OF_NONE)
-    spread = np.empty((k, len(_SHOWN_BY_ROWS), 3 * n))
-    np.matmul(low[:, :, m:], h, out=spread)
-    spread[:, :m] += (np.ascontiguousarray(low[:, :m, :m]).reshape(-1, m) @ standing).reshape(k, m, 3 * n)
-    spread = spread.reshape(k, -1, 3, n)
-    s = [
-        [np.einsum("kaj,kaj->kj", spread[:, :, i], spread[:, :, j]) + float(i == j) for j in range(i + 1)]
-        for i in range(3)
-    ]
-    return distance_squared(s, [*innovation.swapaxes(0, 1)])
 
 
 def _likely(log_share: Array) -> tuple[Index, Array]:

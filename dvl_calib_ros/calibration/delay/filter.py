@@ -31,9 +31,9 @@ from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
-from .bank import DayState, Posterior
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .hold_out import Recording, Terms, held_out_error
+from .known import DayState, Posterior
 from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
 from .solver import BlockSolver, Outcome
 from .workers import AtOnce, Solved

@@ -21,12 +21,13 @@ from ..parameters import Parameters
 from ..register.registration import Registration
 from ..samples import Stamps
 from ..shared_noise import SharedNoise
-from .bank import DelayBank, Found, Posterior
+from .bank import DelayBank
 from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
 from .clocks import KeptClocks
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, Kept
+from .known import After, BlockRows, Found, Known, Posterior
 from .parts import Parts
 from .rows import (
     DelayedRows,
@@ -164,18 +165,29 @@ class BlockSolver:
             self._clocks.end_day()
         streams = [cleaned(block, self._parameters, self.epoch_ns, self._contradicted) for block in blocks]
         compared = self._compared([each for each in streams if each.are_compared])
-        outcomes: list[Outcome] = []
-        found: list[tuple[int, Found | None]] = []
+        last = After(self.bank.used, self.bank.gated, self.bank.mean_nis)
+        found: dict[int, Known | None] = {}
+        if blocks[0].new_days:
+            found[0] = self._known()
+        own: list[tuple[BlockRows | None, int, int]] = []
         for each in streams:
-            has_rows = self._take(each, compared)
-            if has_rows or each.block.new_days:
-                found.append((len(outcomes), self._found()))
-            outcomes.append(self.outcome(has_rows))
-        return self._with_posteriors(outcomes, found)
+            own.append((self._take(each, compared), self._spikes, self._claims))
+        after = iter(self.bank.add([rows for rows, _, _ in own if rows is not None]))
+        outcomes: list[Outcome] = []
+        for number, (rows, spikes, claims) in enumerate(own):
+            has_rows = rows is not None and len(rows.rows) > 0
+            last = last if rows is None else next(after)
+            if has_rows:
+                found[number] = last.known
+            counts = ModelCounts(last.used, last.gated + spikes, last.mean_nis, 3.0, self.restarted)
+            outcomes.append(Outcome(self.bank.prior, self._posterior, counts, claims, has_rows))
+        sound = {number: known for number, known in found.items() if known is not None}
+        posteriors = dict(zip(sound, self.bank.found([*sound.values()]), strict=True))
+        return self._with_posteriors(outcomes, [(number, posteriors.get(number)) for number in found])
 
-    def _found(self) -> Found | None:
+    def _known(self) -> Known | None:
         try:
-            return self.bank.found()
+            return self.bank.known()
         except np.linalg.LinAlgError:
             return None
 
@@ -262,12 +274,12 @@ class BlockSolver:
             imu_gap_s=p.imu_timeout,
         )
 
-    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison]) -> bool:
-        """Take a block's samples; whether it has rows."""
+    def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison]) -> BlockRows | None:
+        """Take a block's samples; the rows that it has, for the bank."""
         block, reference, dvl = streams.block, streams.reference, streams.dvl
         self._spikes += streams.reference_spikes
         if not streams.are_compared:
-            return False
+            return None
         self._spikes += streams.dvl_spikes
         self._turned = self._turned or not reference.in_body.all()
         stamps_ns = block.dvl.stamps_ns
@@ -289,9 +301,8 @@ class BlockSolver:
         if self.kept is not None:
             self.kept.append(kept)
         if rows is None:
-            return False
-        self.bank.add(rows, streams.reference_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
-        return len(rows) > 0
+            return None
+        return BlockRows(rows, streams.reference_ns[rows.index], (block.end_ns - block.from_ns) * 1e-9)
 
     def _leave_out(self, stamps_ns: Stamps, block_ns: int) -> None:
         """Leave some DVL samples out from now on, and where they are kept for verification already."""

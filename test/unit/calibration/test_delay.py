@@ -244,6 +244,50 @@ def test_blocks_that_are_gathered_see_no_more_than_each_by_itself(seed):
     assert held_out.samples == beside.samples and held_out.corrected == pytest.approx(beside.corrected, rel=1e-9)
 
 
+def in_waves(samples):
+    """The same in a swell that both measure, and with references that are off by half a metre per second for a while,
+    which neighbours do not show to be spikes."""
+    for sample in samples:
+        if not isinstance(sample, ImuSample):
+            seconds = 1e-9 * (sample.stamp_ns - START_NS)
+            heave = 0.3 * np.sin(2.0 * np.pi * seconds / 8.3) + 0.15 * np.sin(2.0 * np.pi * seconds / 97.0)
+            off = 0.5 if isinstance(sample, ReferenceSample) and 90.0 < seconds % 100.0 < 92.0 else 0.0
+            sample = sample._replace(velocity=tuple(np.add(sample.velocity, (off, -off, heave)).tolist()))
+        yield sample
+
+
+def test_blocks_that_are_gathered_gate_and_learn_the_heave_as_each_by_itself():
+    """Which rows are used depends on those before them, and what is learnt of heave on both."""
+    samples = list(in_waves(late(0.0, duration=300.0)))
+    alone, together = (
+        feed_columns(Calibrator(NOISE, block_size=size, verified=True, models=AUTO), samples) for size in (128, 4096)
+    )
+    banks = [next(iter(each._further))._idle_solver().bank for each in (alone, together)]
+    assert all(each.gated and each.sums.heave_variance > 2.0 * NOISE.motion_std**2 for each in banks)
+    one, other = (each.result().estimates["G2"] for each in (alone, together))
+    assert (one.used, one.gated) == (other.used, other.gated)
+    np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
+
+
+def test_a_block_whose_numbers_run_away_costs_those_gathered_with_it_nothing(monkeypatch):
+    samples, broken = late(-1.4), []
+    real = delay_solver.DelayBank.told_by
+
+    def told_by(bank, block, use):
+        told = real(bank, block, use)
+        first = broken[0] if broken else int(block.stamps_ns[0])
+        broken[:] = [first]
+        is_that = first + 60_000_000_000 <= block.stamps_ns[0] < first + 70_000_000_000
+        return told._replace(vector=told.vector * np.nan) if is_that else told
+
+    monkeypatch.setattr(delay_solver.DelayBank, "told_by", told_by)
+    alone, together = (feed_columns(Calibrator(NOISE, block_size=size, models=AUTO), samples) for size in (128, 4096))
+    one, other = (each.result().estimates["G2"] for each in (alone, together))
+    assert np.isfinite(one.state).all() and one.used == other.used
+    np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-12)
+
+
 class Lazy:
     """A worker that does nothing before somebody waits for it, the latest that it could be done."""
 
