@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from .comparison import date
+from .days import OFFSETS, OFTEN_OFF
 from .findings import Finding, finding
 from .parameters import Parameters
 from .results import Day, Estimate
@@ -19,11 +20,10 @@ SUSPICIOUS_GATED = 0.2
 ENOUGH_SAMPLES = 20
 # Share of DVL velocities that repeat the one before exactly above which its driver hangs.
 SUSPICIOUS_REPEATED = 0.05
-# A constant error of the reference is said if it is larger than this, m/s (twice what is allowed for by default), and
-# than so many σ.
+# A constant error of the reference is said if it is larger than this, m/s, and than so many σ.
 OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
-# It is not shown from this share of its prior σ on. References and DVLs are off by so much, m/s, without being broken.
-NOT_SHOWN, OFTEN_OFF = 0.6, 0.02
+# It is not shown from this share of its prior σ on.
+NOT_SHOWN = 0.6
 # So many losses of GNSS are flapping.
 FLAPPING = 3
 
@@ -109,13 +109,14 @@ def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float)
     speed: m/s, usual.
     """
     own, assumed = estimate.state_names, parameters.reference_offset_std
-    if "reference_east" not in own or not estimate.used or speed <= 0.0:
+    if OFFSETS[0] not in own or not estimate.used or speed <= 0.0:
         return []
-    std = estimate.filter_std[[own.index("reference_east"), own.index("reference_north")]]
+    std = estimate.filter_std[[own.index(name) for name in OFFSETS]]
     if float(std.min()) < NOT_SHOWN * assumed:
         return []
-    share = OFTEN_OFF / speed
-    return [finding("ONE_HEADING", off=OFTEN_OFF, degrees=math.degrees(share), percent=100.0 * share, assumed=assumed)]
+    off = OFTEN_OFF * assumed
+    share = off / speed
+    return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
 
 
 def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Finding]:
@@ -123,8 +124,7 @@ def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Findi
 
     days: that the model found something of, if there are several.
     """
-    names = "reference_east", "reference_north"
-    std = estimate.std_of(*names)
+    std = estimate.std_of(*OFFSETS)
     if std is None:
         return []
     said = []
@@ -136,7 +136,7 @@ def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Findi
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days
-    ] or [("", np.array([estimate.state_of(name) for name in names]), std)]
+    ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
     for where, offset, own_std in found:
         size = float(np.linalg.norm(offset))
         if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * own_std).all():

@@ -23,7 +23,7 @@ import numpy as np
 from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
-from .days import day_covariance
+from .days import day_covariance, offset_covariance
 from .delay.hold_out import Recording, Terms
 from .delay.workers import Worker
 from .estimator import Estimator, Given, LinearEstimator, kind_of
@@ -486,7 +486,10 @@ class Calibrator:
 
     def of_recording(self, name: str) -> GaussianState:
         """As `state`, with σ as of the same day: the larger of what the filter claims and what blocks of time show."""
-        return self._estimators[name].of_recording()
+        estimator = self._estimators[name]
+        state, covariance = estimator.of_recording()
+        worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
+        return GaussianState(state, covariance + worse)
 
     def states_at(
         self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps

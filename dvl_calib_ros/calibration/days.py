@@ -3,6 +3,11 @@
 By how much the heading reference is off goes into yaw one to one, the speed of sound into scale; no scatter within a
 recording shows either. A σ is worth what happens in the next recording, so that which is published, and that by which
 recordings are compared, hold both; how far a calibration is, and what its data showed, goes by the recording alone.
+
+A constant error of the reference is of the day as well, but headings show it, so it is a state, with the prior of a
+good reference, σ_p. Many are worse, and where headings do not show it σ holds that: of a true error o the estimate is
+off by S o, S = P_o / σ_p², beside what it claims. So (F² - 1) σ_p² S Sᵀ is added, of an o of F σ_p; and of a larger one
+where what the data show of it, x_o = (1 - S_o) o, contradicts the prior.
 """
 
 from __future__ import annotations
@@ -12,6 +17,28 @@ import numpy as np
 from .frames import Array
 from .models import Model
 from .parameters import Parameters
+
+# References are off by so many times `reference_offset_std` without being broken.
+OFTEN_OFF = 4.0
+# Data that see this share of an error, or less, show nothing of it; so many σ contradict the prior.
+SEEN_FROM, SURELY = 0.02, 3.0
+OFFSETS = "reference_east", "reference_north"
+
+
+def offset_covariance(model: Model, state: Array, claimed: Array, parameters: Parameters) -> Array:
+    """(n, n) to be added to a model's covariance for references that are worse than their prior.
+
+    state: (n,). claimed: (n, n) what the filter alone claims.
+    """
+    at = [model.state_names.index(name) for name in OFFSETS if name in model.state_names]
+    variance = parameters.reference_offset_std**2
+    sensitivity = claimed[:, at] / variance
+    share, axes = np.linalg.eigh(np.eye(len(at)) - sensitivity[at])
+    seen = (axes.T @ state[at]) / np.sqrt(np.maximum(share, SEEN_FROM))  # σ_p each, by the prior
+    shown = (share > SEEN_FROM) & (np.abs(seen) > SURELY * parameters.reference_offset_std)
+    off = float((seen[shown] ** 2 / share[shown]).sum())
+    found: Array = (max(OFTEN_OFF**2 * variance, off) - variance) * (sensitivity @ sensitivity.T)
+    return found
 
 
 def day_covariance(model: Model, parameters: Parameters) -> Array:

@@ -442,11 +442,11 @@ _KINDS = (
     FindingKind(
         "ONE_HEADING",
         "on one heading an error of reference or DVL that stays is a yaw or a scale: {off:g} m/s would be "
-        "{degrees:.1f}° or {percent:.1f} %, and σ holds {assumed:g} m/s",
+        "{degrees:.1f}° or {percent:.1f} %, and σ holds that of the reference",
         "A constant velocity error turns with the vehicle where it is the DVL's, and does not where it is the "
         "reference's or a current's; on one heading at one speed no data tell either from a mounting.",
-        "drive the opposite heading as well, at two speeds; or set reference_offset_std to what the reference is good "
-        "for",
+        "drive the opposite heading as well, at two speeds; or set reference_offset_std, of which σ holds four times, "
+        "to what the reference is good for",
     ),
     FindingKind(
         "INNOVATIONS_LARGE",

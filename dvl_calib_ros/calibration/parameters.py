@@ -367,8 +367,8 @@ class Parameters:
     reference_offset_std: float = _parameter(
         0.005,
         "Prior standard deviation, east and north, of a constant error of a reference velocity in an earth frame, as "
-        "of an inertial navigation (G1, G2). On one heading yaw and scale are never better known than by it; several "
-        "headings find it.",
+        "of an inertial navigation (G1, G2). On one heading yaw and scale are never better known than by four times "
+        "it; several headings find it.",
         unit="m/s",
         low=1e-6,
         high=10.0,
