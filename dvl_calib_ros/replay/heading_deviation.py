@@ -14,11 +14,14 @@ import numpy as np
 from ..calibration.findings import Finding, finding
 from ..calibration.frames import Array
 from ..calibration.kalman import GaussianState
+from ..calibration.results import Estimate
 
 # Its rms (rad) is worth a word from here on, and where it is so many times its σ.
 SAID_FROM, SURELY = math.radians(0.3), 3.0
 # From here on (rad) the compass is to be calibrated first (QRev's rule).
 FIRST = math.radians(3.0)
+# ... and where more than this share of the samples was gated, which are those that it turns most.
+GATED_FROM = 0.1
 
 
 class HeadingDeviation(NamedTuple):
@@ -63,6 +66,11 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
         rms, std, float(shown[most]), float(north[most]), float(shown[least]), float(north[least]),
         bool(by_time.std() > by_heading.std()),
     )  # fmt: skip
+
+
+def comes_first(found: HeadingDeviation, estimate: Estimate) -> bool:
+    """Whether the compass is to be calibrated before an estimate is worth anything."""
+    return found.rms > FIRST or estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
 
 
 def heading_advice(found: HeadingDeviation | None) -> list[Finding]:

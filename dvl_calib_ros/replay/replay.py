@@ -37,7 +37,7 @@ from ..recordings.check import check_topics
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from .clocks import StreamClocks
-from .heading_deviation import FIRST, heading_advice
+from .heading_deviation import comes_first, heading_advice
 from .left_over import left_over_advice
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
@@ -154,7 +154,8 @@ def replay(
     # where the data show how the clocks stand, it does not matter when messages arrived
     of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
     of_clocks += [(Word.MARGINAL, each.says) for each in told] + [(word, each.says) for word, each in left]
-    if navigation is not None and navigation.deviation is not None and navigation.deviation.rms > FIRST:
+    deviation = navigation.deviation if navigation is not None else None
+    if deviation is not None and comes_first(deviation, result.estimate):
         of_clocks += [(Word.REJECT, each.says) for each in deviates]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_clocks += [] if result.counts["pairing"]["paired"] else [(Word.REJECT, NOTHING_COMPARED)]

@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.replay.heading_deviation import FIRST, heading_advice, heading_deviation
+from dvl_calib_ros.replay.heading_deviation import FIRST, comes_first, heading_advice, heading_deviation
 
 START_NS, STEP_S, LEG_S = 1_600_000_000_000_000_000, 0.5, 40.0
 YAW = math.radians(1.0)  # of the DVL in the vehicle
@@ -86,6 +86,15 @@ def test_a_gyro_that_drifts_is_named_by_time_and_beyond_three_degrees_the_compas
     assert found.rms > FIRST and "calibrate the compass first" in heading_advice(found)[0].remedy
     drifts = deviation(2, lambda _, time: math.radians(5.0) * time / (16 * LEG_S))
     assert drifts.by_time and "with time" in heading_advice(drifts)[0].says
+
+
+@pytest.mark.parametrize("degrees, is_first", [(2.0, False), (6.0, True)])
+def test_a_compass_whose_worst_headings_are_gated_comes_first_whatever_is_left(degrees, is_first):
+    """The gate throws away what it turns most, so by the rest the compass is better than it is."""
+    size = math.radians(degrees)
+    calibrator, time, yaw = recorded(3, lambda yaw, _: size * math.sin(yaw + 1.2), every=math.pi)
+    found, estimate = heading_deviation(time, yaw, calibrator.heading_deviation), calibrator.estimate("G1")
+    assert found is not None and comes_first(found._replace(rms=math.radians(2.0)), estimate) is is_first
 
 
 def test_sigma_of_yaw_holds_a_drift_from_the_beginning_on():
