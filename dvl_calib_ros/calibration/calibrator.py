@@ -269,7 +269,7 @@ class Calibrator:
             shown_ns = self._headings.add(stamps_ns, oriented, seen.observations)
             if shown_ns is not None:
                 wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
-                self._selection.headings_show_the_current(shown_ns + wait_ns)
+                self._selection.headings_show_the_current(shown_ns + wait_ns, self._headings.trimmed)
 
     def _by_days(self, first: int, end: int) -> Iterator[tuple[int, int, bool]]:
         """Rows first .. end - 1 parted where days begin: the first and the end of each part, and whether a day does."""

@@ -4,6 +4,9 @@ Sway over ground is that of a misalignment, u φ_z with speed u ahead, plus that
 heading: (Rᵀc)_y. On one heading the two are the same to the data; over several, least squares on (φ_z, c) alone says
 by its covariance whether they come apart. It is A1's without all else that A1 estimates, and with a current ten times
 as strong as expected, so that no prior stands in for a heading.
+
+And whether the vehicle is trimmed: a model without attitude takes the heave in the body of one that holds its depth
+with its bow up for none, and makes a pitch of it.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from .frames import Array
+from .models.own import UPRIGHT
 from .observations import Observations
 from .parameters import Parameters
 from .samples import Mask, Stamps
@@ -22,6 +26,8 @@ EVERY_NS = 10_000_000_000
 STRONGER = 10.0
 # The angle is told from the current once its σ is below this share of the prior's, as for what is observed.
 SHOWN_SHARE = 0.5
+# So much mean heave of a level path, of its prior, over so many periods, is a trim.
+TRIMMED_FROM, TRIMMED_PERIODS = 2.0, 6
 # Sway that a turn leaves, s: m/s per (rad/s of turn times m/s of speed); a turning sample says little of a current.
 TURN_SWAY_STD_S = 1.0
 
@@ -34,7 +40,9 @@ class Headings:
         self._prior_std, self._current_std = angle, current
         self._information = np.diag([angle**-2, current**-2, current**-2])
         self._motion_std = parameters.motion_std
-        self.shown = False
+        self._least_heave = TRIMMED_FROM * parameters.heave_offset_std
+        self._heave, self._periods, self._n = 0.0, 0, 0
+        self.shown = self.trimmed = False
         self._next_ns = LONG_AGO_NS  # from here on they are judged again
 
     def waits_for(self, stamp_ns: int) -> bool:
@@ -44,23 +52,28 @@ class Headings:
     def add(self, stamps_ns: Stamps, oriented: Mask, seen: Observations | None) -> int | None:
         """Take rows that are decided (N,), of which M are oriented (N,) and are those of `seen` (M), None if none.
 
-        Returns the stamp of the row by which the current was shown, the first time; else None.
+        Returns the stamp of the row by which the current, or the trim, was shown, the first time; else None.
         """
         if self.shown:
             return None
-        part = np.zeros((len(stamps_ns), 3, 3))
+        part, heave = np.zeros((len(stamps_ns), 3, 3)), np.zeros(len(stamps_ns))
         if seen is not None:
-            part[oriented] = self._told(seen)
+            part[oriented], heave[oriented] = self._told(seen), self._level_heave(seen)
         periods = stamps_ns // EVERY_NS
         starts = [0, *(np.flatnonzero(np.diff(periods)) + 1).tolist()]
         for start, end in zip(starts, [*starts[1:], len(stamps_ns)], strict=True):
             stamp_ns = int(stamps_ns[start])
             if stamp_ns >= self._next_ns:
                 self._next_ns = (stamp_ns // EVERY_NS + 1) * EVERY_NS
-                if np.sqrt(np.linalg.inv(self._information)[0, 0]) < SHOWN_SHARE * self._prior_std:
+                self._periods += self._n > 0
+                told = np.sqrt(np.linalg.inv(self._information)[0, 0]) < SHOWN_SHARE * self._prior_std
+                self.trimmed = self._periods >= TRIMMED_PERIODS and abs(self._heave) > self._least_heave * self._n
+                if told or self.trimmed:
                     self.shown = True
                     return stamp_ns
             self._information = self._information + part[start:end].sum(axis=0)
+            self._heave += float(heave[start:end].sum())
+            self._n += int(np.count_nonzero(oriented[start:end]))
         return None
 
     def end_day(self) -> None:
@@ -76,3 +89,11 @@ class Headings:
         variance = self._motion_std**2 + (TURN_SWAY_STD_S * rates[:, 2] * ahead) ** 2
         told: Array = h[:, :, None] * h[:, None, :] * (seen.motion_weight / variance)[:, None, None]
         return told
+
+    def _level_heave(self, seen: Observations) -> Array:
+        """Heave in the body (M,) m/s of a vehicle that holds its depth with the pitch that it has."""
+        assert seen.rotation_enu_from_body is not None
+        up = seen.rotation_enu_from_body[:, 2]
+        upright = np.abs(up[:, 2]) > UPRIGHT
+        heave: Array = np.where(upright, -up[:, 0] * seen.velocity_in_body[:, 0] / np.where(upright, up[:, 2], 1.0), 0.0)
+        return heave

@@ -101,7 +101,7 @@ class Selection:
         self._evidence = NO_EVIDENCE
         self._extended = False
         self._referenced_until_ns = 0
-        self._headings = False
+        self._headings = self._trimmed = False
         # what is to be taken note of once DVL samples reach its stamp: evidence, or that headings show the current
         self._coming: deque[tuple[int, Evidence | None]] = deque()
 
@@ -109,8 +109,9 @@ class Selection:
         """From this stamp on, go by this evidence for the model that extends the one with GNSS."""
         self._note(from_ns, evidence)
 
-    def headings_show_the_current(self, from_ns: int) -> None:
-        """From this stamp on, a model with attitude can do without GNSS."""
+    def headings_show_the_current(self, from_ns: int, trimmed: bool = False) -> None:
+        """From this stamp on, a model with attitude can do without GNSS. trimmed: it is the trim that asks for it."""
+        self._trimmed = trimmed
         self._note(from_ns, None)
 
     def _note(self, from_ns: int, what: Evidence | None) -> None:
@@ -176,6 +177,8 @@ class Selection:
         reason = f"{parameters.model}: {self.gnss.reason}"
         if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
             told = "headings tell" if self._headings else "no attitude over headings that would tell"
+            if self._headings and self._trimmed:
+                return f"{reason}; the trim is known"
             return f"{reason}; {told} a current from the mounting"
         if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
             return reason

@@ -246,6 +246,19 @@ def test_auto_stays_with_f1_on_one_heading_or_without_attitude_and_says_so(rng):
         assert "no attitude over headings that would tell" in calibrator.result().selected_because
 
 
+@pytest.mark.parametrize("trim_deg", [3.0, -3.0])
+def test_auto_runs_a1_on_one_heading_too_where_the_vehicle_is_trimmed_and_says_so(trim_deg, rng):
+    """F1 takes a vehicle that holds its depth nose up for one that moves where it points: 7 sigma of pitch."""
+    samples = run_without_gnss((20.0,) * 3, (0.0, 0.0), (0.0, 0.03, 0.0), rng, trim=np.deg2rad(trim_deg))
+    calibrator = calibrate(samples)
+    assert [each.model for each in calibrator.selection.segments] == ["F1", "A1"]
+    assert "the trim is known" in calibrator.result().selected_because
+    pitch, std = calibrator.estimate().misalignment[1], calibrator.estimate().std[1]
+    assert abs(pitch - 0.03) < 3.0 * std
+    for block_size in (1, 30):
+        assert calibrate(samples, block_size=block_size).selection.segments == calibrator.selection.segments
+
+
 def test_with_gnss_headings_change_nothing():
     segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
     assert [segment.model for segment in segments] == ["F1", "G1"]
