@@ -94,6 +94,6 @@ class Headings:
         """Heave in the body (M,) m/s of a vehicle that holds its depth with the pitch that it has."""
         assert seen.rotation_enu_from_body is not None
         up = seen.rotation_enu_from_body[:, 2]
-        upright = np.abs(up[:, 2]) > UPRIGHT
-        heave: Array = np.where(upright, -up[:, 0] * seen.velocity_in_body[:, 0] / np.where(upright, up[:, 2], 1.0), 0.0)
+        upright, ahead = np.abs(up[:, 2]) > UPRIGHT, seen.velocity_in_body[:, 0]
+        heave: Array = np.where(upright, -up[:, 0] * ahead / np.where(upright, up[:, 2], 1.0), 0.0)
         return heave
