@@ -182,13 +182,17 @@ class Calibration:
             result.position_in_body,
         )
 
-    def correct(self, velocity_dvl: Array) -> Array:
+    def correct(self, velocity_dvl: Array, angular_velocity: Array | None = None) -> Array:
         """Measured velocities (..., 3) m/s, forward-left-up axes of the DVL, to corrected ones in the body.
 
-        Of the place where the DVL is: the reference point moves by ``-ω × mounting.xyz_m`` beside it.
+        With angular_velocity, (..., 3) rad/s in the body, they are those of the reference point, by the lever arm that
+        was found; without, of the place where the DVL is. They are of ``mounting.time_offset_s`` before their stamps.
         """
         rotation = self.discovery.parameters.rotation_dvl_from_body
-        return self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
+        velocity = self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
+        if angular_velocity is None:
+            return velocity
+        return velocity - np.cross(np.asarray(angular_velocity, dtype=float), self.mounting.xyz_m)
 
     def to_pandas(self) -> pandas.DataFrame:
         """The selected model over time: time in s since the first DVL sample, states in SI with their σ as *_std.

@@ -242,6 +242,7 @@ def cross_checked(name: str) -> CrossCheck:
         distance_m=110.0, seconds=60.0, stretch_m=110.0, stretches=1, before=Drift(20.0, 2.2), after=Drift(2.0, 0.2),
         noise_per_km=1.0, on_a_map=True, stamps_ns=np.arange(50) * 1_000_000_000, distances=along,
         reference=track, track_before=1.02 * track, track_after=1.002 * track,
+        error_before=np.full((50, 3), 0.1), error_after=np.full((50, 3), 0.02),
     )  # fmt: skip
     other = "tuesday"
     return CrossCheck(

@@ -81,6 +81,8 @@ class Navigation:
         (P,) time, and m along the track, of the points kept.
     reference, track_before, track_after
         (P, 2) m from the start.
+    error_before, error_after
+        (P, 3) m/s, body axes: reference less the DVL's velocity; corrected by all that was found, arm and delay too.
     deviation
         By what the heading is off as it changes; None where that does not show.
     followed
@@ -100,6 +102,8 @@ class Navigation:
     reference: Array
     track_before: Array
     track_after: Array
+    error_before: Array
+    error_after: Array
     deviation: HeadingDeviation | None = None
     followed: Followed | None = None
 
@@ -170,6 +174,8 @@ def dead_reckoned(
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
+        error_before=before.whole[2][use[kept]],
+        error_after=after.whole[2][use[kept]],
         deviation=heading_deviation(recording.dvl.times[use], after.yaw[use], heading)
         if on_a_map and heading is not None
         else None,

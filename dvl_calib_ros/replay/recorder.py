@@ -24,14 +24,19 @@ KEPT_STATES, KEPT_VELOCITIES = 300, 800
 class ModelHistory:
     """One model over time, at the N stamps of its `RunHistory`.
 
-    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names. std: (N, n). nis: (N,) mean
-    νᵀS⁻¹ν per measurement row over the samples used since the stamp before (about 1 for a consistent filter), nan
-    where it used none.
+    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names. covariance: (N, n, n). nis:
+    (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the stamp before (about 1 for a consistent filter),
+    nan where it used none.
     """
 
     state: Array
-    std: Array
+    covariance: Array
     nis: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (N, n)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True)
@@ -41,8 +46,7 @@ class RunHistory:
     stamps_ns: (N,) of the rows of `models` and paired_share; a model's state is that of the samples up to then.
     paired_share: (N,) share of the DVL samples since the stamp before that had a reference, nan where none was decided.
     dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, moved to the reference point.
-    paired_ns (P,), paired_velocity (P, 3), reference_velocity (P, 3): those that had a reference, m/s; the DVL's as
-    above, the reference in the body frame.
+    paired_ns (P,), reference_velocity (P, 3): those that had a reference, and that, m/s, in the body frame.
     """
 
     stamps_ns: Stamps
@@ -51,7 +55,6 @@ class RunHistory:
     dvl_ns: Stamps
     dvl_velocity: Array
     paired_ns: Stamps
-    paired_velocity: Array
     reference_velocity: Array
 
 
@@ -114,7 +117,7 @@ class Recorder:
         if len(paired):
             seen = self._observer.observe(paired, Needs.REFERENCE, np.zeros(2))
             assert seen.reference_body is not None
-            self._paired.add(paired.stamps_ns, seen.velocity_at_reference, seen.reference_body)
+            self._paired.add(paired.stamps_ns, seen.reference_body)
 
     def history(self, calibrator: Calibrator) -> RunHistory:
         """What was collected until `Calibrator.finish`, with the calibrator's state as it is now at its end."""
@@ -125,7 +128,7 @@ class Recorder:
         decided, paired = np.cumsum(pairing != Pairing.AWAITING), np.cumsum(pairing == Pairing.PAIRED)
         at = np.append(numbers, len(stamps_ns) - 1) if len(stamps_ns) else np.zeros(0, dtype=np.int64)
         dvl_ns, dvl_velocity = self._dvl.columns((), (3,))
-        paired_ns, paired_velocity, reference_velocity = self._paired.columns((), (3,), (3,))
+        paired_ns, reference_velocity = self._paired.columns((), (3,))
         return RunHistory(
             stamps_ns=np.append(stamps_ns[numbers], calibrator.last_ns or 0),
             models={name: _model_history(name, calibrator, self.trace, numbers, stamps_ns[numbers]) for name in MODELS},
@@ -133,7 +136,6 @@ class Recorder:
             dvl_ns=dvl_ns.astype(np.int64),
             dvl_velocity=dvl_velocity,
             paired_ns=paired_ns.astype(np.int64),
-            paired_velocity=paired_velocity,
             reference_velocity=reference_velocity,
         )
 
@@ -143,15 +145,16 @@ def _model_history(
 ) -> ModelHistory:
     estimate = calibrator.estimate(name)
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
-    states, stds, sums = [estimate.state[None]], [estimate.recording_std[None]], [[(nis_sum, estimate.used)]]
+    states, covariances = [estimate.state[None]], [estimate.recording_covariance[None]]
+    sums = [[(nis_sum, estimate.used)]]
     if len(numbers):
         state, used, nis_sums = calibrator.states_at(name, trace, numbers, stamps_ns)
         states.insert(0, state.x)
-        stds.insert(0, np.sqrt(np.diagonal(state.p, axis1=1, axis2=2)))
+        covariances.insert(0, state.p)
         sums.insert(0, list(zip(nis_sums.tolist(), used.tolist(), strict=True)))
     return ModelHistory(
         state=np.concatenate(states),
-        std=np.concatenate(stds),
+        covariance=np.concatenate(covariances),
         nis=_share(np.concatenate(sums)) / MODELS[name].n_measurement,
     )
 

@@ -8,11 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..calibration.error_model import correct
-from ..calibration.frames import Array
-from ..calibration.models import MODELS
+from ..calibration.error_model import corrected_mounting
+from ..calibration.frames import Array, rpy_from_rotation
+from ..calibration.mounting_pose import rpy_std
 from ..calibration.parameters import Parameters
-from ..replay.recorder import RunHistory
 from ..replay.replay import Replayed
 
 _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")
@@ -30,11 +29,11 @@ class NotebookFigure(Figure):
 
 
 def calibration_figure(replayed: Replayed) -> Figure:
-    """Above, roll, pitch and yaw of the correction over time with ±1σ; below, the velocity error of each sample.
+    """Above, roll, pitch and yaw over time with ±1σ, less those configured; below, the velocity error of samples.
 
-    replayed: with a history. Angles about the body's axes, degrees; errors in m/s.
+    replayed: with a history. Degrees; m/s, corrected by estimates that had not seen the data, with all that was found.
     """
-    result, history = replayed.result, replayed.history
+    result, history, navigation = replayed.result, replayed.history, replayed.navigation
     if history is None:
         raise ValueError("a replay without history has nothing to draw")
     parameters = Parameters.from_mapping(result.parameters)
@@ -44,9 +43,11 @@ def calibration_figure(replayed: Replayed) -> Figure:
     figure = NotebookFigure(figsize=(8.0, 5.6), layout="constrained")
     angles, errors = figure.subplots(2, 1, sharex=True)
     time = 1e-9 * (history.stamps_ns - first_ns)
-    # φ turns the measured velocity in the DVL's frame: about the body's axes it is the mounting's turn, reversed
-    turned = np.degrees(-model.state[:, :3] @ rotation)
-    std = np.degrees(np.sqrt((model.std[:, :3] ** 2) @ rotation**2))
+    phi = model.state[:, :3]
+    turned = np.degrees([rpy_from_rotation(corrected_mounting(each, rotation)) for each in phi])
+    turned -= np.degrees(parameters.mounting_rpy)
+    turned = (turned + 180.0) % 360.0 - 180.0
+    std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         value, sleeve = turned[:, axis], std[:, axis]
@@ -57,11 +58,12 @@ def calibration_figure(replayed: Replayed) -> Figure:
     angles.set_ylim(float(span.min()) - margin, float(span.max()) + margin)
     angles.set_ylabel("correction of the mounting, °")
     _legend_above(angles)
-    if len(history.paired_ns):
-        terms = MODELS[result.selected].error_terms_from_state @ result.estimate.state
-        corrected = correct(history.paired_velocity, terms[:3], terms[3:], rotation)
-        _errors(errors, history, history.paired_velocity @ rotation, "before", _COLOURS[2], first_ns)
-        _errors(errors, history, corrected, "after", _COLOURS[0], first_ns)
+    if navigation is not None:
+        for each, name, colour in (
+            (navigation.error_before, "before", _COLOURS[2]),
+            (navigation.error_after, "after", _COLOURS[0]),
+        ):
+            _errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
         _legend_above(errors)
     errors.set_ylabel("DVL less reference, m/s")
     errors.set_xlabel("time, s")
@@ -70,12 +72,11 @@ def calibration_figure(replayed: Replayed) -> Figure:
     return figure
 
 
-def _errors(axes: Axes, history: RunHistory, velocity: Array, name: str, colour: str, first_ns: int) -> None:
-    """Points of the error's length, with its root mean square."""
-    error = np.linalg.norm(velocity - history.reference_velocity, axis=1)
-    rms = float(np.sqrt(np.mean(error**2)))
-    time = 1e-9 * (history.paired_ns - first_ns)
-    axes.plot(time, error, ".", markersize=3, color=colour, alpha=0.6, label=f"{name}: {rms:.3f} m/s rms")
+def _errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
+    """Points of the length of an error (N, 3), with its root mean square."""
+    length = np.linalg.norm(error, axis=1)
+    rms = float(np.sqrt(np.mean(length**2)))
+    axes.plot(time, length, ".", markersize=3, color=colour, alpha=0.6, label=f"{name}: {rms:.3f} m/s rms")
 
 
 def _legend_above(axes: Axes) -> None:

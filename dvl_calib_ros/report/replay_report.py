@@ -106,8 +106,8 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
         "estimates": _estimate_table(result, shown),
         "families": list(_families(result, history, time, shown)),
         "selected": result.selected,
-        "velocities": _velocities(result, history, time),
-        "velocity_note": _velocity_note(result, history),
+        "velocities": _velocities(replayed, history, time),
+        "velocity_note": _velocity_note(replayed),
         "streams": _stream_table(result),
         "data_pictures": _data_pictures(result, history, time, shown),
         "parameters": parameter_texts(result.parameters),
@@ -305,10 +305,10 @@ def _line(name: str, history: ModelHistory, term: Term) -> figures.Line:
 # ------------------------------------------------------------------ velocity
 
 
-def _velocities(result: Result, history: RunHistory, time: TimeAxis) -> list[Picture]:
+def _velocities(replayed: Replayed, history: RunHistory, time: TimeAxis) -> list[Picture]:
     """Velocity and, with a reference, residual, per body axis."""
-    t = Parameters.from_mapping(result.parameters).rotation_dvl_from_body
-    correction = result.estimate
+    t = Parameters.from_mapping(replayed.result.parameters).rotation_dvl_from_body
+    correction = replayed.result.estimate
     before, after = history.dvl_velocity @ t, correction.corrected_velocity(history.dvl_velocity, t)
     pictures = [
         picture(
@@ -318,28 +318,28 @@ def _velocities(result: Result, history: RunHistory, time: TimeAxis) -> list[Pic
         )
         for axis, where in enumerate(BODY_AXES)
     ]  # fmt: skip
-    if len(history.paired_ns):
-        residual_before = history.paired_velocity @ t - history.reference_velocity
-        residual_after = correction.corrected_velocity(history.paired_velocity, t) - history.reference_velocity
+    navigation = replayed.navigation
+    if navigation is not None:
         pictures += [
             picture(
                 f"Residual {where}", f"DVL minus GNSS {where}, before and after correction, m/s",
-                figures.residual_over_time, time, history.paired_ns, residual_before[:, axis],
-                residual_after[:, axis], f"DVL − GNSS {where}, m/s",
+                figures.residual_over_time, time, navigation.stamps_ns, -navigation.error_before[:, axis],
+                -navigation.error_after[:, axis], f"DVL − GNSS {where}, m/s",
             )
             for axis, where in enumerate(BODY_AXES)
         ]  # fmt: skip
     return pictures
 
 
-def _velocity_note(result: Result, history: RunHistory) -> str:
-    note = f"Body frame, corrected with the final estimate of {result.selected}."
-    if len(history.paired_ns):
-        return (
-            f"{note} The residuals hold the noise of the GNSS as well, and the calibration has used this data: they "
-            "show what was corrected, they do not verify it. Lines are running means."
-        )
-    return f"{note} No DVL sample has a reference velocity, so there is no residual."
+def _velocity_note(replayed: Replayed) -> str:
+    estimate = replayed.result.estimate
+    turned = f"Body frame. Velocities are of the DVL's own place, corrected with the final estimate of {estimate.model}"
+    if replayed.navigation is None:
+        return f"{turned}. No reference is beside enough of them for residuals."
+    return (
+        f"{turned}; residuals are at the reference point, corrected by estimates that had not seen the data, with all "
+        "that was found, lever arm and delay too. The noise of the reference is in them. Lines are running means."
+    )
 
 
 # ------------------------------------------------------------------ data

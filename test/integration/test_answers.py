@@ -76,9 +76,7 @@ def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
             True,
             none[:, 0],
             none[:, 0],
-            none,
-            none,
-            none,
+            *[none] * 5,
         )
     )
     assert [word for word, _ in found] == expected

@@ -69,6 +69,17 @@ def test_a_corrected_velocity_is_in_the_body(calibration):
     np.testing.assert_allclose(calibration.correct([1.0, 0.0, 0.0]), rotation[:, 0], atol=0.02)
 
 
+def test_a_corrected_velocity_of_a_turning_vehicle_is_that_of_the_reference_point(tmp_path):
+    bag = tmp_path / "ahead"
+    assert main(["simulate", str(bag), "--duration", "240", "--effect", "lever_arm:x_m=0.8"]) == 0
+    run = dc.replay(bag, model="G2")
+    assert run.mounting.xyz_m[0] == pytest.approx(0.8, abs=0.1)
+    velocity = [[1.0, 0.0, 0.0], [0.5, 0.1, 0.0]]
+    turning = run.correct(velocity, [[0.0, 0.0, 0.2], [0.0, 0.0, -0.1]]) - run.correct(velocity)
+    x, y, _ = run.mounting.xyz_m
+    np.testing.assert_allclose(turning, [[0.2 * y, -0.2 * x, 0.0], [-0.1 * y, 0.1 * x, 0.0]], atol=1e-12)
+
+
 def test_the_run_over_time_is_a_data_frame_on_demand(calibration):
     frame = pytest.importorskip("pandas") and calibration.to_pandas()
     assert list(frame.columns[:3]) == ["time_s", "phi_x", "phi_x_std"]

@@ -77,6 +77,9 @@ def test_lever_arm_and_delay_are_part_of_what_is_corrected():
     assert corrected is not None and without is not None
     assert corrected.before.per_km > 20.0 * corrected.after.per_km
     assert without.after.per_km > 10.0 * corrected.after.per_km
+    left = [np.sqrt(np.mean(each.error_after**2)) for each in (corrected, without)]
+    assert left[0] < 0.01 < 0.02 < left[1] < np.sqrt(np.mean(corrected.error_before**2))
+    assert corrected.error_after.shape == (len(corrected.stamps_ns), 3)
 
 
 def test_each_fold_is_corrected_by_what_has_not_seen_it():

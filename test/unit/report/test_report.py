@@ -234,7 +234,7 @@ def test_a_figure_that_is_not_over_time_has_no_data_for_the_script():
 def test_a_bag_without_gnss_has_no_residuals(tmp_path):
     samples = [sample for sample in run() if not isinstance(sample, ReferenceSample)]
     page = Page(replay_page(tmp_path, samples)[0])
-    assert "No DVL sample has a reference velocity" in page.text
+    assert "No reference is beside enough of them for residuals" in page.text
     assert "Residual" not in page.text and "Models with GNSS" not in page.text and "Models without GNSS" in page.text
 
 
@@ -290,7 +290,7 @@ def test_the_history_ends_with_the_result_and_holds_what_the_models_saw(tmp_path
         np.testing.assert_allclose(history.models[name].std[-1], estimate.recording_std, atol=1e-12)
     assert len(history.dvl_ns) == result.counts["dvl"]["usable"]
     assert len(history.paired_ns) == result.counts["pairing"]["paired"]
-    assert np.abs(history.paired_velocity - history.reference_velocity).max() < 0.6
+    assert history.reference_velocity.shape == (len(history.paired_ns), 3)
 
 
 @pytest.mark.parametrize("expected", [0, 7, 1000, 10**6])
