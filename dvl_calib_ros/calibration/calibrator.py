@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from . import told_arm
 from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
@@ -611,11 +612,13 @@ class Calibrator:
         return any(each.is_level for each in self._further)
 
     def _without_tilt(self, estimate: Estimate) -> Estimate:
-        """Where no roll and pitch of the vehicle are known, an estimate that claims none of the DVL."""
+        """An estimate that claims no roll and pitch where those of the vehicle are not known; and no roll where another
+        lever arm is found than was told: an attitude of another time makes one, and in waves a roll."""
         model, p = MODELS[estimate.model], self.parameters
-        if not (model.aided and self.is_level):
+        unknown_axes = 0 if not model.aided else 2 if self.is_level else int(self._finds_another_arm)
+        if not unknown_axes:
             return estimate
-        level = p.rotation_dvl_from_body[:, :2]
+        level = p.rotation_dvl_from_body[:, :unknown_axes]
         unknown = np.zeros((model.n_state, model.n_state))
         unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
         own = estimate.recording_covariance + unknown
@@ -626,6 +629,16 @@ class Calibrator:
             convergence=convergence(model, own, p),
             observability=observability(model, own, p),
         )
+
+    @property
+    def _finds_another_arm(self) -> bool:
+        """Whether the lever arm that was told is contradicted."""
+        if told_arm.FINDS_IT not in self._models:
+            return False
+        estimator = self._estimators[told_arm.FINDS_IT]
+        x, p = estimator.of_recording()
+        shown = GaussianState(x, p - estimator.left_open)
+        return bool(told_arm.contradicted(MODELS[told_arm.FINDS_IT], shown, self.parameters).any())
 
     def _days_of(self, name: str) -> tuple[Day, ...]:
         return self._estimators[name].days_from((self.first_ns or 0, *self._aligner.day_starts_ns))

@@ -94,6 +94,8 @@ def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(t
     run = dc.replay(told.write(tmp_path / "bag"))
     codes = [found.code for found in run.findings]
     assert ("LEVER_ARM_CONTRADICTED" in codes) == off
+    result = run.replayed.result  # a late attitude would be such an arm, and a roll besides
+    assert (result.estimates["G2"].recording_std[0] >= result.parameters["initial_std_misalignment"]) == off
     assert run.mounting.position_m == pytest.approx(LEVER_ARM, abs=0.05)
     if off:
         assert run.verdict == "marginal" and any("another lever arm" in reason for reason in run.reasons)
