@@ -612,10 +612,12 @@ class Calibrator:
         return any(each.is_level for each in self._further)
 
     def _without_tilt(self, estimate: Estimate) -> Estimate:
-        """An estimate that claims no roll and pitch where those of the vehicle are not known; and no roll where another
-        lever arm is found than was told: an attitude of another time makes one, and in waves a roll."""
+        """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
+        the vertical; and no roll where another lever arm is found than was told: an attitude of another time makes one,
+        and in waves a roll."""
         model, p = MODELS[estimate.model], self.parameters
-        unknown_axes = 0 if not model.aided else 2 if self.is_level else int(self._finds_another_arm)
+        hidden = self.is_level or any(each.is_horizontal for each in self._further)
+        unknown_axes = 0 if not model.aided else 2 if hidden else int(self._finds_another_arm)
         if not unknown_axes:
             return estimate
         level = p.rotation_dvl_from_body[:, :unknown_axes]

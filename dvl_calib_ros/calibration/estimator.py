@@ -98,6 +98,11 @@ class Estimator(ABC):
         return False
 
     @property
+    def is_horizontal(self) -> bool:
+        """Whether no reference measures the vertical."""
+        return False
+
+    @property
     def left_open(self) -> Array:
         """(n, n) of `of_recording`'s covariance, what the clock of the reference leaves open."""
         n = len(self.state().x)

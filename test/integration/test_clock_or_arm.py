@@ -30,6 +30,8 @@ def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
     """It was -0.46 m ± 0.05; by differences of velocities it is 0.0 ± 0.1."""
     run = dc.replay(bags / name, history=False)
     estimate = run.replayed.result.estimate
+    observed = {each.axis: each.observed for each in estimate.observability}
+    assert not (observed["roll"] or observed["pitch"] or observed.get("lever arm z"))  # horizontal references
     if estimate.model != "G2":  # which claims no arm
         return
     arm, std = estimate.state_of("lever_arm_x"), estimate.std_of("lever_arm_x")

@@ -210,6 +210,11 @@ class DelayFilter(Estimator):
         return self._idle_solver().is_level
 
     @property
+    def is_horizontal(self) -> bool:
+        """As `Estimator`."""
+        return self._idle_solver().is_horizontal
+
+    @property
     def registration_so_far(self) -> Registration | None:
         """The same, as it was seen a little ago."""
         return self._solver.registration(fresh=False)

@@ -90,6 +90,7 @@ class BlockSolver:
         self.bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified, parameters)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
+        self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
         self._dvl_stream = DvlStream()
         self._turned = False
         self._clocks = KeptClocks(parameters)
@@ -134,6 +135,11 @@ class BlockSolver:
     def is_level(self) -> bool:
         """Whether references were turned into the body by a heading alone, without roll and pitch."""
         return self._turned and self._attitude_rates.is_level
+
+    @property
+    def is_horizontal(self) -> bool:
+        """Whether no reference measures the vertical."""
+        return self._seen_ahead and not self._seen_upwards
 
     def solve(self, blocks: Sequence[Block]) -> list[Outcome]:
         """Take blocks in order: many at once cost a third of one after the other, and come to the same."""
@@ -320,6 +326,8 @@ class BlockSolver:
         """Give a block's streams to `_shared_noise`. seen: its references."""
         variance = np.diagonal(seen.noise, axis1=1, axis2=2)
         known = seen.known[:, None] & (variance < MEASURED_BELOW)
+        self._seen_ahead = bool(known[:, 0].any()) or self._seen_ahead
+        self._seen_upwards = bool(known[:, 2].any()) or self._seen_upwards
         at = streams.own_dvl
         in_the_body = streams.dvl.velocity[at] @ self._parameters.rotation_dvl_from_body
         reference = np.where(known, seen.velocity, np.nan)
