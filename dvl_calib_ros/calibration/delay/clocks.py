@@ -7,8 +7,7 @@ lever arm of ρ u explains almost as well: so what G2 has kept of each day is re
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,8 @@ from ..register.configuration import fitting_configuration
 from ..register.motion import Motion, make_motion
 from ..register.registration import Registration, register
 from ..samples import FRAMES, Codes, Mask
-from .hold_out import MEASURED_BELOW, Kept
+from ..tables import Table
+from .hold_out import KEPT_EVERY_S, MEASURED_BELOW, Kept
 from .rows import ImuColumns
 
 # Live, what was found stands until so much more is there.
@@ -27,28 +27,91 @@ AGAIN_FROM = 1.5
 # Fewer blocks tell nothing, and live there is no look before a minute. Of more, which are 40 minutes, the oldest are
 # forgotten: no more rows are looked at than a third of these have, and a node's memory is to be flat.
 ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
+# Rows that a block of 10 s has of each stream.
+MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
 
-class _Seen(NamedTuple):
-    """What is registered of a block: times (N,) s and velocities (N, 3) of the DVL; of M references the same, whether
-    they are in the body (M,) and which axes they measure (M, 3); times, attitudes and rates of the IMU."""
+class _Dvl(Table):
+    """times s and velocities m/s of the DVL."""
 
-    dvl_times: Array
-    dvl_velocity: Array
+    LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,))}
+    times: Array
+    velocity: Array
+
+
+class _Reference(Table):
+    """The same of references, whether they are in the body and which axes they measure."""
+
+    LAYOUT: ClassVar = {**_Dvl.LAYOUT, "in_body": (np.bool_, ()), "is_measured": (np.bool_, (3,))}
     times: Array
     velocity: Array
     in_body: Mask
     is_measured: NDArray[np.bool_]
-    imu_times: Array
+
+
+class _Imu(Table):
+    """times s, attitudes and rates of the IMU, as of `ImuColumns`."""
+
+    LAYOUT: ClassVar = {
+        "times": (np.float64, ()),
+        "orientation": (np.float64, (4,)),
+        "angular_velocity": (np.float64, (3,)),
+    }
+    times: Array
     orientation: Array
     angular_velocity: Array
 
-    @staticmethod
-    def of(kept: Kept) -> _Seen:
-        """What is kept of a block, without what is of no use here: covariances alone are half of it."""
+
+class _Seen:
+    """What is registered of the newest blocks, without what is of no use here: covariances alone are half of it."""
+
+    def __init__(self) -> None:
+        self._streams = _Dvl(), _Reference(), _Imu()
+        self._blocks: deque[tuple[int, ...]] = deque()  # rows of each in the streams
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def take_room(self) -> None:
+        """Take all room that will be needed at once, so that memory does not grow for 40 minutes."""
+        for stream in self._streams:
+            stream.reserve((MOST + 1) * MOST_OF_A_BLOCK)
+
+    def add(self, kept: Kept) -> None:
+        """Take a block; of more than `MOST` the oldest is forgotten."""
         r = kept.reference
         is_measured = np.diagonal(r.noise, axis1=1, axis2=2) < MEASURED_BELOW
-        return _Seen(*kept.dvl, r.times, r.velocity, r.in_body, is_measured, *kept.imu)
+        columns = kept.dvl, (r.times, r.velocity, r.in_body, is_measured), kept.imu
+        for stream, own in zip(self._streams, columns, strict=True):
+            at = stream.extend(len(own[0]))
+            for name, column in zip(stream.LAYOUT, own, strict=True):
+                getattr(stream, name)[at] = column
+        self._blocks.append(tuple(len(own[0]) for own in columns))
+        if len(self._blocks) > MOST:
+            for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):
+                stream.forget_before(stream.begin + n)
+
+    def clear(self) -> None:
+        """Forget all blocks."""
+        self._blocks.clear()
+        for stream in self._streams:
+            stream.clear()
+
+    def motion(self) -> Motion | None:
+        """All that is there, without references that are not like most; None where that is too little."""
+        dvl, reference, imu = (
+            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
+        )
+        times, velocity, in_body, is_measured = reference
+        alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
+        x, y, z = (2 * np.count_nonzero(is_measured[alike], axis=0) > np.count_nonzero(alike)).tolist()
+        return make_motion(
+            (dvl[0].copy(), dvl[1].copy()),
+            (times[alike], velocity[alike]),
+            not bool(in_body[alike].all()) if alike.any() else False,
+            (x, y, z),
+            ImuColumns(*(column.copy() for column in imu)),
+        )
 
 
 class Looked(NamedTuple):
@@ -62,9 +125,12 @@ class Looked(NamedTuple):
 class KeptClocks:
     """What registration says of clocks and frames, of the days that are over and of this one."""
 
-    def __init__(self, parameters: Parameters) -> None:
+    def __init__(self, parameters: Parameters, live: bool) -> None:
+        """live: they go on for hours."""
         self._parameters = parameters
-        self._seen: deque[_Seen] = deque(maxlen=MOST)
+        self._seen = _Seen()
+        if live:
+            self._seen.take_room()
         self._blocks = 0  # of this day
         self._declared = np.zeros(len(FRAMES), dtype=np.int64)  # references said to be in each frame
         self._over: Looked | None = None  # of a day that is over, where something was off
@@ -72,7 +138,7 @@ class KeptClocks:
 
     def add(self, kept: Kept, frames: Codes) -> None:
         """Take a block's streams. frames: (J,) codes of the frames that its references are said to be in."""
-        self._seen.append(_Seen.of(kept))
+        self._seen.add(kept)
         self._declared += np.bincount(frames, minlength=len(FRAMES))
         self._blocks += 1
 
@@ -107,7 +173,7 @@ class KeptClocks:
         return "" if looked.registration is None else looked.registration.says(self._parameters)
 
     def _look(self) -> Looked:
-        motion = _motion(tuple(self._seen)) if len(self._seen) >= ENOUGH else None
+        motion = self._seen.motion() if len(self._seen) >= ENOUGH else None
         if motion is None:
             return Looked(self._blocks)
         nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
@@ -117,16 +183,3 @@ class KeptClocks:
             return Looked(self._blocks, found, fitting_configuration(motion, declared, nominal, lever_arm, found))
         except np.linalg.LinAlgError:  # numbers that ran away
             return Looked(self._blocks)
-
-
-def _motion(seen: Sequence[_Seen]) -> Motion | None:
-    dvl_times, velocity, times, reference, in_body, is_measured, *imu = map(np.concatenate, zip(*seen, strict=True))
-    alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
-    x, y, z = (2 * np.count_nonzero(is_measured[alike], axis=0) > np.count_nonzero(alike)).tolist()
-    return make_motion(
-        (dvl_times, velocity),
-        (times[alike], reference[alike]),
-        not bool(in_body[alike].all()) if alike.any() else False,
-        (x, y, z),
-        ImuColumns(*imu),
-    )

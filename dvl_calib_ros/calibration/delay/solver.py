@@ -93,7 +93,7 @@ class BlockSolver:
         self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
         self._dvl_stream = DvlStream()
         self._turned = False
-        self._clocks = KeptClocks(parameters)
+        self._clocks = KeptClocks(parameters, live)
         self._is_live = live
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
