@@ -128,12 +128,16 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, s
     the axes given leave with whichever clocks, m/s: where a clock is off, neither fits with clocks in time.
     """
     fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
-    found = []
-    for rotation, held in ((nominal, (REFERENCE,)), (nominal @ FLU_FROM_FRD, WITHOUT_ARM)):
+
+    def fitted(rotation: Array, held: Sequence[Array]) -> Fitted | None:
         near = nearest(quick, rotation, held)
-        found.append(None if near is None else fit(0.0, near.dvl_late, rotation, held))
-    given, turned = found
-    if given is None or turned is None or turned.level > AS_WELL * spread:
+        return None if near is None else fit(0.0, near.dvl_late, rotation, held)
+
+    turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM)
+    if turned is None or turned.level > AS_WELL * spread:
+        return ""
+    given = fitted(nominal, (REFERENCE,))
+    if given is None:
         return ""
     # of the same samples but for those at the ends; outliers, and a level that is told by the middle one, judge nothing
     most = (OUTLYING * max(min(given.level, turned.level), 1e-6)) ** 2

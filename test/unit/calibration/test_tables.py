@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.delay.clocks import MOST, MOST_OF_A_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.delay.filter import DelayFilter
+from dvl_calib_ros.calibration.delay.hold_out import KEPT_EVERY_S, Kept
+from dvl_calib_ros.calibration.delay.rows import DvlColumns, ImuColumns, ReferenceColumns
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.tables import Table
@@ -65,3 +68,24 @@ def test_live_the_room_for_samples_is_taken_before_they_come(rate_hz):
     memory = keeper._dvl.velocity
     feed(20, 80)
     assert keeper._dvl.base > 0 and keeper._dvl.velocity is memory
+
+
+def test_what_is_registered_live_is_of_the_newest_blocks_in_memory_that_is_taken_at_once():
+    clocks = KeptClocks(Parameters(), live=True)
+    streams = clocks._seen._streams
+    memory = [stream.times for stream in streams]
+    n = MOST_OF_A_BLOCK
+    for number in range(2 * MOST + 20):
+        times = 10.0 * number + KEPT_EVERY_S * np.arange(n)
+        reference = ReferenceColumns(times, np.ones((n, 3)), np.ones((n, 1, 1)) * np.eye(3), times < 0.0, times > 0.0)
+        kept = Kept(
+            DvlColumns(times, np.ones((n, 3))),
+            np.eye(3),
+            reference,
+            ImuColumns(times, np.ones((n, 4)), np.ones((n, 3))),
+        )
+        clocks.add(kept, np.zeros(n, dtype=np.uint8))
+        oldest = 10.0 * max(0, number + 1 - MOST)
+        assert all(stream.times[stream.begin] == oldest for stream in streams)
+    assert len(clocks._seen) == MOST
+    assert all(stream.times is own for stream, own in zip(streams, memory, strict=True))
