@@ -29,6 +29,8 @@ REGISTERED, CLEARLY = 0.3, 0.5
 SAID_FROM_M = 0.08
 # Of a stream one sample in so long is registered, ns.
 EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
+# What a clock of the DVL's that drifts or leaps is told by.
+MOVING = frozenset({"dvl_clock_drift", "dvl_time_jump", "dvl_time_jump_at"})
 # Samples of the DVL that are compared to find frames: no more tell more.
 COMPARED = 1500
 
@@ -45,9 +47,21 @@ class FoundClocks:
     parameters: Parameters
     far: Far | None = None
 
+    @property
+    def doubt(self) -> str:
+        """What no calibration can be done with, in words; else ''."""
+        if self.far is not None:
+            return self.far.says
+        moves = self.registration.unsteady
+        is_left = moves is not None and not MOVING & self.offsets.keys()
+        return f"{moves.says}: {moves.remedy}" if moves is not None and is_left else ""
+
     def says(self) -> Iterator[str]:
         """Of each clock that is off how late it is, and what comes of it; one sentence each."""
         r = self.registration
+        if r.unsteady is not None and not self.doubt:
+            taken = ", ".join(f"{name} {self.offsets[name]:.13g}" for name in sorted(MOVING & self.offsets.keys()))
+            yield f"{r.unsteady.says}: taken off ({taken})"
         for name, late in r.offsets.items():
             if name in self.offsets:
                 done = f"taken off ({name} {late:.2f})"
@@ -77,6 +91,8 @@ def find_clocks(
         return None
     each = [_found(one, topics, parameters, knows_mounting, given) for one in recording.each]
     first = each[0]
+    if len(each) > 1 and any(one is not None and one.offsets.keys() & MOVING for one in each):
+        return None  # of each recording another
     if first is None or any(one is None for one in each):
         return None
     for one in each[1:]:
@@ -91,6 +107,7 @@ def _found(
     recording: Recording, topics: Topics, parameters: Parameters, knows_mounting: bool, given: frozenset[str]
 ) -> FoundClocks | None:
     best: tuple[Registration, Parameters] | None = None
+    epoch_ns = 0
     for hypothesis in _hypotheses(parameters, given):
         motion = _motion(recording, topics, hypothesis)
         if motion is None:
@@ -103,7 +120,7 @@ def _found(
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
         if found is not None and (best is None or found.left < CLEARLY * best[0].left):
-            best = found, hypothesis
+            best, epoch_ns = (found, hypothesis), motion.epoch_ns
         if is_first and found is not None and found.left < REGISTERED:
             break
     if best is None or best[0].left >= REGISTERED:
@@ -112,6 +129,8 @@ def _found(
     # a whole recording that does not show how all clocks stand is no reason to move one
     is_kept = bool(given.intersection(OFFSETS)) or not registration.are_known
     offsets = {} if is_kept else registration.taken_off
+    if registration.unsteady is not None and not given & MOVING:
+        offsets |= registration.unsteady.taken_off(epoch_ns)
     return FoundClocks(registration, offsets, hypothesis)
 
 

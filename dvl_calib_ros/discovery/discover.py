@@ -130,7 +130,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         found,
         parameters=found.parameters.replace(**{n: getattr(parameters, n) + s for n, s in clocks.offsets.items()}),
         found=(*found.found, *clocks.says()),
-        contradictions=(*found.contradictions, *([clocks.far.says] if clocks.far else [])),
+        contradictions=(*found.contradictions, *([clocks.doubt] if clocks.doubt else [])),
         clocks=clocks,
     )
 

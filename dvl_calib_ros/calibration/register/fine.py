@@ -83,9 +83,7 @@ class Fitted(NamedTuple):
 
     def cost(self, level: float, among: Index) -> float:
         """What is left of these references, in chi-square by a level of noise (m/s), robust."""
-        scale = HALF_AT**2 * self.axes
-        kept = self.squares[np.searchsorted(self.at, among)]
-        return scale * float(np.log1p(kept / (scale * level**2)).sum())
+        return float(_robust(self.squares[np.searchsorted(self.at, among)], self.axes, level).sum())
 
     @property
     def left(self) -> float:
@@ -173,7 +171,7 @@ def _between(values: Array, before: Index, share: Array) -> Array:
 class Fit:
     """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
 
-    rows: references that are looked at.
+    times: (J,) s of the references that are looked at.
     """
 
     def __init__(self, motion: Motion, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
@@ -184,8 +182,7 @@ class Fit:
         moving = np.flatnonzero((m.reference**2).sum(axis=1) >= SLOW_MPS**2)
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
-        self._times, self._velocity = m.reference_times[moving], m.reference[moving]
-        self.rows = len(moving)
+        self.times, self._velocity = m.reference_times[moving], m.reference[moving]
         # of the DVL, (m/s)²: where hardly anything changes, what seems to is its noise
         self._noise = float(_noise(m.dvl.velocity))
 
@@ -234,14 +231,21 @@ class Fit:
         inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
         return Fitted(x, p, rotation, level, len(rows.at), rows.speed, squares, axes, inflation, rows.at)
 
+    def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
+        """Which references (J,) are compared at a state, and what is left of each (J,), as in `Fitted.cost`."""
+        rows = self._rows(x, rotation, None)
+        if rows is None:
+            return np.zeros(0, dtype=np.intp), np.zeros(0)
+        return rows.at, _robust((rows.residual**2).sum(axis=1), rows.residual.shape[1], level)
+
     def _streams(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
         """Which references (J,), and B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), noise gain of
         the slope (J,)."""
         m = self._motion
-        own = self._times - reference
+        own = self.times - reference
         if m.in_earth and not m.has_attitude:
             return None
-        velocity, slope, gain, known = self._curves.velocity(self._times + apart)
+        velocity, slope, gain, known = self._curves.velocity(self.times + apart)
         needed = m.in_earth or not all(m.measured)
         rotation, oriented = attitude_at(m.imu, own, GAP_S) if needed else (np.zeros((len(own), 3, 3)), known)
         if m.in_earth:
@@ -257,10 +261,10 @@ class Fit:
 
     def _shared(self, other: Fitted, reference: float, apart: float) -> Mask:
         """Which references (J,) are compared at another place, with DVL and attitudes that are compared there."""
-        there, shared = self._times[other.at], np.zeros(len(self._times), dtype=bool)
+        there, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
         shared[other.at] = True
         for here, elsewhere in ((apart, float(other.x[APART])), (-reference, -float(other.x[LATE]))):
-            at = self._times + here
+            at = self.times + here
             shared &= (at >= there[0] + elsewhere) & (at <= there[-1] + elsewhere)
         return shared
 
@@ -328,6 +332,12 @@ class Fit:
             blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
         factor = blocks.inflation(0, np.zeros(N), p)
         return p * np.outer(factor, factor), factor
+
+
+def _robust(squares: Array, axes: int, level: float) -> Array:
+    """Squares (J,) (m/s)² of so many axes in chi-square by a level of noise (m/s), far ones by their logarithm."""
+    scale = HALF_AT**2 * axes
+    return np.asarray(scale * np.log1p(squares / (scale * level**2)))
 
 
 def _noise(velocity: Array) -> float:

@@ -11,7 +11,7 @@ from ..delay.rows import DvlColumns, ImuColumns, TurnRates, binned
 from ..frames import ENU_FROM_NED, Array
 from ..imu_alignment import ImuAlignment
 from ..parameters import Parameters
-from ..samples import FRAME_CODES, SampleBlock, Streams, VelocityFrame
+from ..samples import FRAME_CODES, Index, SampleBlock, Streams, VelocityFrame
 from ..screening import screen_columns, unit_quaternions
 from ..spikes import without_spikes
 
@@ -22,6 +22,7 @@ class Motion:
 
     dvl: velocity in the DVL's frame. reference_times (M,) s, reference (M, 3) m/s: in the earth (ENU) if in_earth, else
     in the body. measured: (3,) which of its axes are measured. imu: attitudes; without any none is known. turns: rates.
+    epoch_ns: stamp of time 0, but for what was taken off.
     """
 
     dvl: DvlColumns
@@ -31,11 +32,19 @@ class Motion:
     measured: tuple[bool, bool, bool]
     imu: ImuColumns
     turns: TurnRates
+    epoch_ns: int = 0
 
     @property
     def has_attitude(self) -> bool:
         """Whether there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
+
+    def part(self, at: Index, margin_s: float) -> Motion:
+        """Some of the references, one after the other, and of the DVL what is so near to them."""
+        times = self.reference_times[at]
+        near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
+        dvl = DvlColumns(self.dvl.times[near], self.dvl.velocity[near])
+        return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl)
 
     def in_the_body(self) -> Motion:
         """The same as if the reference were in the body."""
@@ -64,13 +73,14 @@ def motion_of(streams: Streams, parameters: Parameters) -> Motion | None:
     measured = _measured(reference, parameters)
     if code == FRAME_CODES[VelocityFrame.NED]:
         measured = measured[1], measured[0], measured[2]
-    return make_motion(
+    made = make_motion(
         (dvl_times, velocity),
         (reference_times, seen),
         code != FRAME_CODES[VelocityFrame.BODY],
         measured,
         ImuColumns(imu_times, numbers[:, :4], numbers[:, 4:]),
     )
+    return None if made is None else replace(made, epoch_ns=first_ns)
 
 
 def make_motion(

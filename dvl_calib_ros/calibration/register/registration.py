@@ -16,8 +16,9 @@ import numpy as np
 from ..frames import Array
 from ..parameters import Parameters
 from .coarse import LONGEST_S, places
-from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Curves, Fit, Fitted
+from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Curves, Fit, Fitted, N
 from .motion import Motion
+from .steadiness import DIRECTIONS, Unsteady, unsteady
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
 # of an inertial navigation are late by less (five real recordings: 0.03 to 0.07 s).
@@ -35,6 +36,9 @@ EARLY = 6.0
 INDEPENDENT_S, GAIN = 1.0, 8.0
 # Against a place that compares fewer references than this share of its own another is weighed on what both compare.
 AS_MANY = 0.95
+# What is left lasts by so much longer than noise where a clock moves; it is then looked for in stretches this long, s,
+# no more of them, each by so many references.
+STEADY, STRETCH_S, MOST_STRETCHES, ROWS_OF_STRETCH = 1.05, 90.0, 16, 400
 # The place of the clocks is known where it is to this, s (σ).
 KNOWN_STD_S = 0.25
 
@@ -69,6 +73,7 @@ class Registration:
     rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the DVL from the reference
     point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
     speed; spread: the same, m/s per axis; speed: RMS, m/s.
+    unsteady: a clock that drifts or leaps beside the others; all else is what holds with that taken off.
     open_late: σ (s) of the reference's clock by the data alone; open_by: (4,) by how much the lever arm (m) and the
     DVL's delay (s) are others for each second of it.
     """
@@ -90,6 +95,7 @@ class Registration:
     speed: float
     open_late: float
     open_by: Array
+    unsteady: Unsteady | None = None
 
     @property
     def left_open(self) -> Array:
@@ -132,6 +138,8 @@ class Registration:
     def says(self, parameters: Parameters) -> str:
         """What configuration would fit, in words, where a clock beside the DVL's is off beyond doubt; else ''."""
         imu = f"imu_time_offset: {round(parameters.imu_time_offset + self.imu.late, 2):g}"
+        if self.unsteady is not None:
+            return f"{self.unsteady.says} ({self.unsteady.remedy})"
         if self.imu.is_shown:
             return f"the data fit an IMU whose stamps are {_late(self.imu)} ({imu})"
         if not self.reference.is_shown:
@@ -146,21 +154,23 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
 
     rotation_body_from_dvl: (3, 3) the mounting, None where it is not known. lever_arm: (3,) m, what is known of it.
     """
+    return _registered(motion, rotation_body_from_dvl, lever_arm, None)
+
+
+def _registered(
+    motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: Unsteady | None
+) -> Registration | None:
+    """moves: what has been taken off a clock; None to look whether one moves."""
     curves = Curves(motion)
     fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
-    likely = places(motion, rotation_body_from_dvl)
-    enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
-    tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
-    found = [quick(*place, rotation_body_from_dvl) for place in {*tried, (0.0, 0.0)}]
-    fitted = [each for each in found if each is not None and _is_possible(each)]
-    if not fitted:
-        return None
-    closest = min(fitted, key=lambda each: each.level)
-    # legs that repeat agree at more than one delay
-    as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation_body_from_dvl)]
-    best: Fitted | None = min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
+    best = _placed(motion, quick, rotation_body_from_dvl)
     if best is None:
         return None
+    if moves is None and best.inflation > STEADY:
+        moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
+        if moves is not None:
+            found = _registered(moves.steadied(motion), rotation_body_from_dvl, lever_arm, moves)
+            return None if found is None else replace(found, unsteady=_timed(moves, found, motion, fit, lever_arm))
     in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
     if in_time[1] < NO_DOUBT:  # all that there is would show nothing more
         seen = _explained(quick, best, rotation_body_from_dvl, lever_arm)
@@ -171,6 +181,58 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
         return seen if free is None or not _is_possible(free) else replace(seen, **_open(fit, free))
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
     return None if best is None or not _is_possible(best) else _explained(fit, best, rotation_body_from_dvl, lever_arm)
+
+
+def _placed(motion: Motion, quick: Fit, rotation: Array | None) -> Fitted | None:
+    """The likeliest place of the clocks of a motion."""
+    likely = places(motion, rotation)
+    enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
+    tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
+    found = [quick(*place, rotation) for place in {*tried, (0.0, 0.0)}]
+    fitted = [each for each in found if each is not None and _is_possible(each)]
+    if not fitted:
+        return None
+    closest = min(fitted, key=lambda each: each.level)
+    # legs that repeat agree at more than one delay
+    as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation)]
+    return min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
+
+
+def _unsteady(motion: Motion, curves: Curves, lever_arm: Array, rotation: Array | None) -> Unsteady | None:
+    """A clock that moves, by the places of all of them in stretches of a motion."""
+    times = motion.reference_times
+    number = min(int((times[-1] - times[0]) / STRETCH_S), MOST_STRETCHES)
+    found = []
+    for at in np.array_split(np.arange(len(times)), max(number, 1)) if number > 1 else ():
+        own = motion.part(at, LONGEST_S)
+        best = _placed(own, Fit(own, lever_arm, curves, ROWS_OF_STRETCH), rotation)
+        if best is not None:
+            found.append((float(times[at].mean()), best))
+    is_turned = motion.in_earth and motion.has_attitude
+    return unsteady(np.array([at for at, _ in found]), [each for _, each in found], is_turned)
+
+
+def _timed(moves: Unsteady, found: Registration, motion: Motion, fit: Fit, lever_arm: Array) -> Unsteady:
+    """A leap with the time at which the clocks before it and those after it explain most together."""
+    if not moves.leap:
+        return moves
+    reach = np.ptp(fit.times) / MOST_STRETCHES + STRETCH_S
+    if (hole := moves.hole(motion, reach)) is not None:
+        return replace(moves, at=hole)
+    x = np.zeros(N)
+    x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
+    x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
+    after = x.copy()
+    after[[APART, LATE]] += moves.leap * np.array(DIRECTIONS[moves.whose or "dvl"])
+    (at, before), (later, behind) = (fit.costs(each, found.rotation_body_from_dvl, found.spread) for each in (x, after))
+    shared, own, other = np.intersect1d(at, later, return_indices=True)
+    near = np.abs(fit.times[shared] - moves.at) <= reach
+    gain = np.cumsum((before[own] - behind[other])[near])
+    if not len(gain):
+        return moves
+    seconds = float(fit.times[shared][near][int(np.argmin(gain))])
+    # between the DVL's stamps before it and those after it
+    return replace(moves, at=seconds + (float(x[APART]) + max(0.5 * moves.leap, 0.0) if moves.whose == "dvl" else 0.0))
 
 
 def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:

@@ -1,0 +1,164 @@
+"""Clocks that do not stand still beside each other: one that drifts, or that leaps once.
+
+A recording is registered in stretches. Where their clocks are not one, it is asked which single clock explains them:
+one that is later by so much for each second, or from some stretch on; the stretch in which it leaps may be anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..delay.rows import DvlColumns, ImuColumns, TurnRates
+from ..frames import Array
+from ..samples import Mask
+from .fine import APART, LATE, Fitted
+from .motion import Motion
+
+# By how much (δ, ρ) of a fit are more for each second that a stream's stamps are later.
+DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference": (-1.0, 1.0), "imu": (0.0, -1.0)}
+# Lags of interpolation and filters change by as much from one stretch to another, s.
+LAGS_S = 0.03
+# From here on a clock that moves is one, from end to end: s, in σ, and in chi-square; another clock has to explain it
+# by so much less to be told from it, and what is left may be so much for each degree of freedom.
+SHOWN_FROM_S, SIGMAS, GAIN, TOLD_APART, LEFT = 0.1, 5.0, 18.0, 8.0, 4.0
+# A leap ahead leaves a hole of its size in the stamps, which is known to such a share.
+HOLE = 0.8
+# More is no parameter's (`dvl_clock_drift`, s/s, and `dvl_time_jump`, s).
+MOST_DRIFT, MOST_LEAP_S = 0.01, 10.0
+# What it costs, in chi-square, that one stretch is anything; and so many at least on either side of a leap.
+ANYTHING, EACH_SIDE = 10.0, 2
+
+
+@dataclass(frozen=True)
+class Unsteady:
+    """whose: by the name of `DIRECTIONS`, "" where that does not show. drift: by how much later its stamps get, s/s
+    since time 0. leap: by how much later they are from `at` (s) on. std: σ of whichever of both it is."""
+
+    whose: str
+    drift: float = 0.0
+    leap: float = 0.0
+    at: float = 0.0
+    std: float = 0.0
+
+    @property
+    def says(self) -> str:
+        """In words, without the remedy."""
+        whose = f"the {self.whose.upper() if self.whose != 'reference' else self.whose}'s clock"
+        if not self.whose:
+            whose = "one of the clocks"
+        if self.drift:
+            return f"{whose} drifts by {1e6 * self.drift:.0f} ± {1e6 * self.std:.0f} ppm beside the others"
+        way = "ahead" if self.leap > 0.0 else "back"
+        return f"{whose} leaps {way} by {abs(self.leap):.2f} ± {self.std:.2f} s after {self.at:.0f} s"
+
+    @property
+    def remedy(self) -> str:
+        """What to do about it."""
+        if self.leap:
+            return "cut the recording there, and calibrate with either part"
+        return "set the clocks by one source" + (
+            f", or dvl_clock_drift: {self.drift:.2g}" if self.whose == "dvl" else ""
+        )
+
+    def hole(self, motion: Motion, reach_s: float) -> float | None:
+        """The middle (s) of the hole in a clock's stamps that its leap ahead leaves; None where there is not just one.
+
+        reach_s: no further from where it is thought to be.
+        """
+        streams = {"reference": motion.reference_times, "imu": motion.imu.times}
+        times = streams.get(self.whose, motion.dvl.times)
+        gap = np.diff(times)
+        at = np.flatnonzero((gap > HOLE * self.leap) & (np.abs(times[1:] - self.at) < reach_s + gap))
+        return float(times[at[0]] + 0.5 * gap[at[0]]) if self.leap > 0.0 and len(at) == 1 else None
+
+    def taken_off(self, epoch_ns: int) -> dict[str, float]:
+        """The parameters that take it off, which only the DVL's clock has. epoch_ns: stamp of time 0."""
+        if self.whose != "dvl" or abs(self.drift) > MOST_DRIFT or abs(self.leap) > MOST_LEAP_S:
+            return {}
+        if self.drift:
+            return {"dvl_clock_drift": round(self.drift, 7)}
+        return {"dvl_time_jump": round(self.leap, 3), "dvl_time_jump_at": round(1e-9 * epoch_ns + self.at, 3)}
+
+    def steadied(self, motion: Motion) -> Motion:
+        """The motion without it."""
+        m = motion
+        if self.whose == "reference":
+            times, at = self._true(m.reference_times)
+            return replace(m, reference_times=times, reference=m.reference[at])
+        if self.whose == "imu":
+            times, at = self._true(m.imu.times)
+            imu = ImuColumns(times, m.imu.orientation[at], m.imu.angular_velocity[at])
+            return replace(m, imu=imu, turns=TurnRates.of(imu))
+        times, at = self._true(m.dvl.times)
+        return replace(m, dvl=DvlColumns(times, m.dvl.velocity[at]))
+
+    def _true(self, times: Array) -> tuple[Array, Mask]:
+        """Times that increase, and whose (N,) they are."""
+        true = times - self.drift * times - self.leap * (times >= self.at)
+        at = np.diff(np.maximum.accumulate(true), prepend=-np.inf) > 0.0
+        return true[at], at
+
+
+class _Course(NamedTuple):
+    """of: (S,) by how much a clock is later in each stretch, for each unit. kept: (S,) False where it is anything. at:
+    (s) since when, None of a drift."""
+
+    of: Array
+    kept: Mask
+    at: float | None
+
+
+def unsteady(times: Array, stretches: Sequence[Fitted], is_turned: bool) -> Unsteady | None:
+    """Which clock moves through stretches at times (S,) s; None where that is not beyond doubt."""
+    if len(times) < 2 * EACH_SIDE:
+        return None
+    both = np.ix_([APART, LATE], [APART, LATE])
+    seen = np.array([each.x[[APART, LATE]] for each in stretches])
+    weight = np.linalg.inv(np.array([each.p[both] for each in stretches]) + LAGS_S**2 * np.eye(2))
+    names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}
+    everywhere = np.ones(len(times), dtype=bool)
+    n = np.arange(len(times))
+    stands = np.zeros((len(times), 2))
+    still, *but_one = (_explained(seen, weight, stands, n != out)[0] for out in (-1, *n))
+    found = []
+    for course in (_Course(times, everywhere, None), *_leaps(times)):
+        for name, direction in names.items():
+            moved = np.outer(course.of, direction)
+            left, value, std = _explained(seen, weight, moved, course.kept)
+            left += ANYTHING * (not course.kept.all())
+            found.append((left, value, std, name, course))
+    left, value, std, name, course = min(found, key=lambda each: each[0])
+    length = float(np.ptp(times)) if course.at is None else 1.0
+    is_shown = still - left > GAIN and abs(value) * length > SHOWN_FROM_S and abs(value) > SIGMAS * std
+    if not is_shown or left > min(but_one) + ANYTHING or left > LEFT * (2.0 * len(times) - 3.0):
+        return None
+    others = min((each[0] for each in found if each[3] != name), default=np.inf)
+    whose = name if is_turned and others - left > TOLD_APART else ""
+    return Unsteady(whose, value, std=std) if course.at is None else Unsteady(whose, 0.0, value, course.at, std)
+
+
+def _leaps(times: Array) -> Iterator[_Course]:
+    """Between two stretches, and within one."""
+    n = np.arange(len(times))
+    for at in range(EACH_SIDE, len(times) - EACH_SIDE + 1):
+        yield _Course((n >= at).astype(float), n >= 0, float(times[at - 1 : at + 1].mean()))
+        if at < len(times) - EACH_SIDE:
+            yield _Course((n > at).astype(float), n != at, float(times[at]))
+
+
+def _explained(seen: Array, weight: Array, moved: Array, kept: Mask) -> tuple[float, float, float]:
+    """What is left in chi-square of clocks (S, 2) of one place and `moved` (S, 2) times a value; that, and its σ."""
+    h = np.concatenate([np.broadcast_to(np.eye(2), (len(seen), 2, 2)), moved[:, :, None]], axis=2)[kept]
+    z, w = seen[kept], weight[kept]
+    information = np.einsum("sij,sik,skl->jl", h, w, h)
+    is_asked = bool(information[2, 2] > 0.0)
+    n = 3 if is_asked else 2
+    p = np.linalg.inv(information[:n, :n])
+    x = p @ np.einsum("sij,sik,sk->j", h, w, z)[:n]
+    rest = z - h[:, :, :n] @ x
+    left = float(np.einsum("si,sij,sj->", rest, w, rest))
+    return (left, float(x[2]), float(np.sqrt(p[2, 2]))) if is_asked else (left, 0.0, np.inf)

@@ -1,0 +1,68 @@
+"""A clock that drifts or leaps once is found with its size and time, and clocks that stand still are left alone."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from test_register import ARM, run
+
+from dvl_calib_ros.calibration.delay.rows import ImuColumns
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.register.motion import make_motion
+from dvl_calib_ros.calibration.register.registration import Registration, register
+
+AT_S = 250.0
+
+
+@cache
+def registered(trajectory: str, whose: str = "", drift: float = 0.0, leap: float = 0.0) -> Registration:
+    """A run of ten minutes, one of whose clocks gets later."""
+    streams = dict(zip(("dvl", "reference", "imu"), run(trajectory, 5.0), strict=True))
+    if whose:
+        times, *values = streams[whose]
+        times = times + drift * times + leap * (times > AT_S)
+        later = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
+        streams[whose] = (times[later], *(value[later] for value in values))
+    made = make_motion(streams["dvl"], streams["reference"], True, (True,) * 3, ImuColumns(*streams["imu"]))
+    assert made is not None
+    found = register(made, np.eye(3), np.zeros(3))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("trajectory", ["lawnmower", "box", "figure8", "free"])
+def test_clocks_that_stand_still_do(trajectory):
+    assert registered(trajectory).unsteady is None
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0, -3.0, 5.0])
+@pytest.mark.parametrize("whose", ["dvl", "reference"])
+def test_one_leap_is_found_with_its_size_and_time(whose, seconds):
+    found = registered("figure8", whose, leap=seconds)
+    assert found.unsteady is not None and found.unsteady.whose == whose and not found.unsteady.drift
+    assert found.unsteady.leap == pytest.approx(seconds, abs=0.05 + 3.0 * found.unsteady.std)
+    assert found.unsteady.at == pytest.approx(AT_S, abs=20.0 + abs(seconds))
+    # ... and with it taken off the arm is what it is
+    assert found.lever_arm[0] == pytest.approx(ARM, abs=0.05)
+
+
+@pytest.mark.parametrize("whose", ["dvl", "reference", "imu"])
+def test_a_drift_is_found_with_its_size(whose):
+    found = registered("figure8", whose, drift=1e-3)  # 0.6 s in all, as 170 ppm make of an hour
+    assert found.unsteady is not None and found.unsteady.whose == whose and not found.unsteady.leap
+    assert found.unsteady.drift == pytest.approx(1e-3, abs=3.0 * found.unsteady.std)
+    assert found.unsteady.std < 2e-4
+    assert found.lever_arm[0] == pytest.approx(ARM, abs=0.05)
+
+
+def test_only_the_clock_of_the_dvl_is_put_right_and_what_is_left_is_said():
+    of_dvl, of_reference = (registered("figure8", whose, leap=1.0) for whose in ("dvl", "reference"))
+    assert of_dvl.unsteady is not None and of_reference.unsteady is not None
+    taken = of_dvl.unsteady.taken_off(10**18)
+    assert taken["dvl_time_jump"] == pytest.approx(1.0, abs=0.1)
+    assert taken["dvl_time_jump_at"] == pytest.approx(1e9 + AT_S, abs=2.0)
+    assert not of_reference.unsteady.taken_off(10**18)
+    assert "the reference's clock leaps ahead by" in of_reference.says(Parameters())
+    assert "cut the recording there" in of_reference.says(Parameters())
