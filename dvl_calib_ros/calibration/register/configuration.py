@@ -17,7 +17,8 @@ from ..delay.rows import attitude_at
 from ..directions import Directions
 from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..samples import VelocityFrame
-from .fine import ARM, FEW_ROWS, GAP_S, MOST_ROWS, REFERENCE, SCALE, Curves, Fit, Fitted, N
+from .curves import GAP_S, Curves
+from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, Fit, Fitted, N
 from .motion import Motion
 from .registration import Registration
 

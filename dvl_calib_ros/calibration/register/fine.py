@@ -16,13 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..delay.local_motion import REACH_INTERVALS, local_fit, reach_at, spacing_at
-from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at, attitude_at
+from ..delay.rows import attitude_at
 from ..extrinsics import rotation_of, turn_between
 from ..frames import Array, cross, nearest_rotation, skew
 from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
+from .curves import GAP_S, Curves
 from .motion import Motion
 
 # States: turn (rad, body), scale, lever arm (m), δ (s), ρ (s).
@@ -39,16 +39,12 @@ HELD_STD_S = 1e-4
 LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
 # References that are looked at, evenly spread: more tell little more, and take longer; fewer tell places apart.
 MOST_ROWS, FEW_ROWS = 4000, 800
-# Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.
-GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
 # Rounds at most, and the step (s, m, rad) from which on another one changes nothing.
 ROUNDS, SETTLED_S = 12, 5e-4
 # A delay moves no further in one round, s: slopes hold that far.
 FARTHEST_S = 0.7
 # Samples so many times further off than usual count by half.
 HALF_AT = 3.0
-# Attitudes further apart than this are no attitude between, s.
-GAP_S = 2.0
 # Slower, nothing is compared, m/s. Fewer rows tell nothing.
 SLOW_MPS, ENOUGH = 0.1, 20
 # No more of what is known of δ is taken for noise.
@@ -115,57 +111,6 @@ class _Rows(NamedTuple):
     at: Index
     of_noise: Array
     speed: float
-
-
-class Curves:
-    """Velocity and slope of the DVL, and turn rates, on a fine grid of time, each smoothed once for all places."""
-
-    def __init__(self, motion: Motion) -> None:
-        """Of all streams of a motion."""
-        times = motion.dvl.times
-        length = float(times[-1] - times[0])
-        self._step, self._start = max(GRID_S, length / MOST_GRID), float(times[0])
-        self._grid = self._start + self._step * np.arange(int(length / self._step) + 2)
-        typical = float(median(np.diff(times)))
-        reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
-        reach = np.clip(reach, LEAST_SLOPE_REACH_S, None)
-        reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(REACH_INTERVALS * typical, MOST_REACH_S))
-        fits = [local_fit(times, motion.dvl.velocity, self._grid[at], reach[at]) for at in _parts(len(self._grid))]
-        self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
-        self._found = np.concatenate([fit.found for fit in fits])
-        self._turns, self._turns_start = np.zeros((2, 3)), 0.0
-        if len(motion.turns.times) > 1:
-            grid = np.arange(motion.turns.times[0], motion.turns.times[-1] + self._step, self._step)
-            self._turns_start = float(grid[0])
-            rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
-            self._turns = np.nan_to_num(np.concatenate(rates))
-
-    def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
-        """At times (J,) s: velocity (J, 3), slope (J, 3), noise gain of the slope (J,), and whether there is one."""
-        before, share, inside = self._places(at, self._start, len(self._grid))
-        both = _between(self._velocity, before, share)
-        return both[:, :3], both[:, 3:6], both[:, 6], inside & self._found[before] & self._found[before + 1]
-
-    def rates(self, at: Array) -> Array:
-        """(J, 3) rad/s, zero where they are not known."""
-        before, share, inside = self._places(at, self._turns_start, len(self._turns))
-        return np.where(inside[:, None], _between(self._turns, before, share), 0.0)
-
-    def _places(self, at: Array, start: float, n: int) -> tuple[Index, Array, Mask]:
-        place = (at - start) / self._step
-        before = np.clip(place, 0, n - 2).astype(np.intp)
-        return before, (place - before)[:, None], (place >= 0.0) & (place <= n - 1)
-
-
-def _parts(n: int) -> list[slice]:
-    """N places in parts: windows about all of them at once would take more memory than a node should."""
-    return [slice(first, first + AT_ONCE) for first in range(0, n, AT_ONCE)]
-
-
-def _between(values: Array, before: Index, share: Array) -> Array:
-    left = values[before]
-    found: Array = left + share * (values[before + 1] - left)
-    return found
 
 
 class Fit:

@@ -28,8 +28,9 @@ from ..frames import (
 from ..imu_alignment import quaternion_product
 from ..samples import VelocityFrame
 from .configuration import DRAWN, angle_between, misfit, nearest
+from .curves import GAP_S, Curves
 from .far import covered, velocity_at
-from .fine import FEW_ROWS, GAP_S, SLOW_MPS, Curves, Fit
+from .fine import FEW_ROWS, SLOW_MPS, Fit
 from .motion import Motion
 
 # Fewer samples say nothing about frames.

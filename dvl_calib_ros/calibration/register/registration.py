@@ -16,9 +16,10 @@ import numpy as np
 from ..frames import Array
 from ..parameters import Parameters
 from .coarse import LONGEST_S, places
-from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Curves, Fit, Fitted, N
+from .curves import Curves
+from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Fit, Fitted, N
 from .motion import Motion
-from .steadiness import DIRECTIONS, Unsteady, unsteady
+from .steadiness import MOST_STRETCHES, STRETCH_S, Unsteady, unsteady
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
 # of an inertial navigation are late by less (five real recordings: 0.03 to 0.07 s).
@@ -36,9 +37,9 @@ EARLY = 6.0
 INDEPENDENT_S, GAIN = 1.0, 8.0
 # Against a place that compares fewer references than this share of its own another is weighed on what both compare.
 AS_MANY = 0.95
-# What is left lasts by so much longer than noise where a clock moves; it is then looked for in stretches this long, s,
-# no more of them, each by so many references.
-STEADY, STRETCH_S, MOST_STRETCHES, ROWS_OF_STRETCH = 1.05, 90.0, 16, 400
+# What is left lasts by so much longer than noise where a clock moves, which is then looked for by so many references of
+# each stretch.
+STEADY, ROWS_OF_STRETCH = 1.05, 400
 # The place of the clocks is known where it is to this, s (σ).
 KNOWN_STD_S = 0.25
 
@@ -170,7 +171,12 @@ def _registered(
         moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
         if moves is not None:
             found = _registered(moves.steadied(motion), rotation_body_from_dvl, lever_arm, moves)
-            return None if found is None else replace(found, unsteady=_timed(moves, found, motion, fit, lever_arm))
+            if found is None:
+                return None
+            x = np.zeros(N)
+            x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
+            x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
+            return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
     in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
     if in_time[1] < NO_DOUBT:  # all that there is would show nothing more
         seen = _explained(quick, best, rotation_body_from_dvl, lever_arm)
@@ -210,29 +216,6 @@ def _unsteady(motion: Motion, curves: Curves, lever_arm: Array, rotation: Array 
             found.append((float(times[at].mean()), best))
     is_turned = motion.in_earth and motion.has_attitude
     return unsteady(np.array([at for at, _ in found]), [each for _, each in found], is_turned)
-
-
-def _timed(moves: Unsteady, found: Registration, motion: Motion, fit: Fit, lever_arm: Array) -> Unsteady:
-    """A leap with the time at which the clocks before it and those after it explain most together."""
-    if not moves.leap:
-        return moves
-    reach = np.ptp(fit.times) / MOST_STRETCHES + STRETCH_S
-    if (hole := moves.hole(motion, reach)) is not None:
-        return replace(moves, at=hole)
-    x = np.zeros(N)
-    x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
-    x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
-    after = x.copy()
-    after[[APART, LATE]] += moves.leap * np.array(DIRECTIONS[moves.whose or "dvl"])
-    (at, before), (later, behind) = (fit.costs(each, found.rotation_body_from_dvl, found.spread) for each in (x, after))
-    shared, own, other = np.intersect1d(at, later, return_indices=True)
-    near = np.abs(fit.times[shared] - moves.at) <= reach
-    gain = np.cumsum((before[own] - behind[other])[near])
-    if not len(gain):
-        return moves
-    seconds = float(fit.times[shared][near][int(np.argmin(gain))])
-    # between the DVL's stamps before it and those after it
-    return replace(moves, at=seconds + (float(x[APART]) + max(0.5 * moves.leap, 0.0) if moves.whose == "dvl" else 0.0))
 
 
 def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:

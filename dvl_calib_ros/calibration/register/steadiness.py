@@ -15,7 +15,7 @@ import numpy as np
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates
 from ..frames import Array
 from ..samples import Mask
-from .fine import APART, LATE, Fitted
+from .fine import APART, LATE, Fit, Fitted
 from .motion import Motion
 
 # By how much (δ, ρ) of a fit are more for each second that a stream's stamps are later.
@@ -29,6 +29,8 @@ SHOWN_FROM_S, SIGMAS, GAIN, TOLD_APART, LEFT = 0.1, 5.0, 18.0, 8.0, 4.0
 HOLE = 0.8
 # More is no parameter's (`dvl_clock_drift`, s/s, and `dvl_time_jump`, s).
 MOST_DRIFT, MOST_LEAP_S = 0.01, 10.0
+# A clock that moves is looked for in stretches this long, s, and no more of them.
+STRETCH_S, MOST_STRETCHES = 90.0, 16
 # What it costs, in chi-square, that one stretch is anything; and so many at least on either side of a leap.
 ANYTHING, EACH_SIDE = 10.0, 2
 
@@ -64,16 +66,32 @@ class Unsteady:
             f", or dvl_clock_drift: {self.drift:.2g}" if self.whose == "dvl" else ""
         )
 
-    def hole(self, motion: Motion, reach_s: float) -> float | None:
-        """The middle (s) of the hole in a clock's stamps that its leap ahead leaves; None where there is not just one.
+    def timed(self, motion: Motion, fit: Fit, x: Array, rotation: Array, level: float) -> Unsteady:
+        """A leap ahead at the hole that it leaves in the stamps, if there is just one; else at the time at which the
+        clocks before it and those after it explain most together.
 
-        reach_s: no further from where it is thought to be.
+        x: (9,) the state before it. rotation: (3, 3) and level (m/s), that `fit` found with it taken off.
         """
+        if not self.leap:
+            return self
+        reach = float(np.ptp(fit.times)) / MOST_STRETCHES + STRETCH_S
         streams = {"reference": motion.reference_times, "imu": motion.imu.times}
         times = streams.get(self.whose, motion.dvl.times)
         gap = np.diff(times)
-        at = np.flatnonzero((gap > HOLE * self.leap) & (np.abs(times[1:] - self.at) < reach_s + gap))
-        return float(times[at[0]] + 0.5 * gap[at[0]]) if self.leap > 0.0 and len(at) == 1 else None
+        holes = np.flatnonzero((gap > HOLE * self.leap) & (np.abs(times[1:] - self.at) < reach + gap))
+        if self.leap > 0.0 and len(holes) == 1:
+            return replace(self, at=float(times[holes[0]] + 0.5 * gap[holes[0]]))
+        after = x.copy()
+        after[[APART, LATE]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
+        (at, before), (later, behind) = (fit.costs(each, rotation, level) for each in (x, after))
+        shared, own, other = np.intersect1d(at, later, return_indices=True)
+        near = np.abs(fit.times[shared] - self.at) <= reach
+        if not near.any():
+            return self
+        place = int(np.argmin(np.cumsum((before[own] - behind[other])[near])))
+        seconds = float(fit.times[shared][near][place])
+        # between the DVL's stamps before it and those after it
+        return replace(self, at=seconds + (float(x[APART]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
     def taken_off(self, epoch_ns: int) -> dict[str, float]:
         """The parameters that take it off, which only the DVL's clock has. epoch_ns: stamp of time 0."""

@@ -12,7 +12,8 @@ from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, places
-from dvl_calib_ros.calibration.register.fine import DVL, REFERENCE, Curves, Fit
+from dvl_calib_ros.calibration.register.curves import Curves
+from dvl_calib_ros.calibration.register.fine import DVL, REFERENCE, Fit
 from dvl_calib_ros.calibration.register.motion import Motion, make_motion
 from dvl_calib_ros.calibration.register.registration import Registration, register
 from dvl_calib_ros.simulation.injection import injection
