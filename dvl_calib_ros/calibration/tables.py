@@ -18,10 +18,12 @@ class Table:
     """Rows with a column per entry of `LAYOUT` (dtype, shape of one element), which are attributes of these names.
 
     The arrays are longer than what they hold: rows are in the slots begin .. size - 1. A row's number, counted since
-    the start, stays its own: slot + base.
+    the start, stays its own: slot + base. Where memory `IS_REUSED`, rows may be overwritten by others once they are
+    forgotten: only where nobody keeps a view of them.
     """
 
     LAYOUT: ClassVar[Mapping[str, tuple[Any, tuple[int, ...]]]]
+    IS_REUSED: ClassVar[bool] = False
 
     def __init__(self) -> None:
         self.begin = self.size = self.base = 0
@@ -57,11 +59,11 @@ class Table:
         self._move(capacity)
 
     def _move(self, capacity: int) -> None:
-        """Have what is held at the beginning of so much room; of the same it goes on in the memory that it has."""
+        """Have what is held at the beginning of so much room, in the memory that there is where that `IS_REUSED`."""
         held = self.size - self.begin
         for name, (dtype, shape) in self.LAYOUT.items():
             before = getattr(self, name)
-            grown = before if capacity == self._capacity else np.empty((capacity, *shape), dtype)
+            grown = before if self.IS_REUSED and capacity == self._capacity else np.empty((capacity, *shape), dtype)
             grown[:held] = before[self.begin : self.size]
             setattr(self, name, grown)
         self.base += self.begin

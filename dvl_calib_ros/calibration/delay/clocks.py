@@ -34,6 +34,7 @@ MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 class _Dvl(Table):
     """times s and velocities m/s of the DVL."""
 
+    IS_REUSED = True  # a motion has copies
     LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,))}
     times: Array
     velocity: Array
@@ -42,6 +43,7 @@ class _Dvl(Table):
 class _Reference(Table):
     """The same of references, whether they are in the body and which axes they measure."""
 
+    IS_REUSED = True  # a motion has copies
     LAYOUT: ClassVar = {**_Dvl.LAYOUT, "in_body": (np.bool_, ()), "is_measured": (np.bool_, (3,))}
     times: Array
     velocity: Array
@@ -52,6 +54,7 @@ class _Reference(Table):
 class _Imu(Table):
     """times s, attitudes and rates of the IMU, as of `ImuColumns`."""
 
+    IS_REUSED = True  # a motion has copies
     LAYOUT: ClassVar = {
         "times": (np.float64, ()),
         "orientation": (np.float64, (4,)),

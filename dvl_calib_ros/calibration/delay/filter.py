@@ -55,6 +55,7 @@ NAMED_FROM = 4.0
 class _Dvl(Table):
     """Usable DVL samples that blocks to come need."""
 
+    IS_REUSED = True  # blocks have copies
     LAYOUT: ClassVar = {
         "stamps_ns": (np.int64, ()),
         "velocity": (np.float64, (3,)),

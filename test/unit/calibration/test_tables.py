@@ -21,7 +21,14 @@ class Numbers(Table):
     """One column."""
 
     LAYOUT: ClassVar = {"number": (np.int64, ())}
+    IS_REUSED = True
     number: np.ndarray
+
+
+class KeptNumbers(Numbers):
+    """The same, of which others keep parts."""
+
+    IS_REUSED = False
 
 
 def filled(table: Numbers, n: int) -> Numbers:
@@ -39,6 +46,15 @@ def test_what_holds_few_rows_goes_on_in_the_memory_that_it_has():
         held = table.number[table.begin : table.size]
         np.testing.assert_array_equal(held, np.arange(table.end - len(held), table.end))
         assert table.number is memory
+
+
+def test_who_keeps_a_part_keeps_its_numbers_whatever_comes_later():
+    table = filled(KeptNumbers(), 128)
+    part = table.number[100:128]
+    for _ in range(20):
+        table.forget_before(table.size - 10)
+        filled(table, 50)
+    np.testing.assert_array_equal(part, np.arange(100, 128))
 
 
 def test_rows_up_to_what_was_reserved_need_no_more_memory():
