@@ -398,4 +398,6 @@ def _is_sound(x: Array, p: Array) -> bool:
     """Whether all of states x (..., n), P (..., n, n) are finite, with variances above zero."""
     flat_x, flat_p = x.ravel(), p.ravel()
     finite = math.isfinite(float(flat_x @ flat_x) + float(flat_p @ flat_p))  # nan and inf stay in sums
-    return finite and bool(np.diagonal(p, axis1=-2, axis2=-1).min() > 0.0)
+    n = p.shape[-1]
+    # of few numbers, as live, in a third of the time of numpy's
+    return finite and min(p.reshape(-1, n * n)[:, :: n + 1].ravel().tolist()) > 0.0

@@ -138,26 +138,35 @@ def recursion(
     ends: (E,) ascending numbers of samples (0..N) after which the state is wanted, too. Raises LinAlgError where S is
     not positive definite, or numbers are not finite.
     """
-    # each model by itself: live there is one, and products of single matrices cost a third of those of stacks
+    # each model by itself: products of single matrices cost a third of those of stacks, and live there is one sample
     models = [
-        _recursion_of_one(x[k], p[k], data.model(k), None if process is None else process[:, k], ends)
+        _recursion_of_one(x[k], p[k], data, k, None if process is None else process[:, k], ends is not None)
         for k in range(len(x))
     ]
-    return models[0] if len(models) == 1 else Updated.joined(models)
+    paths, used, nis = zip(*models, strict=True)
+    at = None
+    if ends is not None:
+        wanted = [[path[end] for path in paths] for end in ends.tolist()]
+        at = GaussianState(*(np.array([[state[of] for state in each] for each in wanted]) for of in range(2)))
+    x, p = (np.array([path[-1][of] for path in paths]) for of in range(2))
+    return Updated(x, p, np.array(used), np.array(nis), at)
 
 
 def _recursion_of_one(
-    x: Array, p: Array, data: Measurements, process: Array | None, ends: NDArray[np.intp] | None
-) -> Updated:
-    """`recursion` of one model: x (n,), P (n, n), data with K = 1, Q (N, n, n)."""
+    x: Array, p: Array, data: Measurements, k: int, process: Array | None, on_the_way: bool
+) -> tuple[list[GaussianState], list[bool], list[float]]:
+    """`recursion` of the k-th model: x (n,), P (n, n), Q (N, n, n).
+
+    Returns the state at the end, or, on_the_way, before the first sample and after each; which are used; and their nis.
+    """
     n_samples, n = data.z.shape[1], len(x)
-    identity = np.eye(n)
-    z, h_all = data.z[0], data.h[0]
-    r = data.r[0] if data.r.shape[1] == n_samples else [data.r[0, 0]] * n_samples
-    gate = data.gate[0].tolist() * (1 if data.gate.shape[1] == n_samples else n_samples)
-    usable, weight = data.usable[0].tolist(), data.weight[0].tolist()
+    identity = _identity(n)
+    z, h_all = data.z[k], data.h[k]
+    r, gate, weight = (each[k] if len(each) > 1 else each[0] for each in (data.r, data.gate, data.weight))
+    r, gate = (each if len(each) == n_samples else [each[0]] * n_samples for each in (r, gate.tolist()))
+    usable, weight = data.usable[k].tolist(), weight.tolist()
     used, nis = [], []
-    on_the_way = [(x, p)]
+    path = [GaussianState(x, p)]
     for i in range(n_samples):
         if process is not None:
             p = p + process[i]
@@ -180,13 +189,15 @@ def _recursion_of_one(
             p = 0.5 * (p + p.T)
         used.append(use)
         nis.append(nis_i if usable[i] else 0.0)
-        if ends is not None:
-            on_the_way.append((x, p))
-    at = None
-    if ends is not None:
-        wanted = [on_the_way[end] for end in ends.tolist()]
-        at = GaussianState(np.array([[x] for x, _ in wanted]), np.array([[p] for _, p in wanted]))
-    return Updated(x[None], p[None], np.array([used]), np.array([nis]), at)
+        if on_the_way:
+            path.append(GaussianState(x, p))
+    return path if on_the_way else [GaussianState(x, p)], used, nis
+
+
+@cache
+def _identity(n: int) -> Array:
+    """1 (n, n), not to be written to."""
+    return np.eye(n)
 
 
 @cache
