@@ -43,6 +43,7 @@ def test_that_there_is_no_imu_is_the_first_sentence_of_doctor_and_replay(tmp_pat
     assert "27" not in answer.split("Not to be used")[0]  # no misalignment is made of velocities in two frames
 
 
+@pytest.mark.slow
 def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, math.radians(20.0)))

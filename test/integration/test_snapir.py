@@ -55,6 +55,7 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
         assert estimate.used + estimate.gated == given
 
 
+@pytest.mark.slow
 def test_calibrating_on_t12_corrects_the_other_fourteen_as_published(trajectories, tmp_path, rng):
     """Set E1 of the protocol, with default parameters: M7 at most 0.066 m/s, M3 and M4 at most 0.045 m/s."""
     time, velocity = trajectories["T12"]
@@ -111,6 +112,7 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
     assert selected.count("A1") >= 9
 
 
+@pytest.mark.slow
 def test_three_recordings_together_are_accepted_with_one_lever_arm_and_a_delay_for_each(snapir_ins, tmp_path):
     """Their clocks are 0.9 s apart from day to day; one delay for all was rejected."""
     bags = []

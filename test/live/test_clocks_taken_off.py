@@ -53,6 +53,7 @@ def result_of(world, bag, path, *arguments):
     return load_yaml(path, "result file"), said
 
 
+@pytest.mark.slow
 def test_a_late_reference_is_taken_off_and_calibrated_with(world, bag, tmp_path):
     """It was named, and every calibration rejected."""
     saved, said = result_of(world, bag, tmp_path / "result.yaml")

@@ -68,7 +68,7 @@ def test_rows_up_to_what_was_reserved_need_no_more_memory():
     assert table.number is memory
 
 
-@pytest.mark.parametrize("rate_hz", [5, 200])
+@pytest.mark.parametrize("rate_hz", [5, pytest.param(200, marks=pytest.mark.slow)])
 def test_live_the_room_for_samples_is_taken_before_they_come(rate_hz):
     calibrator = Calibrator(Parameters())
     (keeper,) = (each for each in calibrator._further if isinstance(each, DelayFilter))

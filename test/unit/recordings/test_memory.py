@@ -173,6 +173,7 @@ def measured(path: Path, what: str) -> tuple[float, list[int]]:
     return float(peak), list(map(int, counts))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks Linux for the peak")
 def test_two_hours_beside_40_gb_of_images_are_examined_in_400_mb(tmp_path):
     path = long_recording(tmp_path / "long.mcap", 7200, camera_chunks=400)

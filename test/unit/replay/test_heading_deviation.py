@@ -62,7 +62,7 @@ def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
 
 
 @pytest.mark.parametrize("legs, every", [(16, math.pi / 4.0), (16, math.pi)], ids=["all around", "to and fro"])
-@pytest.mark.parametrize("size", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("size", [0.0, pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_yaw_is_within_its_sigma(legs, every, size):
     off = []
     for seed in range(4):

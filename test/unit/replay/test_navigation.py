@@ -115,6 +115,7 @@ def test_hardly_any_samples_are_no_track_and_no_error(n):
     assert navigated(one) is None
 
 
+@pytest.mark.slow
 def test_ten_hours_take_seconds_and_keep_a_bounded_track():
     data = recording(36_000.0, turn_rate=0.01, phi=(0.0, 0.0, YAW))
     start = time.process_time()
