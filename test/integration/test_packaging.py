@@ -51,7 +51,8 @@ def imported() -> set[str]:
 
 def test_the_version_is_the_same_everywhere():
     (in_setup,) = re.findall(r"version=\"(\d+\.\d+\.\d+)\",", SETUP)  # the form that catkin_prepare_release looks for
-    assert PACKAGE.findtext("version") == in_setup == dvl_calib_ros.__version__
+    (to_cite,) = re.findall(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)
+    assert PACKAGE.findtext("version") == in_setup == to_cite == dvl_calib_ros.__version__
 
 
 def test_everything_that_is_imported_is_declared():
