@@ -15,7 +15,7 @@ import numpy as np
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates
 from ..frames import Array
 from ..samples import Mask
-from .fine import APART, LATE, Fit, Fitted
+from .fine import APART, ARM, LATE, Fit, Fitted, N
 from .motion import Motion
 
 # By how much (δ, ρ) of a fit are more for each second that a stream's stamps are later.
@@ -134,25 +134,27 @@ def unsteady(times: Array, stretches: Sequence[Fitted], is_turned: bool) -> Unst
     """Which clock moves through stretches at times (S,) s; None where that is not beyond doubt."""
     if len(times) < 2 * EACH_SIDE:
         return None
-    both = np.ix_([APART, LATE], [APART, LATE])
-    seen = np.array([each.x[[APART, LATE]] for each in stretches])
-    weight = np.linalg.inv(np.array([each.p[both] for each in stretches]) + LAGS_S**2 * np.eye(2))
+    # where the vehicle hardly speeds up, a clock looks like an arm; but that is the same in all stretches
+    states = [*range(N)[ARM], APART, LATE]
+    seen = np.array([each.x[states] for each in stretches])
+    lags = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
+    weight = np.linalg.inv(np.array([each.p[np.ix_(states, states)] for each in stretches]) + lags)
     names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}
     everywhere = np.ones(len(times), dtype=bool)
     n = np.arange(len(times))
-    stands = np.zeros((len(times), 2))
+    stands = np.zeros((len(times), len(states)))
     still, *but_one = (_explained(seen, weight, stands, n != out)[0] for out in (-1, *n))
     found = []
     for course in (_Course(times, everywhere, None), *_leaps(times)):
         for name, direction in names.items():
-            moved = np.outer(course.of, direction)
+            moved = np.outer(course.of, (0.0, 0.0, 0.0, *direction))
             left, value, std = _explained(seen, weight, moved, course.kept)
             left += ANYTHING * (not course.kept.all())
             found.append((left, value, std, name, course))
     left, value, std, name, course = min(found, key=lambda each: each[0])
     length = float(np.ptp(times)) if course.at is None else 1.0
     is_shown = still - left > GAIN and abs(value) * length > SHOWN_FROM_S and abs(value) > SIGMAS * std
-    if not is_shown or left > min(but_one) + ANYTHING or left > LEFT * (2.0 * len(times) - 3.0):
+    if not is_shown or left > min(but_one) + ANYTHING or left > LEFT * (seen.size - len(states) - 1.0):
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)
     whose = name if is_turned and others - left > TOLD_APART else ""
@@ -169,14 +171,15 @@ def _leaps(times: Array) -> Iterator[_Course]:
 
 
 def _explained(seen: Array, weight: Array, moved: Array, kept: Mask) -> tuple[float, float, float]:
-    """What is left in chi-square of clocks (S, 2) of one place and `moved` (S, 2) times a value; that, and its σ."""
-    h = np.concatenate([np.broadcast_to(np.eye(2), (len(seen), 2, 2)), moved[:, :, None]], axis=2)[kept]
+    """What is left in chi-square of states (S, k) that are one, and `moved` (S, k) times a value; that, and its σ."""
+    k = seen.shape[1]
+    h = np.concatenate([np.broadcast_to(np.eye(k), (len(seen), k, k)), moved[:, :, None]], axis=2)[kept]
     z, w = seen[kept], weight[kept]
     information = np.einsum("sij,sik,skl->jl", h, w, h)
-    is_asked = bool(information[2, 2] > 0.0)
-    n = 3 if is_asked else 2
+    is_asked = bool(information[k, k] > 0.0)
+    n = k + is_asked
     p = np.linalg.inv(information[:n, :n])
     x = p @ np.einsum("sij,sik,sk->j", h, w, z)[:n]
     rest = z - h[:, :, :n] @ x
     left = float(np.einsum("si,sij,sj->", rest, w, rest))
-    return (left, float(x[2]), float(np.sqrt(p[2, 2]))) if is_asked else (left, 0.0, np.inf)
+    return (left, float(x[k]), float(np.sqrt(p[k, k]))) if is_asked else (left, 0.0, np.inf)

@@ -57,6 +57,16 @@ def test_a_drift_is_found_with_its_size(whose):
     assert found.lever_arm[0] == pytest.approx(ARM, abs=0.05)
 
 
+@pytest.mark.parametrize(
+    ("trajectory", "whose", "moves"),
+    [("free", "imu", {"leap": 0.5}), ("box", "imu", {"drift": 1e-3}), ("free", "reference", {"leap": 0.3})],
+)
+def test_what_looks_like_an_arm_of_its_own_in_each_stretch_is_told_by_the_arm_being_one(trajectory, whose, moves):
+    found = registered(trajectory, whose, **moves)  # the arm was -1.04, -1.00 and -0.32
+    assert found.unsteady is not None and found.unsteady.whose in (whose, "")
+    assert found.lever_arm[0] == pytest.approx(ARM, abs=0.06)
+
+
 def test_only_the_clock_of_the_dvl_is_put_right_and_what_is_left_is_said():
     of_dvl, of_reference = (registered("figure8", whose, leap=1.0) for whose in ("dvl", "reference"))
     assert of_dvl.unsteady is not None and of_reference.unsteady is not None
