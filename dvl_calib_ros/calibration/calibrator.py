@@ -48,6 +48,8 @@ from .verification import SEVERAL, Verification, verify
 COPIED_AT_ONCE = 64
 # An error of so many times the usual one is that of an outlier.
 OUTLYING = 5.0
+# Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
+OPEN_FROM = 4.0
 # Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
@@ -490,7 +492,17 @@ class Calibrator:
         estimator = self._estimators[name]
         state, covariance = estimator.of_recording()
         worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
-        return GaussianState(state, covariance + worse)
+        return GaussianState(state, covariance + worse + self._by_unknown_arm(name, covariance))
+
+    def _by_unknown_arm(self, name: str, covariance: Array) -> Array:
+        """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known."""
+        found = np.zeros_like(covariance)
+        estimator = self._estimators.get(EXTENDED_BY.get(name, ""))
+        if estimator is None or not estimator.claims or any(self.parameters.lever_arm):
+            return found
+        own, open_arm = np.diag(covariance)[:3], np.diag(estimator.of_recording().p)[:3]
+        np.fill_diagonal(found[:3, :3], np.where(open_arm > OPEN_FROM * own, open_arm - own, 0.0))
+        return found
 
     def states_at(
         self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps

@@ -147,7 +147,7 @@ def test_on_a_circle_at_changing_speed_auto_takes_the_model_whose_sigma_knows_of
     assert verification.verdict is not Word.ACCEPT and any(ON_A_CIRCLE in reason for reason in verification.reasons)
     assert f"G1 takes the lever arm as known, and {ON_A_CIRCLE}" in calibrator.result().selected_because
     g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
-    assert abs(g1.state[2]) > 20.0 * g1.std[2]
+    assert abs(g1.state[2]) > 20.0 * g1.filter_std[2] and abs(g1.state[2]) < 4.0 * g1.std[2]
     assert abs(g2.state[2]) < 3.0 * g2.std[2]
 
 
