@@ -152,7 +152,7 @@ class Group:
             folds = folds_of(stamps_ns, self._parameters)
             self._folds.add(folds, data, after.used)
             if self.needs is Needs.REFERENCE:
-                self.moments.add(folds, seen)
+                self.moments.take(folds, seen)
         standing = None if ends is None or known_at is None else self._standing_at(after, states, ends, known_at)
         n_used = after.used.sum(axis=1)
         self._used += n_used

@@ -138,22 +138,18 @@ def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np
     return GaussianState(x, p)
 
 
-class Moments:
+class Moments(FoldSums):
     """All that is kept of samples with a reference to judge any correction by.
 
     For each fold the number of samples, and for each axis of the body, over the samples whose reference measures it,
-    the sums of v vᵀ, g vᵀ, g² and of the variance that R says; with v (3,) m/s measured, DVL frame, at the reference
-    point, and g m/s the reference velocity along the axis.
+    the sums of v vᵀ (3, 3, 3) and g vᵀ (3, 3), and over the axes of g² and of the variance that R says; with v (3,) m/s
+    measured, DVL frame, at the reference point, and g m/s the reference velocity along the axis.
     """
 
     def __init__(self) -> None:
-        self.count = np.zeros(FOLDS, dtype=np.int64)
-        self.vv = np.zeros((FOLDS, 3, 3, 3))
-        self.gv = np.zeros((FOLDS, 3, 3))
-        self.gg = np.zeros(FOLDS)
-        self.noise = np.zeros(FOLDS)
+        super().__init__((), (3, 3, 3), (3, 3), (), ())
 
-    def add(self, folds: NDArray[np.int64], seen: Observations) -> None:
+    def take(self, folds: NDArray[np.int64], seen: Observations) -> None:
         """Add N samples."""
         assert seen.reference_body is not None
         v, g = seen.velocity_at_reference, seen.reference_body
@@ -162,16 +158,20 @@ class Moments:
         variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, seen.noise, rotation), v.shape)
         for fold in set(folds.tolist()):
             at = folds == fold
-            self.count[fold] += at.sum()
-            for axis in range(3):
-                known = v[at] * measured[at, axis, None]
-                self.vv[fold, axis] += known.T @ v[at]
-                self.gv[fold, axis] += g[at, axis] @ known
-            self.gg[fold] += np.sum(g[at] ** 2 * measured[at])
-            self.noise[fold] += np.sum(variance[at] * measured[at])
+            own, known = v[at], measured[at]
+            along = known.T[:, :, None] * own  # (3, N, 3)
+            squares, noise = np.sum(g[at] ** 2 * known), np.sum(variance[at] * known)
+            self.add(
+                fold,
+                int(np.count_nonzero(at)),
+                along.swapaxes(1, 2) @ own,
+                (g[at].T[:, None] @ along)[:, 0],
+                squares,
+                noise,
+            )
 
     def squared_error(self, fold: int, body_from_measured: Array) -> float:
         """Sum over a fold of |g - C v|² (m/s)² along the measured axes, C (3, 3)."""
         c = body_from_measured
-        squared = np.einsum("ai,aij,aj->", c, self.vv[fold], c)
-        return float(self.gg[fold] - 2.0 * np.sum(c * self.gv[fold]) + squared)
+        _, vv, gv, gg, _ = self.of(fold)
+        return float(gg - 2.0 * np.sum(c * gv) + np.einsum("ai,aij,aj->", c, vv, c))

@@ -17,7 +17,7 @@ import numpy as np
 
 from .chi_square import chi2_isf
 from .error_model import CORRECTION_JACOBIAN, correction_matrix
-from .folds import Moments
+from .folds import FOLDS, Moments
 from .frames import Array
 from .kalman import GaussianState
 from .models import Model
@@ -64,8 +64,8 @@ def held_out_error(
 
     without: one state for each fold.
     """
-    samples = int(moments.count.sum())
-    if samples < ENOUGH_SAMPLES or np.count_nonzero(moments.count) < 2:
+    samples = int(moments.total[0])
+    if samples < ENOUGH_SAMPLES or max(moments.of(fold)[0] for fold in range(FOLDS)) == samples:
         return None
     nominal = rotation_dvl_from_body.T
     uncorrected = corrected = noise = calibration = 0.0
@@ -74,8 +74,9 @@ def held_out_error(
         covariance = model.error_terms_from_state @ state.p @ model.error_terms_from_state.T
         uncorrected += moments.squared_error(fold, nominal)
         corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
-        noise += moments.noise[fold]
-        calibration += _calibration_variance(covariance, moments.vv[fold], nominal)
+        _, vv, _, _, own_noise = moments.of(fold)
+        noise += float(own_noise)
+        calibration += _calibration_variance(covariance, vv, nominal)
     return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
 
 

@@ -11,6 +11,7 @@ from io_fixtures import run, storage_file, write_bag
 
 from dvl_calib_ros.bags import sources
 from dvl_calib_ros.bags.sources import Source
+from dvl_calib_ros.calibration.register import registration
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +77,29 @@ def test_a_replay_from_an_initial_calibration_reads_once_though_it_runs_twice(ba
 def test_what_is_wrong_with_the_last_is_said_before_the_first_is_read(bags, passes, tmp_path, capsys):
     assert "no such file" in fail(capsys, "replay", bags["BAG"], tmp_path / "none")
     assert not any(what.startswith("read") for what in passes)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("doctor BAG", {"discovery.clocks": 1}),
+        # what is calibrated is registered by itself: live there is nothing else, and σ holds what it leaves open
+        ("replay BAG", {"discovery.clocks": 1, "calibration.delay.clocks": 1}),
+        ("diagnose BAG OTHER", {"discovery.clocks": 2, "diagnosis.registered": 2}),
+    ],
+)
+def test_a_command_registers_a_recording_no_more_often_than_this(words, expected, bags, monkeypatch, capsys):
+    counted: Counter[str] = Counter()
+
+    def counting(name):
+        def register(*arguments):
+            counted[name] += 1
+            return registration.register(*arguments)
+
+        return register
+
+    for name in ("discovery.clocks", "calibration.delay.clocks", "diagnosis.registered"):
+        monkeypatch.setattr(f"dvl_calib_ros.{name}.register", counting(name))
+    command, *arguments = words.split()
+    succeed(capsys, command, *(bags[word] for word in arguments))
+    assert counted == expected

@@ -53,7 +53,7 @@ def test_the_held_out_error_is_the_error_of_each_sample_with_the_state_that_has_
     noise = np.diag([0.01, 0.02, 0.03])
     folds = np.arange(60) // 5 % FOLDS
     moments = Moments()
-    moments.add(folds, Observations(velocity, reference, None, t, np.zeros(2), noise=noise[None]))
+    moments.take(folds, Observations(velocity, reference, None, t, np.zeros(2), noise=noise[None]))
     states = [GaussianState(rng.normal(0, 0.02, 4), np.diag(rng.uniform(1e-5, 1e-4, 4))) for _ in range(FOLDS)]
     error = held_out_error(MODELS["M3"], states, moments, t)
     terms = MODELS["M3"].error_terms_from_state
