@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from .calibration.comparison import Comparison
     from .evaluation.bags import CrossCheck
     from .evaluation.results import Evaluation
+    from .unpaired.results import UnpairedComparison
 
 __all__ = [
     "Calibration",
@@ -286,28 +287,30 @@ def compare(*results: StrPath | Calibration) -> Comparison:
     Parameters
     ----------
     *results
-        Result files, or what `replay` gave; two or more.
+        Result files, bags, or what `replay` gave; two or more. A bag is calibrated first.
 
     Returns
     -------
     Comparison
-        ``same_mounting``, and everything beside it; `sentences` of it are in `calibration.comparison`.
+        ``word``: same, suspicious or moved, and all that is behind it; `calibration.comparison` has its `sentences`.
 
     Raises
     ------
     InputError
         For what is no result file, holds no sample, is one of the others, or has nothing in common with them.
     """
+    from .bags.files import is_bag
     from .calibration.comparison import check_distinct
     from .calibration.comparison import compare as run
     from .files.extrinsics import load_extrinsics
     from .replay.replay import extrinsics_of_replay
 
     found = []
-    for each in results:
-        if not isinstance(each, Calibration):
-            found.append(load_extrinsics(Path(each), str(each)))
+    for given in results:
+        if not isinstance(given, Calibration) and not is_bag(Path(given)):
+            found.append(load_extrinsics(Path(given), str(given)))
             continue
+        each = given if isinstance(given, Calibration) else replay(given, history=False)
         name = ", ".join(map(str, each.bags))
         extrinsics = extrinsics_of_replay(each.replayed, name)
         if extrinsics is None:
@@ -336,21 +339,51 @@ def doctor(
 def diagnose(
     bags: Bags,
     *,
+    simulator: Bags | None = None,
     dvl_topic: str | None = None,
     gnss_topic: str | None = None,
     imu_topic: str | None = None,
     params: StrPath | None = None,
     **parameters: Any,
-) -> Diagnosis:
-    """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``; as `replay`."""
+) -> Diagnosis | UnpairedComparison:
+    """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``.
+
+    Parameters
+    ----------
+    bags, dvl_topic, gnss_topic, imu_topic, params, **parameters
+        As of `replay`.
+    simulator
+        Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
+
+    Raises
+    ------
+    InputError, ParameterError
+        As `replay`.
+    """
+    topics = (dvl_topic, gnss_topic, imu_topic)
+    sides = [
+        _discovered(_paths(each), topics, params, {"min_speed": 0.0} | parameters)
+        for each in ([bags] if simulator is None else [bags, simulator])
+    ]
+    if simulator is not None:
+        from .unpaired.compare import compare as against
+        from .unpaired.logs import Source
+
+        real, made = (Source(recording, found.parameters, found.topics) for recording, found in sides)
+        return against(real, made)
     from .diagnosis.diagnose import diagnose as run
 
-    topics = (dvl_topic, gnss_topic, imu_topic)
-    recording, discovery = _discovered(_paths(bags), topics, params, {"min_speed": 0.0} | parameters)
+    ((recording, discovery),) = sides
     return run(recording, discovery.parameters, discovery.topics)
 
 
-def simulate(bag: StrPath, scenario: Scenario | None = None, **scenario_fields: Any) -> Path:
+def simulate(
+    bag: StrPath,
+    scenario: Scenario | None = None,
+    *,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    **scenario_fields: Any,
+) -> Path:
     """Write a simulated bag, as ``dvl-calib simulate``.
 
     Parameters
@@ -359,26 +392,37 @@ def simulate(bag: StrPath, scenario: Scenario | None = None, **scenario_fields: 
         Folder to write; must not exist.
     scenario
         What to simulate; by default ten minutes along a box.
+    effects
+        By name, each with its parameters, such as ``{"lever_arm": {"x_m": 0.5}}``.
     **scenario_fields
         Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
 
     Raises
     ------
     InputError
-        If the bag exists, or cannot be written.
+        If the bag exists, or cannot be written; for an effect or parameter that there is not.
     """
     from .bags.writer import Compression, Storage
+    from .simulation.injection import injection_of
     from .simulation.scenario import write_bag
 
     if scenario is not None and scenario_fields:
         raise InputError("simulate: give a scenario or fields of one, not both")
-    target = Path(bag)
-    write_bag(scenario or Scenario(**scenario_fields), target, Storage.MCAP, Compression.NONE, with_truth=True)
+    target, made = Path(bag), scenario or Scenario(**scenario_fields)
+    if effects is not None:
+        made = replace(made, effects=tuple(injection_of(name, given) for name, given in effects.items()))
+    write_bag(made, target, Storage.MCAP, Compression.NONE, with_truth=True)
     return target
 
 
 def evaluate(
-    paths: Bags | None = None, *, models: Sequence[str] | None = None, **parameters: Any
+    paths: Bags | None = None,
+    *,
+    models: Sequence[str] | None = None,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    **parameters: Any,
 ) -> Evaluation | CrossCheck:
     """Evaluate the models, as ``dvl-calib evaluate``.
 
@@ -389,6 +433,8 @@ def evaluate(
         more, of which each calibrates and all others verify.
     models
         Names; all by default.
+    dvl_topic, gnss_topic, imu_topic
+        Of bags; those of `dvl-calib simulate` where not named.
     **parameters
         Any of the node's parameters, in SI units.
     """
@@ -399,13 +445,15 @@ def evaluate(
     from .recordings.topics import Topics
 
     found = [] if paths is None else _paths(paths)
+    named = {"dvl": dvl_topic, "gnss": gnss_topic, "imu": imu_topic}
+    topics = Topics(**{stream: topic for stream, topic in named.items() if topic is not None})
     known = tuple(MODELS) if len(found) > 1 else EVALUATED
     names = known if models is None else tuple(models)
     for name in names:
         if name not in known:
             raise InputError(f"models: {name!r} is none of {', '.join(known)}")
     if len(found) > 1:
-        return cross_check(found, Parameters.from_mapping(parameters), names, Topics(), Workers())
+        return cross_check(found, Parameters.from_mapping(parameters), names, topics, Workers())
     return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)
 
 

@@ -37,8 +37,8 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "node": (*_CORE, "streams", "disk", "messages", "files", "discovery", "simulation"),
     "demo": (*_READ, "files", "node"),
     "api": (
-        *_READ, "parallel", "disk", "files", "discovery", "examination", "replay", "diagnosis", "simulation",
-        "evaluation", "report",
+        *_READ, "parallel", "disk", "files", "discovery", "examination", "replay", "diagnosis", "unpaired",
+        "simulation", "evaluation", "report",
     ),
     "cli": (
         *_READ, "streams", "parallel", "disk", "files", "effects", "discovery", "examination", "replay", "diagnosis",

@@ -20,6 +20,13 @@ else:
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 STORAGE_SUFFIXES = (".mcap", ".db3")
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is that of a bag, by its name alone: a folder, or a file of one."""
+    return path.is_dir() or path.suffix in STORAGE_SUFFIXES
+
+
 # A compressed file that unpacks to more than this and so many times its size is no recording.
 LARGEST_RATIO, SMALL_FILE = 100, 1 << 30
 

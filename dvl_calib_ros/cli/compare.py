@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 # More pairs than these are in --json; printed are the neighbours in time.
 MOST_PAIRS = 10
-BAG_SUFFIXES = (".mcap", ".db3")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,9 +76,10 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
     """Of a result file; a bag is calibrated for it."""
+    from ..bags.files import is_bag
     from ..files.extrinsics import load_extrinsics
 
-    if not path.is_dir() and path.suffix not in BAG_SUFFIXES:
+    if not is_bag(path):
         return load_extrinsics(path, name)
     from ..errors import InputError
     from ..replay.replay import extrinsics_of_replay, replay

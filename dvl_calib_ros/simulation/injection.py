@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -21,17 +21,24 @@ def injection(text: str) -> Injection:
     """What ``lever_arm:x_m=0.3,z_m=-0.1`` says; parameters not given keep their defaults. Raises InputError."""
     name, _, rest = text.strip().partition(":")
     effect = _effect(name.strip())
-    values = effect.defaults
-    given: set[str] = set()
+    given: dict[str, str] = {}
     for assignment in filter(str.strip, rest.split(",")):
-        parameter, value = _assignment(effect, assignment)
+        parameter, equals, number = (part.strip() for part in assignment.partition("="))
+        if not equals:
+            raise InputError(f"effect {name}: {assignment.strip()!r} is no PARAMETER=VALUE; it has {_listed(effect)}")
         if parameter in given:
-            raise InputError(f"effect {effect.name}: {parameter} is given twice; give it once")
-        given.add(parameter)
-        values[parameter] = value
+            raise InputError(f"effect {name}: {parameter} is given twice; give it once")
+        given[parameter] = number
+    return injection_of(effect.name, given)
+
+
+def injection_of(name: str, given: Mapping[str, float | str]) -> Injection:
+    """An effect with some of its parameters, in its units; the others keep their defaults. Raises InputError."""
+    effect = _effect(name)
     if not given:
         raise InputError(f"effect {effect.name} without parameters does nothing; give some of {_listed(effect)}")
-    return Injection(effect, values)
+    checked = {parameter: _checked(effect, parameter, value) for parameter, value in given.items()}
+    return Injection(effect, {**effect.defaults, **checked})
 
 
 def _effect(name: str) -> AnyEffect:
@@ -43,18 +50,15 @@ def _effect(name: str) -> AnyEffect:
     return known[name]
 
 
-def _assignment(effect: AnyEffect, text: str) -> tuple[str, float]:
-    name, equals, number = (part.strip() for part in text.partition("="))
+def _checked(effect: AnyEffect, name: str, number: float | str) -> float:
     parameters = {parameter.name: parameter for parameter in effect.parameters}
-    if not equals:
-        raise InputError(f"effect {effect.name}: {text.strip()!r} is no PARAMETER=VALUE; it has {_listed(effect)}")
     if name not in parameters:
         meant = _meant(name, list(parameters))
         raise InputError(f"effect {effect.name}: no parameter {name!r}{meant}; it has {_listed(effect)}")
     parameter = parameters[name]
     try:
         value = float(number)
-    except ValueError:
+    except (TypeError, ValueError):
         raise InputError(
             f"effect {effect.name}: {name}: {number!r} is no number; give it in {parameter.unit}, without the unit"
         ) from None
@@ -63,7 +67,7 @@ def _assignment(effect: AnyEffect, text: str) -> tuple[str, float]:
             f"effect {effect.name}: {name}: {value:g} is outside {parameter.low:g} .. {parameter.high:g} "
             f"{parameter.unit}"
         )
-    return name, value
+    return value
 
 
 def _listed(effect: AnyEffect) -> str:

@@ -105,6 +105,43 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
         dc.replay(bag, min_spede=1.0)
 
 
+def test_bags_are_compared_as_result_files_are(calibration, bag, tmp_path):
+    saved = calibration.save(tmp_path / "before.yaml")
+    later = dc.simulate(tmp_path / "later", seconds=90.0, seed=7)
+    found = dc.compare(saved, later)
+    assert [each.name for each in found.calibrations] == [str(saved), str(later)]
+    assert found.word in ("same", "suspicious", "moved")
+
+
+def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
+    made = dc.simulate(tmp_path / "ahead", seconds=240.0, effects={"lever_arm": {"x_m": 0.5}})
+    assert dc.replay(made, model="G2", history=False).mounting.xyz_m[0] == pytest.approx(0.5, abs=0.1)
+    for wrong, message in (
+        ({"lever_rm": {"x_m": 0.5}}, "did you mean 'lever_arm'"),
+        ({"lever_arm": {"xm": 0.5}}, "did you mean 'x_m'"),
+        ({"lever_arm": {"x_m": "far"}}, "is no number"),
+        ({"lever_arm": {}}, "does nothing"),
+    ):
+        with pytest.raises(dc.InputError, match=message):
+            dc.simulate(tmp_path / "none", effects=wrong)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_vehicle_is_diagnosed_against_a_simulator(tmp_path):
+    real = dc.simulate(tmp_path / "real", seconds=200.0, seed=1, effects={"lever_arm": {"x_m": 1.0}})
+    made = dc.simulate(tmp_path / "made", seconds=200.0, seed=2, trajectory="figure8")
+    found = dc.diagnose(real, simulator=made)
+    assert "lever_arm" in [each.name for each in found.effects] and found.verdict.value == "different"
+
+
+def test_topics_are_named_for_an_evaluation_as_for_a_replay(bag, tmp_path):
+    other = dc.simulate(tmp_path / "other", seconds=60.0, seed=3)
+    checked = dc.evaluate([bag, other], models=["G1"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
+    assert checked.models == ("G1",)
+    with pytest.raises(dc.InputError, match="no sample has a reference"):
+        dc.evaluate([bag, other], models=["G1"], gnss_topic="nowhere")
+
+
 def test_a_saved_calibration_is_one_that_apply_takes(calibration, tmp_path, capsys):
     saved = calibration.save(tmp_path / "c.yaml")
     out, _ = succeed(capsys, "apply", saved)
