@@ -550,6 +550,7 @@ class _Expected:
         self._bank, self._blocks = bank, blocks
         self.use: list[Mask] = [np.ones(len(each.rows), dtype=bool) for each in blocks]
         self.nis: list[Array] = [np.zeros(len(each.rows)) for each in blocks]
+        self.steps: list[tuple[Sums, Hypotheses]] = []
         found: dict[int, Told] = {}
         settled, last = 0, len(blocks) - 1
         while True:
@@ -562,7 +563,10 @@ class _Expected:
                 return
             self.heave = bank.heave.copy() if last else bank.heave
             rows = [self._heave_after(number) for number in range(last)]
-            self.steps = bank.steps(bank.sums, self.told, rows)
+            # of the one that was settled last other rows are used than the time before
+            first = max(settled - 1, 0)
+            start = self.steps[first - 1][0] if first else bank.sums
+            self.steps = self.steps[:first] + bank.steps(start, self.told[first:], rows[first:])
             for number in range(settled, last + 1):
                 before = self.steps[number - 1][1] if number else bank.hypotheses
                 state = GaussianState(before.x, before.p)
