@@ -40,6 +40,7 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from . import choose
 from .clocks import FoundClocks, find_clocks, in_time
+from .heading_claim import believed_heading
 from .transforms import FrameTree, Placed
 
 # A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
@@ -54,9 +55,6 @@ TRIMMED = 0.85
 QUIETEST, CLAIMS_TOO_MUCH = 0.01, 3.0
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
-# What an IMU claims of its heading (rad) is believed between these: few are as good as the first, and one that claims
-# more than the second says that it does not know.
-BEST_HEADING, WORST_HEADING = math.radians(0.1), math.radians(10.0)
 # Reference frames, in the order in which they are taken for one that the data cannot tell.
 USUAL = (VelocityFrame.ENU, VelocityFrame.BODY, VelocityFrame.NED)
 
@@ -270,9 +268,10 @@ class _Search:
 
     def _know_heading(self, imu: Look) -> None:
         """How far the heading is to be believed, where the IMU says it."""
-        if self._gives("heading_deviation_std") or not imu.claimed_std <= WORST_HEADING:
+        std = believed_heading(imu.claimed_std)
+        if self._gives("heading_deviation_std") or std is None:
             return
-        std = self._values["heading_deviation_std"] = float(f"{max(imu.claimed_std, BEST_HEADING):.2g}")
+        self._values["heading_deviation_std"] = std
         self._found.append(
             f"the IMU claims its heading to ±{math.degrees(imu.claimed_std):.2g}°: taken for how it may deviate "
             f"(-p heading_deviation_std:={std:.2g})"

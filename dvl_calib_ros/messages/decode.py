@@ -6,6 +6,7 @@ and the rules of the message types, which are in `drivers`. What becomes of a sa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
@@ -67,6 +68,12 @@ def frame_named(frame_id: str, base_frames: Collection[str]) -> DeclaredFrame | 
         return DeclaredFrame(EARTH_FRAMES[name.lower()])
     suffix = _SUFFIXES.get(name.lower().rpartition("_")[2]) if "_" in name else None
     return None if suffix is None else DECLARED_FRAMES[suffix]
+
+
+def heading_variance(covariance: Any) -> float:
+    """Variance of an IMU's orientation about z, rad², by its covariance (9,); nan where that says nothing."""
+    given = covariance[0] != NO_DATA and covariance[8] > 0.0
+    return float(covariance[8]) if given else math.nan
 
 
 def stamp_ns(stamp: Any) -> int:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -33,6 +34,7 @@ from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.samples import DvlSample, VelocityFrame
+from ..discovery.heading_claim import believed_heading
 from ..discovery.placement import Frames, not_default, placement
 from ..disk.atomic import check_writable
 from ..errors import InputError
@@ -46,6 +48,7 @@ from ..files.result_file import (
     result_text,
     save_result,
 )
+from ..messages.decode import heading_variance
 from ..messages.feed import MessageFeed
 from ..streams import say
 from .answering import AnsweringNode
@@ -89,11 +92,13 @@ class CalibrationNode(AnsweringNode):
             self.get_logger().warning(str(finding("PRIOR_HOLDS_ERROR")))
         kalman.prepare()
         self._worker = ThreadPoolExecutor(1, "g2")
+        self._initial = initial
         self._begin(parameters, initial)
         # a saved calibration is one of the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
         self._given = not_default(parameters)
+        self._heading_is_open = "heading_deviation_std" not in self._given
         self._late_clocks = LateClocks(named)
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
@@ -122,7 +127,7 @@ class CalibrationNode(AnsweringNode):
         self._feed_from: Mapping[str, Callable[[Any, int], Any]] = {
             "dvl/twist": self._feed_dvl,
             "gnss/twist": lambda message, received_ns: self._feed.reference(message, received_ns),
-            "imu/data": lambda message, received_ns: self._feed.imu(message, received_ns),
+            "imu/data": self._feed_imu,
         }
         self._subscribe(dvl_class, "dvl/twist")
         self._subscribe(gnss_class, "gnss/twist")
@@ -250,6 +255,21 @@ class CalibrationNode(AnsweringNode):
         sample = self._feed.dvl(message, received_ns)
         if sample is not None:
             self._publish_corrected(sample)
+
+    def _feed_imu(self, message: Any, received_ns: int) -> None:
+        if self._heading_is_open:
+            self._believe_heading(message)
+        self._feed.imu(message, received_ns)
+
+    def _believe_heading(self, message: Any) -> None:
+        """Begin with what the first message of the IMU that claims anything claims of its heading, as a replay does."""
+        claimed = math.sqrt(heading_variance(message.orientation_covariance))
+        if math.isnan(claimed):
+            return
+        self._heading_is_open = False
+        std = believed_heading(claimed)
+        if std is not None:
+            self._begin(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial)
 
     # ------------------------------------------------------------------ output
 

@@ -19,7 +19,7 @@ from ..bags.layout import Columns
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import Codes, Covariances, Index, Stamps
-from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
+from ..messages.decode import NO_DATA, UNREADABLE, heading_variance, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
 from .growing import GrowingRows
 
@@ -260,12 +260,6 @@ def turning(message: Any) -> Array:
     if twist is None:
         return np.full((1, 3), np.nan)
     return _columns_of(getattr(twist, "twist", twist).angular)
-
-
-def heading_variance(covariance: Any) -> float:
-    """Variance of an IMU's orientation about z, rad², by its covariance (9,); nan where that says nothing."""
-    given = covariance[0] != NO_DATA and covariance[8] > 0.0
-    return float(covariance[8]) if given else math.nan
 
 
 def _imu(columns: Columns) -> tuple[Array, Array]:

@@ -20,10 +20,10 @@ import numpy as np
 from ..calibration.frames import Array
 from ..calibration.robust import median
 from ..calibration.samples import Index, Stamps
-from ..messages.decode import NO_DATA, UNREADABLE
+from ..messages.decode import NO_DATA, UNREADABLE, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
-from .columns import TopicColumns, heading_variance, stamped, turning
+from .columns import TopicColumns, stamped, turning
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
 # straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.

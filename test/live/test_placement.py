@@ -10,14 +10,18 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
 from diagnostic_msgs.msg import DiagnosticArray
+from io_fixtures import TOPICS
 from live_fixtures import LATCHED
 from rclpy.duration import Duration
 from ros import NODE, PATIENCE_S, World, until
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from dvl_calib_ros.bags.writer import Compression, Storage
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
+from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.demo.player import BagPlayer
+from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
@@ -67,3 +71,26 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
     if not given:
         assert result["mounting"]["corrected_rpy"][2] == pytest.approx(YAW + 0.02, abs=0.02)
         assert result["counts"]["dvl"]["accepted"] > 250
+
+
+@pytest.mark.parametrize("given", [(), ("heading_deviation_std:=0.01",)])
+def test_what_the_imu_claims_of_its_heading_is_taken_unless_given(world, tmp_path, given):
+    sound, bag, saved = tmp_path / "sound", tmp_path / "bag", tmp_path / "live.yaml"
+    write_bag(Scenario(seconds=5.0, gnss_std=0.05), sound, Storage.MCAP, Compression.NONE)
+    with BagReader([sound]) as read, BagWriter(bag, storage="mcap") as written:
+        for topic, log_ns, message, _ in read.messages(TOPICS):
+            if topic == "imu/data":
+                message.orientation_covariance = np.diag([0.0, 0.0, math.radians(2.0) ** 2]).ravel()
+            written.message(topic, TOPICS[topic], log_ns, message)
+    with world.calibration_node("max_latency:=600.0", f"result_file:={saved}", *given):
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        until(lambda: diagnostics, "the node to run")
+        player = BagPlayer(world.node, [bag])
+        player.wait_for_subscribers()
+        player.play(speed=100.0)
+        seen = len(diagnostics)
+        until(lambda: len(diagnostics) >= seen + 2, "what is said at the end")
+        assert world.call(Trigger, f"{NODE}/save").success
+    found = load_yaml(saved, "result file")["parameters"]["heading_deviation_std"]
+    assert found == (0.01 if given else discover([bag], Parameters()).parameters.heading_deviation_std)
+    assert given or found == 0.035
