@@ -114,6 +114,8 @@ class Mounting:
         )
         return f"{self.dvl_frame} in {self.base_frame}: {', '.join(angles)}"
 
+    __repr__ = __str__
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -132,6 +134,9 @@ class Calibration:
     replayed: Replayed = field(repr=False)
     discovery: Discovery = field(repr=False)
     bags: tuple[Path, ...]
+
+    def __repr__(self) -> str:
+        return f"{self.verdict} ({self.model}): {self.mounting}"
 
     @property
     def model(self) -> str:
