@@ -13,9 +13,9 @@ from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, places
 from dvl_calib_ros.calibration.register.curves import Curves
-from dvl_calib_ros.calibration.register.fine import DVL, REFERENCE, Fit
+from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, Fit
 from dvl_calib_ros.calibration.register.motion import Motion, make_motion
-from dvl_calib_ros.calibration.register.registration import Registration, register
+from dvl_calib_ros.calibration.register.registration import Registration, _is_possible, register
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -243,3 +243,16 @@ def test_what_noise_seems_to_tell_of_a_delay_leaves_a_covariance(seed):
     for in_time in ((), (REFERENCE,), (DVL,)):
         found = Fit(made, np.zeros(3), Curves(made))(0.0, 0.0, np.eye(3), in_time)
         assert (np.diag(found.p) > 0.0).all() and np.abs(found.x).max() < LONGEST_S
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "is_possible"),
+    [(LATE, 0.0, True), (LATE, LONGEST_S - 1.0, True), (LATE, LONGEST_S + 1.0, False), (APART, LONGEST_S + 1.0, False),
+     (APART, np.nan, False), (0, np.inf, False)],
+)  # fmt: skip
+def test_a_fit_that_settles_beyond_a_minute_or_nowhere_is_none(at, value, is_possible):
+    moved = motion("box", 5.0)
+    fitted = Fit(moved, np.zeros(3), Curves(moved))(0.0, 0.0, np.eye(3))
+    x = fitted.x.copy()
+    x[at] = value
+    assert _is_possible(fitted._replace(x=x)) is is_possible

@@ -17,6 +17,7 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.observability import Convergence
 from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import ReferenceSample
 from dvl_calib_ros.calibration.verification import HeldOutError, Word, held_out_error, verify
 
 GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05, calibration=0.002)
@@ -174,3 +175,29 @@ def test_the_verdict_changes_at_its_limit_and_not_before(limit, above, changes):
     words = [judged(HeldOutError(1000, 1.0, 0.05 * times * (1.0 + by), 0.05, 0.002), **changes) for by in (-1e-3, 1e-3)]
     below = Word.ACCEPT if above is Word.MARGINAL else Word.MARGINAL
     assert [each.verdict for each in words] == [below, above]
+
+
+@pytest.mark.parametrize(
+    ("typical", "word", "reason"),
+    [(None, Word.REJECT, "several times"), (0.2, Word.REJECT, "several times"), (0.06, Word.MARGINAL, "many of them")],
+)
+def test_a_large_held_out_error_that_outliers_alone_make_does_not_reject(typical, word, reason):
+    large = HeldOutError(1000, 1.0, 0.3, 0.05, 0.002)
+    state = GaussianState(np.array([0.0, 0.02, 0.0, 0.0]), 1e-6 * np.eye(4))
+    said = verify(MODELS["M3"], state, Convergence.FINE, large, Parameters(), typical_error=typical)
+    assert said.verdict is word and reason in said.reasons[0]
+
+
+def test_what_outliers_typically_are_is_no_part_of_the_typical_error(rng):
+    samples = make_samples(MatchedRun("box", 120.0, phi=(0.0, 0.03, 0.02), gnss_std=0.03, dvl_std=0.01))
+    jumps = rng.normal(0.0, 1.0, (1000, 3)) * (rng.random((1000, 1)) < 0.1)  # of four seconds each
+    wild = [
+        each._replace(velocity=tuple(np.add(each.velocity, jumps[each.stamp_ns // 4_000_000_000 % 1000]).tolist()))
+        if isinstance(each, ReferenceSample)
+        else each
+        for each in samples
+    ]
+    clean, spoilt = (calibrate(each, verified=True) for each in (samples, wild))
+    typical = [each._typical_error(MODELS["G1"], clean.state("G1")) for each in (clean, spoilt)]
+    assert typical[1] == pytest.approx(typical[0], rel=0.1)
+    assert typical[0] == pytest.approx(np.sqrt(3.0) * np.hypot(0.03, 0.01), rel=0.2)

@@ -1,0 +1,38 @@
+"""What is registered of a long run: the newest blocks, without covariances, and what they show stays the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from runs import MatchedRun, calibrate, make_samples
+
+from dvl_calib_ros.calibration.delay import clocks
+
+
+@pytest.fixture(scope="module")
+def kept():
+    """Blocks of a run of five minutes."""
+    run = MatchedRun("free", 300.0, gnss_std=0.05, dvl_std=0.01, frame=clocks.FRAMES[1])
+    calibrator = calibrate(make_samples(run), verified=True, models=("G2",))
+    return calibrator._estimators["G2"]._idle_solver().kept
+
+
+def test_all_that_is_registered_of_blocks_is_kept_and_no_covariance(kept):
+    seen = clocks._Seen()
+    for each in kept:
+        seen.add(each)
+    motion = seen.motion()
+    np.testing.assert_array_equal(motion.dvl.times, np.concatenate([each.dvl.times for each in kept]))
+    np.testing.assert_array_equal(motion.dvl.velocity, np.concatenate([each.dvl.velocity for each in kept]))
+    np.testing.assert_array_equal(motion.reference, np.concatenate([each.reference.velocity for each in kept]))
+    assert not any("noise" in name for stream in seen._streams for name in stream.LAYOUT)
+
+
+def test_of_more_blocks_the_newest_are_kept_and_room_does_not_grow(kept, monkeypatch):
+    monkeypatch.setattr(clocks, "MOST", 5)
+    seen = clocks._Seen()
+    seen.take_room()
+    for each in [*kept, *kept]:
+        seen.add(each)
+    assert len(seen) == 5
+    np.testing.assert_array_equal(seen.motion().dvl.times, np.concatenate([each.dvl.times for each in kept[-5:]]))
