@@ -33,7 +33,7 @@ from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
-from .observability import convergence, observability
+from .observability import MEASURES_VERTICAL, convergence, observability
 from .observations import Observations
 from .observe import Observer
 from .parameters import IAC, ParameterError, Parameters
@@ -628,8 +628,12 @@ class Calibrator:
         the vertical; and no roll where another lever arm is found than was told: an attitude of another time makes one,
         and in waves a roll."""
         model, p = MODELS[estimate.model], self.parameters
-        hidden = self.is_level or any(each.is_horizontal for each in self._further)
-        unknown_axes = 0 if not model.aided else 2 if hidden else int(self._finds_another_arm)
+        needs = ""
+        if self.is_level:
+            needs = "an IMU that measures roll and pitch"
+        elif any(each.is_horizontal for each in self._further):
+            needs = MEASURES_VERTICAL
+        unknown_axes = 0 if not model.aided else 2 if needs else int(self._finds_another_arm)
         if not unknown_axes:
             return estimate
         level = p.rotation_dvl_from_body[:, :unknown_axes]
@@ -641,7 +645,7 @@ class Calibrator:
             covariance=estimate.covariance + unknown,
             recording_covariance=own,
             convergence=convergence(model, own, p),
-            observability=observability(model, own, p),
+            observability=observability(model, own, p, needs),
         )
 
     @property

@@ -21,6 +21,8 @@ SHARE_AHEAD = 0.25
 # From here on a lever arm (m) and a delay (s) are fine: 5 cm at 10 degrees per second are 9 mm/s, 10 ms at 1 m/s² 10.
 FINE_STD = {"m": 0.05, "s": 0.01}
 _BODY_AXES = ("roll", "pitch", "yaw")
+# What roll and pitch need of a reference; nothing is claimed of them without.
+MEASURES_VERTICAL = "a reference that measures the vertical velocity"
 
 
 class Convergence(Enum):
@@ -48,8 +50,12 @@ class Observability(NamedTuple):
     progress: float
 
 
-def observability(model: Model, covariance: Array, parameters: Parameters) -> tuple[Observability, ...]:
+def observability(
+    model: Model, covariance: Array, parameters: Parameters, tilt_needs: str = ""
+) -> tuple[Observability, ...]:
     """One entry per error of the DVL that the model estimates, and lever arm and delay, from its covariance (n, n).
+
+    tilt_needs: what roll and pitch lack where that is no motion.
 
     What the data lacks is a motion of the vehicle, so the cause is looked for in the body frame: with a DVL mounted
     at 45 degrees, a straight leg leaves φx and φy uncertain together, and both for want of roll.
@@ -66,7 +72,7 @@ def observability(model: Model, covariance: Array, parameters: Parameters) -> tu
         else:
             axis = _scale_axis(model, index, parameters)
             fine_std = parameters.fine_std_scale
-        missing = "" if observed else model.shown_by[axis]
+        missing = "" if observed else tilt_needs if tilt_needs and axis in _BODY_AXES[:2] else model.shown_by[axis]
         entries.append(Observability(name, std, observed, axis, missing, _progress(std, prior_std[index], fine_std)))
     for index, name in enumerate(model.state_names[model.n_errors :], start=model.n_errors):
         if name in model.shown_by:  # no mere nuisance

@@ -91,7 +91,7 @@ def _why(examined: Examination) -> str:
     if not examined.has_reference:
         return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
     missing = [each.name for each in examined.shown if each.needs]
-    return f"Its motion does not show {' and '.join(missing)}." if missing else ""
+    return f"It does not show {' and '.join(missing)}." if missing else ""
 
 
 def _print_findings(out: Console, examined: Examination) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ import numpy as np
 
 from ..calibration.findings import Finding, Severity
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
+from ..calibration.observability import MEASURES_VERTICAL
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
+from ..calibration.screening import NOT_MEASURED_VARIANCE
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look
@@ -261,15 +263,40 @@ def _shown(velocity: Array, streams: dict[str, Recorded], parameters: Parameters
         variance = float(np.median(given.mean(axis=1)))
     x, y, z = (velocity**2).mean(axis=0) * min(len(velocity), len(reference)) / variance
     prior, fine = parameters.initial_std_misalignment, parameters.fine_std_misalignment
-    rows = []
-    for name, information in (("roll", y + z), ("pitch", x + z), ("yaw", x + y)):
-        rows.append(_row(name, "°", information, prior, fine, math.degrees(1.0)))
-    rows.append(_row("scale", "%", x + y + z, parameters.initial_std_scale, parameters.fine_std_scale, 100.0))
-    return rows
+    needs = _NEEDS
+    about = {"roll": y + z, "pitch": x + z, "yaw": x + y}
+    if _is_horizontal(reference, parameters):  # as a calibration claims nothing of them
+        about, z = about | {"roll": 0.0, "pitch": 0.0}, 0.0
+        needs = _NEEDS | dict.fromkeys(("roll", "pitch"), MEASURES_VERTICAL)
+    rows = [
+        _row(name, "°", information, (prior, fine), math.degrees(1.0), needs) for name, information in about.items()
+    ]
+    scale = parameters.initial_std_scale, parameters.fine_std_scale
+    return [*rows, _row("scale", "%", x + y + z, scale, 100.0, needs)]
 
 
-def _row(name: str, unit: str, information: float, prior: float, fine: float, shown_as: float) -> Shown:
+def _is_horizontal(reference: Recorded, parameters: Parameters) -> bool:
+    """Whether a reference does not measure the vertical."""
+    variance = reference.variances[:, 2]
+    claimed = variance[np.isfinite(variance)]
+    return (
+        parameters.gnss_axes == "xy"
+        or not reference.values[:, 2].any()
+        or bool(len(claimed) and np.median(claimed) >= NOT_MEASURED_VARIANCE)
+    )
+
+
+def _row(
+    name: str,
+    unit: str,
+    information: float,
+    known: tuple[float, float],
+    shown_as: float,
+    needs: Mapping[str, str],
+) -> Shown:
+    """known: σ without data, and from which on it is fine."""
+    prior, fine = known
     std = 1.0 / math.sqrt(information + prior**-2)
     share = min(1.0, max(0.0, math.log(prior / std) / math.log(prior / fine)))
     # half the prior's standard deviation: the data then holds three times what was known before
-    return Shown(name, unit, std * shown_as, share, "" if std <= 0.5 * prior else _NEEDS[name])
+    return Shown(name, unit, std * shown_as, share, "" if std <= 0.5 * prior else needs[name])

@@ -32,6 +32,8 @@ def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
     estimate = run.replayed.result.estimate
     observed = {each.axis: each.observed for each in estimate.observability}
     assert not (observed["roll"] or observed["pitch"] or observed.get("lever arm z"))  # horizontal references
+    missing = {each.axis: each.missing for each in run.replayed.result.estimate.observability}
+    assert missing["roll"] == missing["pitch"] == "a reference that measures the vertical velocity"
     if estimate.model != "G2":  # which claims no arm
         return
     arm, std = estimate.state_of("lever_arm_x"), estimate.std_of("lever_arm_x")

@@ -13,8 +13,10 @@ import pytest
 from command_line import fail, succeed
 from io_fixtures import TOPICS, mcap_bytes, write_bag
 
+import dvl_calib_ros as dc
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.calibration.observability import MEASURES_VERTICAL
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
@@ -214,6 +216,16 @@ def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
     assert code in codes(examined), [str(found) for found in examined.findings]
     also = {"DOCTOR_UNITS": {"DOCTOR_COVARIANCE"}, "DOCTOR_DISAGREE": {"DOCTOR_FRAMES"}}.get(code, set())
     assert codes(examined) <= {code, *also}
+
+
+def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claimed(tmp_path):
+    bag = faulty(tmp_path / "bag", reference_only(no_vertical))
+    examined = examine([bag], Parameters())
+    needs = {each.name: each.needs for each in examined.shown}
+    assert needs["roll"] == needs["pitch"] == MEASURES_VERTICAL and needs["yaw"] == ""
+    assert examined.verdict == "partly"
+    claimed = dc.replay(bag, history=False).replayed.result.estimate.observability
+    assert {each.axis for each in claimed if each.missing == MEASURES_VERTICAL} == {"roll", "pitch"}
 
 
 @pytest.mark.parametrize("sound", SOUND_RUNS)
