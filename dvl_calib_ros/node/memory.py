@@ -11,7 +11,7 @@ import ctypes
 # Of `mallopt` (3). Set, they stay what they are: glibc raises them otherwise with the largest array that is given back.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 # Arrays of at least so many bytes have memory of their own: what comes with each message is smaller.
-LARGE = 1 << 15
+LARGE = 1 << 17
 
 
 def give_back_at_once() -> bool:
