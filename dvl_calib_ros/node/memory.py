@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 
 # Of `mallopt` (3). Set, they stay what they are: glibc raises them otherwise with the largest array that is given back.
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 # Arrays of at least so many bytes have memory of their own: what comes with each message is smaller.
 LARGE = 1 << 17
 
@@ -20,6 +20,4 @@ def give_back_at_once() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # no glibc
         return False
-    return all(
-        mallopt(what, value) for what, value in ((_MMAP_THRESHOLD, LARGE), (_TRIM_THRESHOLD, LARGE), (_ARENA_MAX, 1))
-    )
+    return all(mallopt(what, LARGE) for what in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
