@@ -508,6 +508,7 @@ class _Search:
                 turned_left, rotation = self._readings.registered(reading, None)
                 if turned_left < CLEARLY * left:
                     agree = "where DVL and reference agree best"
+                    rotation = self._readings.without_roll(chosen, rotation)
                     rpy = nominal_rpy(rotation.T)
                     # a roll that a level vehicle hardly shows is none, unless the data need it
                     level = (0.0, *rpy[1:])

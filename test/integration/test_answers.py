@@ -144,3 +144,11 @@ def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path):
     truth = write_survey(draw(25036), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+
+
+@pytest.mark.parametrize(("seed", "yaw_deg"), [(26062, 45.0), (27044, 45.0), (26234, 32.0)])
+def test_a_mounting_that_nobody_told_is_no_roll_that_motion_does_not_show(tmp_path, seed, yaw_deg):
+    """Lasting noise made a roll of -164 and a yaw of -45 of it, which was accepted."""
+    write_survey(draw(seed), tmp_path / "bag")
+    found = discover([tmp_path / "bag"], Parameters()).parameters.mounting_rpy
+    np.testing.assert_allclose(np.degrees(found), (0.0, 0.0, yaw_deg), atol=1e-6)

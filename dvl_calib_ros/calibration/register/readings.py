@@ -16,6 +16,7 @@ import numpy as np
 
 from ..delay.rows import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..directions import Directions
+from ..extrinsics import rotation_of
 from ..frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
@@ -44,6 +45,8 @@ KEPT_SHARE = 0.9
 CLEARLY = 0.5
 # ... and fits in itself: what it leaves is below this share of the speed (17 degrees of misalignment).
 FITS = 0.3
+# Data need a turn about the direction of travel if it leaves less than this share.
+ROLLED = 0.8
 # Turn rates below this (rad/s) do not say which way a body's axes point.
 TURNS = 0.01
 # A mounting nearer than this (rad) to one that is drawn is that one.
@@ -187,6 +190,13 @@ class Readings:
         upright, other = sorted((best, turned), key=lambda each: -float(np.trace(each[1])))
         return other if other[0] < CLEARLY * upright[0] else upright
 
+    def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
+        """A rotation (3, 3) without what it turns about the direction of travel, unless the data need that."""
+        travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
+        least = _least_turn(rotation_dvl_from_body.T @ travel, travel)
+        is_needed = ROLLED * self.agreements([found.reading], least)[0].left > found.best_left
+        return rotation_dvl_from_body if is_needed else least
+
     def is_in_body(self, found: Agreement) -> bool:
         """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
         motion = self._read(replace(found.reading, reference=VelocityFrame.ENU))
@@ -236,6 +246,15 @@ def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
     """The rotation M (3, 3) that minimises mean |a - M b|² + AS_IT_IS |b|² |M - as_it_is|²; a, b: (N, 3)."""
     square = float((b**2).sum(axis=1).mean())
     return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
+
+
+def _least_turn(a: Array, b: Array) -> Array:
+    """The rotation (3, 3) by the smallest angle that turns one direction (3,) into another."""
+    axis = cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9 * max(float(a @ a), 1e-300):
+        return np.eye(3) if float(a @ b) >= 0.0 else np.diag([-1.0, -1.0, 1.0])
+    return rotation_of(axis / sine * math.atan2(sine, float(a @ b)))
 
 
 def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
