@@ -42,7 +42,7 @@ from .results import Day, Estimate, Result
 from .robust import median
 from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
-from .verification import SEVERAL, Verification, verify
+from .verification import SEVERAL, Verification, calibration_error, verify
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
@@ -555,6 +555,7 @@ class Calibrator:
             next((each.doubt for each in self._further if each.doubt), "") if model.aided else "",
             bool(model.estimator) and estimator.claims,
             self._typical_error(model, state) if is_large else None,
+            calibration_error(model, self.of_recording(name).p, judge.moments, self.parameters.rotation_dvl_from_body),
         )
 
     def _typical_error(self, model: Model, state: GaussianState) -> float | None:

@@ -80,6 +80,14 @@ def held_out_error(
     return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
 
 
+def calibration_error(model: Model, covariance: Array, moments: Moments, rotation_dvl_from_body: Array) -> float:
+    """Velocity error, m/s rms, that a covariance (n, n) of a model's state makes on the samples judged; 0 for none."""
+    samples = int(moments.total[0])
+    of_errors = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
+    total = sum(_calibration_variance(of_errors, moments.of(k)[1], rotation_dvl_from_body.T) for k in range(FOLDS))
+    return math.sqrt(max(total, 0.0) / samples) if samples else 0.0
+
+
 def held_out_from_sums(samples: int, sums: Sequence[float] | Array) -> HeldOutError | None:
     """From sums of squares (m/s)² in the order of `HeldOutError`'s fields; None if there is too little to judge by."""
     if samples < ENOUGH_SAMPLES:
@@ -139,6 +147,7 @@ def verify(
     lever_arm_turns: str = "",
     finds_lever_arm: bool = False,
     typical_error: float | None = None,
+    own_error: float = 0.0,
 ) -> Verification:
     """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
 
@@ -155,6 +164,7 @@ def verify(
     lever_arm_turns: How much of an angle is the lever arm's, in words, if the motion does not tell them apart.
     finds_lever_arm: Whether it is in σ of the angles, and not taken as known.
     typical_error: Velocity error without outliers, m/s rms, where that on held-out samples is large.
+    own_error: Velocity error that its σ by blocks of time leads one to expect, m/s rms, as of `calibration_error`.
 
     """
     findings = [
@@ -163,7 +173,7 @@ def verify(
         *([(Word.REJECT, f"{suggestion}, not the configuration given")] if suggestion else []),
         *_size_findings(model, state, parameters),
         *_convergence_findings(convergence),
-        _error_finding(held_out, parameters, reference_claims, typical_error),
+        _error_finding(held_out, parameters, reference_claims, typical_error, own_error),
     ]
     findings.sort(key=lambda finding: _SEVERITY.index(finding[0]))
     reasons = tuple(sentence for _, sentence in findings)
@@ -234,7 +244,11 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
 
 
 def _error_finding(
-    held_out: HeldOutError | None, parameters: Parameters, reference_claims: bool, typical_error: float | None
+    held_out: HeldOutError | None,
+    parameters: Parameters,
+    reference_claims: bool,
+    typical_error: float | None,
+    own_error: float,
 ) -> Finding:
     if held_out is None:
         return Word.MARGINAL, "too few samples with a reference velocity to verify it on held-out data"
@@ -243,8 +257,10 @@ def _error_finding(
         f"on {held_out.samples} samples that it had not seen the velocity error is {uncorrected:.3f} m/s rms without "
         f"correction, {corrected:.3f} with it, {predicted:.3f} predicted"
     )
-    # where there is nothing to correct, correcting adds the estimate's own variance, give or take
-    if corrected**2 - uncorrected**2 > WORSE_FROM * held_out.calibration**2:
+    # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts that
+    # is more than the filter says, and being worse is no contradiction
+    worse = corrected**2 - uncorrected**2
+    if worse > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
         return Word.REJECT, f"{found}: the calibration makes it worse"
     if corrected > SEVERAL * predicted:
         if typical_error is not None and typical_error < SEVERAL * predicted:
@@ -258,6 +274,8 @@ def _error_finding(
             f"{found}: implausibly small. Was the DVL fused into the reference? Then that cannot judge it; take GNSS "
             "alone"
         )
+    if worse > WORSE_FROM * held_out.calibration**2:
+        return Word.MARGINAL, f"{found}: it gets no better, which may be for want of data, as σ says"
     dof = 3 * held_out.samples
     by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)
     if corrected > predicted * parameters.max_error_ratio * by_chance:

@@ -6,6 +6,7 @@ one that is later by so much for each second, or from some stretch on; the stret
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -24,7 +25,7 @@ DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference":
 LAGS_S = 0.03
 # From here on a clock that moves is one, from end to end: s, in σ, and in chi-square; another clock has to explain it
 # by so much less to be told from it, and what is left may be so much for each degree of freedom.
-SHOWN_FROM_S, SIGMAS, GAIN, TOLD_APART, LEFT = 0.1, 5.0, 18.0, 8.0, 4.0
+SHOWN_FROM_S, SIGMAS, GAIN, TOLD_APART, LEFT = 0.1, 6.0, 18.0, 8.0, 4.0
 # A leap ahead leaves a hole of its size in the stamps, which is known to such a share.
 HOLE = 0.8
 # More is no parameter's (`dvl_clock_drift`, s/s, and `dvl_time_jump`, s).
@@ -153,11 +154,14 @@ def unsteady(times: Array, stretches: Sequence[Fitted], is_turned: bool) -> Unst
             found.append((left, value, std, name, course))
     left, value, std, name, course = min(found, key=lambda each: each[0])
     length = float(np.ptp(times)) if course.at is None else 1.0
-    is_shown = still - left > GAIN and abs(value) * length > SHOWN_FROM_S and abs(value) > SIGMAS * std
-    if not is_shown or left > min(but_one) + ANYTHING or left > LEFT * (seen.size - len(states) - 1.0):
+    # stretches scatter by more than they claim where noise lasts as long as they do: all is worth as much less
+    scatter = max(1.0, left / (seen.size - len(states) - 1.0))
+    std *= math.sqrt(scatter)
+    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > SIGMAS * std
+    if not is_shown or left > min(but_one) + ANYTHING * scatter or scatter > LEFT:
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)
-    whose = name if is_turned and others - left > TOLD_APART else ""
+    whose = name if is_turned and others - left > TOLD_APART * scatter else ""
     return Unsteady(whose, value, std=std) if course.at is None else Unsteady(whose, 0.0, value, course.at, std)
 
 

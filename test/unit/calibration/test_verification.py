@@ -117,9 +117,9 @@ def test_verification_does_not_depend_on_how_samples_are_gathered(block_size):
     assert other.corrected == pytest.approx(one.corrected, rel=1e-9)
 
 
-def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, **parameters):
+def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, own_error=0.0, **parameters):
     state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), std**2 * np.eye(4))
-    return verify(MODELS["M3"], state, convergence, held_out, Parameters(**parameters))
+    return verify(MODELS["M3"], state, convergence, held_out, Parameters(**parameters), own_error=own_error)
 
 
 def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_that_is_off():
@@ -141,6 +141,8 @@ def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_t
         ({"scale": -0.051}, Word.REJECT, "scale"),
         ({"scale": 0.051, "max_scale_error": 0.1}, Word.ACCEPT, "0.050 with it"),
         ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002)}, Word.REJECT, "worse"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002), "own_error": 0.01}, Word.MARGINAL, "no better"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.103, 0.2, 0.002), "own_error": 0.01}, Word.REJECT, "worse"),
         ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002)}, Word.MARGINAL, "noisier"),
         (
             {"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002), "max_error_ratio": 1.3},
