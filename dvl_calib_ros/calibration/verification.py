@@ -257,8 +257,8 @@ def _error_finding(
         f"on {held_out.samples} samples that it had not seen the velocity error is {uncorrected:.3f} m/s rms without "
         f"correction, {corrected:.3f} with it, {predicted:.3f} predicted"
     )
-    # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts that
-    # is more than the filter says, and being worse is no contradiction
+    # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts
+    # that is more than the filter says, and being worse is no contradiction
     worse = corrected**2 - uncorrected**2
     if worse > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
         return Word.REJECT, f"{found}: the calibration makes it worse"
