@@ -36,7 +36,7 @@ IMPLAUSIBLE = 0.2
 # If more than this share of the samples is gated, the estimate is that of a minority.
 MOST_GATED = 0.5
 # An error of so many σ is one, however little the data show of it.
-SURELY = 4.0
+SURELY = 3.0
 # Share of runs whose held-out error may by chance exceed what a true covariance predicts.
 CHANCE = 0.01
 

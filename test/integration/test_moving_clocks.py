@@ -41,6 +41,7 @@ def said(command, bag, capsys):
     return " ".join((printed.out + printed.err).split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("moves", "words"),
     [({"leap": 1.0}, "the reference's clock leaps ahead by 1.0"), ({"drift": 1e-3}, "the reference's clock drifts by")],

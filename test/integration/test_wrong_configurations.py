@@ -134,7 +134,7 @@ WRONG = {
     "a DVL in ENU, body claimed": (
         lambda: in_the_earth(run()), {"gnss_frame": "body"}, "turn with the heading, as those in the earth's frame do",
     ),
-    "an effect beyond the model": (lambda: swinging(run(gnss_std=0.01)), {}, "the calibration makes it worse"),
+    "an effect beyond the model": (lambda: swinging(run(gnss_std=0.01)), {}, "an effect is missing from the model"),
     "a vehicle that stands": (
         lambda: [s._replace(velocity=(0.0, 0.0, 0.0)) if not isinstance(s, ImuSample) else s for s in run()], {},
         "no sample was used",
