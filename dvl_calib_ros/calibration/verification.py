@@ -260,11 +260,13 @@ def _error_finding(
     # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts
     # that is more than the filter says, and being worse is no contradiction
     worse = corrected**2 - uncorrected**2
+    is_large = corrected > SEVERAL * predicted
+    if is_large and typical_error is not None and typical_error < SEVERAL * predicted:
+        # nor do they say which is the worse
+        return Word.MARGINAL, f"{found}, {typical_error:.3f} without outliers: there are many of them"
     if worse > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
         return Word.REJECT, f"{found}: the calibration makes it worse"
-    if corrected > SEVERAL * predicted:
-        if typical_error is not None and typical_error < SEVERAL * predicted:
-            return Word.MARGINAL, f"{found}, {typical_error:.3f} without outliers: there are many of them"
+    if is_large:
         return Word.REJECT, (
             f"{found}, several times less: the configuration is wrong, or an effect is missing from the model "
             "(dvl-calib diagnose looks for it)"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from filter_problems import random_problem
@@ -187,6 +189,9 @@ def test_a_large_held_out_error_that_outliers_alone_make_does_not_reject(typical
     large = HeldOutError(1000, 1.0, 0.3, 0.05, 0.002)
     state = GaussianState(np.array([0.0, 0.02, 0.0, 0.0]), 1e-6 * np.eye(4))
     said = verify(MODELS["M3"], state, Convergence.FINE, large, Parameters(), typical_error=typical)
+    a_hair_worse = replace(large, uncorrected=0.999 * large.corrected)
+    again = verify(MODELS["M3"], state, Convergence.FINE, a_hair_worse, Parameters(), typical_error=typical)
+    assert again.verdict is said.verdict  # which of two is worse by a hair is for the outliers to say
     assert said.verdict is word and reason in said.reasons[0]
 
 
