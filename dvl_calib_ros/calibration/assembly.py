@@ -163,9 +163,8 @@ def prior(model: Model, parameters: Parameters) -> GaussianState:
 
 def gate_of(rows: float, parameters: Parameters) -> float:
     """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
-    if parameters.gate_probability in (0.0, 1.0):
-        return float("inf")
-    return chi2_isf(1.0 - parameters.gate_probability, rows)
+    gated = 1.0 - parameters.gate_probability
+    return chi2_isf(gated, rows) if 0.0 < gated < 1.0 else float("inf")  # after rounding
 
 
 def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:

@@ -705,6 +705,7 @@ def settings_inside_their_bounds(draw) -> dict:
 INDEFINITE = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
+@example({"gate_probability": 3.7e-233}, [], VelocityFrame.BODY, 1)
 @example({}, [(DvlSample, 2, INDEFINITE)], VelocityFrame.ENU, 64)
 @example({}, [(ReferenceSample, 2, 0.1 * INDEFINITE)], VelocityFrame.BODY, 1)
 @example(

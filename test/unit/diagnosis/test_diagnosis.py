@@ -507,7 +507,7 @@ def test_a_bag_without_reference_is_refused(tmp_path, capsys):
 
 
 def test_no_bag_is_refused(capsys):
-    assert "name a bag" in fail(capsys, "diagnose")
+    assert "required: BAG" in fail(capsys, "diagnose")
 
 
 @pytest.mark.parametrize(("not_explained", "verdict"), [(0.0139, Verdict.KNOWN), (0.0141, Verdict.UNKNOWN)])
