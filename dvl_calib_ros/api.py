@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .calibration.findings import Finding
 from .calibration.frames import Array, rpy_from_rotation
 from .calibration.models import MODELS
 from .calibration.mounting_pose import rpy_std
@@ -34,6 +33,7 @@ from .examination.examine import Examination
 from .recordings.recording import Recording, open_recording
 from .replay.replay import Replayed
 from .simulation.scenario import Scenario
+from .verdict.reasons import Reason
 
 if TYPE_CHECKING:
     import pandas
@@ -159,7 +159,7 @@ class Calibration:
         return self.discovery.found
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[Reason, ...]:
         """What is wrong with the data, each with its code and remedy."""
         return self.replayed.findings
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 PACKAGE = Path(__file__).resolve().parents[1] / "dvl_calib_ros"
 _BASE = ("errors",)
-_CORE = (*_BASE, "calibration")
+_CORE = (*_BASE, "verdict", "calibration")
 _READ = (*_CORE, "bags", "messages", "recordings")
 # Rooms from the ground up: packages and modules of ours, and which of those before it each may import. docs/develop.md
 ROOMS: Mapping[str, tuple[str, ...]] = {
@@ -19,7 +19,8 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "streams": (),
     "parallel": _BASE,
     "disk": _BASE,
-    "calibration": _BASE,
+    "verdict": (),
+    "calibration": (*_BASE, "verdict"),
     "effects": _CORE,
     "bags": (*_BASE, "disk"),
     "messages": (*_CORE, "bags"),

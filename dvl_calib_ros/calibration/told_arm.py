@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .findings import Finding, finding
+from ..verdict.reasons import Reason, finding
 from .kalman import GaussianState
 from .models import MODELS, Model
 from .parameters import Parameters
@@ -46,7 +46,7 @@ def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> 
     return np.asarray(away > np.maximum(SIGMAS * std, MEASURED_TO))
 
 
-def told_arm_advice(estimates: Mapping[str, Estimate], parameters: Parameters) -> list[Finding]:
+def told_arm_advice(estimates: Mapping[str, Estimate], parameters: Parameters) -> list[Reason]:
     """Whether the lever arm that was told is another than the one that the data show."""
     estimate = estimates.get(FINDS_IT)
     if estimate is None or not estimate.used:

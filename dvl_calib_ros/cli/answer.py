@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from ..calibration.findings import Finding
     from ..discovery.discover import Discovery
     from ..replay.replay import Replayed
+    from ..verdict.reasons import Reason
 
 # What the verdict's word asks of the reader, and its colour.
 VERDICTS = {
@@ -24,7 +24,7 @@ VERDICTS = {
 }
 
 
-def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Finding]:
+def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Reason]:
     """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
     other = [f"{name}: " for name in replayed.result.estimates if name not in models]
     settled = {"BAG_NO_GNSS", "BAG_NO_IMU"} | ({"IMU_FRAME"} if discovery.knows_imu else set())

@@ -43,10 +43,9 @@ def run(arguments: argparse.Namespace) -> None:
         print(command_table(), end="")
         return
     if arguments.findings or arguments.doctor:
-        from ..calibration.findings import FINDINGS, finding_table
-        from ..examination.kinds import KINDS
+        from ..verdict.reasons import TABLES, table
 
-        print(finding_table((FINDINGS if arguments.findings else KINDS).values()), end="")
+        print(table(TABLES["findings" if arguments.findings else "doctor"]), end="")
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.clocks import Clocks
-from ..calibration.findings import Finding
 from ..calibration.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ..calibration.parameters import Parameters
 from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
@@ -28,6 +27,7 @@ from ..recordings.recording import Recording as Opened
 from ..recordings.recording import open_recording
 from ..recordings.same import hold_the_same
 from ..recordings.topics import Topics
+from ..verdict.reasons import Reason
 from .curve import Curve
 from .settings import SETTINGS
 
@@ -247,7 +247,7 @@ def _without_suffix(name: str) -> str:
 
 def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) -> tuple[Streams, list[str]]:
     """All samples of a recording, and what the user should know of them."""
-    found: list[Finding] = []
+    found: list[Reason] = []
     chosen = topics.found_in(opened.types)
     check_topics(opened, chosen, found)
     decoder = MessageDecoder(opened.of_types(chosen, parameters))

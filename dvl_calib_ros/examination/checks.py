@@ -6,14 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.findings import Finding
 from ..calibration.frames import Array
 from ..calibration.parameters import SCHEMA, Parameters
 from ..calibration.register.arrival import apart
 from ..calibration.samples import Stream
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recorded import Recorded
-from .kinds import named
+from ..verdict.reasons import Reason, finding
 
 SECOND_NS = 1_000_000_000
 # Fewer messages say nothing about rates and jitter.
@@ -45,14 +44,14 @@ def interval_s(topic: Recorded) -> float:
     return float(np.median(np.diff(topic.log_ns))) * 1e-9 if len(topic) > 1 else 0.0
 
 
-def stamp_findings(topic: Recorded) -> list[Finding]:
+def stamp_findings(topic: Recorded) -> list[Reason]:
     """Too few messages, zero stamps, stamps of reception, stamps that go back, jump or repeat."""
     if len(topic) < ENOUGH:
-        return [named("DOCTOR_TOO_FEW", topic=topic.topic, count=len(topic))]
+        return [finding("DOCTOR_TOO_FEW", topic=topic.topic, count=len(topic))]
     found = []
     zero = topic.stamps_ns == 0
     if zero.any():
-        found.append(named("DOCTOR_STAMP_ZERO", topic=topic.topic, share=zero.mean()))
+        found.append(finding("DOCTOR_STAMP_ZERO", topic=topic.topic, share=zero.mean()))
     stamps, log = topic.stamps_ns[~zero], topic.log_ns[~zero]
     if len(stamps) < ENOUGH:
         return found
@@ -60,18 +59,18 @@ def stamp_findings(topic: Recorded) -> list[Finding]:
     back = steps < 0.0
     if back.any():
         seconds = float(-steps[back].min())
-        found.append(named("DOCTOR_STAMP_BACK", topic=topic.topic, count=int(back.sum()), seconds=seconds))
+        found.append(finding("DOCTOR_STAMP_BACK", topic=topic.topic, count=int(back.sum()), seconds=seconds))
     ahead = steps - log_steps
     if ahead.max() > SET_CLOCK:
-        found.append(named("DOCTOR_STAMP_JUMP", topic=topic.topic, seconds=float(ahead.max())))
+        found.append(finding("DOCTOR_STAMP_JUMP", topic=topic.topic, seconds=float(ahead.max())))
     repeated = float((steps == 0.0).mean())
     if repeated > SOME:
         code = "DOCTOR_REPEATED_STAMP" if repeated < MOST else "DOCTOR_STANDING_STAMP"
-        found.append(named(code, topic=topic.topic, share=repeated))
+        found.append(finding(code, topic=topic.topic, share=repeated))
     return found + _reception(topic.topic, steps, log_steps)
 
 
-def _reception(name: str, steps: Array, log_steps: Array) -> list[Finding]:
+def _reception(name: str, steps: Array, log_steps: Array) -> list[Reason]:
     """Whether stamps jitter as the reception does, about a sensor's steady rhythm."""
     period = float(np.median(steps))
     steady = (steps > 0.3 * period) & (steps < 1.7 * period)
@@ -88,10 +87,10 @@ def _reception(name: str, steps: Array, log_steps: Array) -> list[Finding]:
     together = float(np.corrcoef(steps[steady], log_steps[steady])[0, 1]) if log_steps[steady].std() > 0.0 else 0.0
     if rhythm > AGAINST_RHYTHM or together < 0.9:
         return []
-    return [named("DOCTOR_STAMP_RECEPTION", topic=name, jitter_ms=1e3 * jitter, period_ms=1e3 * period)]
+    return [finding("DOCTOR_STAMP_RECEPTION", topic=name, jitter_ms=1e3 * jitter, period_ms=1e3 * period)]
 
 
-def apart_findings(dvl: Recorded, reference: Recorded) -> list[Finding]:
+def apart_findings(dvl: Recorded, reference: Recorded) -> list[Reason]:
     """Whether DVL and reference are never measured at one time, by their stamps."""
     ours, theirs = (np.sort(topic.stamps_ns[topic.stamps_ns != 0]) for topic in (dvl, reference))
     if not len(ours) or not len(theirs):
@@ -101,7 +100,7 @@ def apart_findings(dvl: Recorded, reference: Recorded) -> list[Finding]:
         np.abs(ours - theirs[np.minimum(after, len(theirs) - 1)]), np.abs(ours - theirs[np.maximum(after - 1, 0)])
     )
     share = float((near <= GAP * SECOND_NS).mean())
-    return [named("DOCTOR_APART", topic=dvl.topic, other=reference.topic, share=share)] if share <= MANY else []
+    return [finding("DOCTOR_APART", topic=dvl.topic, other=reference.topic, share=share)] if share <= MANY else []
 
 
 def clock_offset_s(topic: Recorded) -> float | None:
@@ -110,7 +109,7 @@ def clock_offset_s(topic: Recorded) -> float | None:
     return float(np.median(topic.stamps_ns[stamped] - topic.log_ns[stamped])) * 1e-9 if stamped.any() else None
 
 
-def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> list[Finding]:
+def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> list[Reason]:
     """Streams (by dvl, reference, imu) that stamp by another clock than the rest."""
     offsets = {Stream(role): clock_offset_s(topic) for role, topic in topics.items()}
     found = []
@@ -124,11 +123,11 @@ def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> li
             "here": f"for this bag: -p {name}:={late:.2f}" if can_be_taken_off else "correct the stamps",
         }
         topic, other = topics[each.stream.value].topic, topics[each.other.value].topic
-        found.append(named("DOCTOR_CLOCKS", topic=topic, other=other, **fields))
+        found.append(finding("DOCTOR_CLOCKS", topic=topic, other=other, **fields))
     return found
 
 
-def gap_findings(topic: Recorded) -> list[Finding]:
+def gap_findings(topic: Recorded) -> list[Reason]:
     """Silences, by log time."""
     if len(topic) < ENOUGH:
         return []
@@ -138,10 +137,10 @@ def gap_findings(topic: Recorded) -> list[Finding]:
         return []
     at_s = float(topic.log_ns[int(np.argmax(steps))] - topic.log_ns[0]) * 1e-9
     fields = {"seconds": float(steps[gaps].sum()), "count": int(gaps.sum()), "at_s": at_s}
-    return [named("DOCTOR_GAPS", topic=topic.topic, **fields)]
+    return [finding("DOCTOR_GAPS", topic=topic.topic, **fields)]
 
 
-def velocity_findings(topic: Recorded, is_dvl: bool) -> list[Finding]:
+def velocity_findings(topic: Recorded, is_dvl: bool) -> list[Reason]:
     """Zeros, repetitions, what is not finite, refusals, axes and covariances of velocities."""
     if not len(topic):
         return []
@@ -149,25 +148,25 @@ def velocity_findings(topic: Recorded, is_dvl: bool) -> list[Finding]:
     values = topic.values
     finite = np.isfinite(values).all(axis=1)
     if not finite.all():
-        found.append(named("DOCTOR_NOT_FINITE", topic=topic.topic, share=1.0 - finite.mean()))
+        found.append(finding("DOCTOR_NOT_FINITE", topic=topic.topic, share=1.0 - finite.mean()))
     zero = (values == 0.0).all(axis=1)
     if zero.mean() > SOME:
-        found.append(named("DOCTOR_ZEROS", topic=topic.topic, share=zero.mean()))
+        found.append(finding("DOCTOR_ZEROS", topic=topic.topic, share=zero.mean()))
     if is_dvl:
         for rule in VELOCITY_TYPES[topic.msgtype].rules:
             share = topic.refused.get(rule.counter, 0) / len(topic)
             if share > SOME and rule.counter != "zero_velocity":
                 reason = {"reason": rule.in_words, "remedy": rule.remedy}
-                found.append(named("DOCTOR_REFUSED", topic=topic.topic, share=share, **reason))
+                found.append(finding("DOCTOR_REFUSED", topic=topic.topic, share=share, **reason))
     measured = values[finite & ~zero]
     if len(measured) < ENOUGH:
         return found
     repeats = float((measured[1:] == measured[:-1]).all(axis=1).mean())
     if repeats > MANY:
-        found.append(named("DOCTOR_FROZEN", topic=topic.topic, share=repeats))
+        found.append(finding("DOCTOR_FROZEN", topic=topic.topic, share=repeats))
     silent = [name for name, axis in zip("xyz", measured.T, strict=True) if not axis.any()]
     if silent:
-        found.append(named("DOCTOR_AXIS", topic=topic.topic, axes=" and ".join(silent)))
+        found.append(finding("DOCTOR_AXIS", topic=topic.topic, axes=" and ".join(silent)))
     return found + _covariance(topic, finite & ~zero, is_dvl)
 
 
@@ -180,7 +179,7 @@ def shown_noise(values: Array) -> float:
     return float(np.sqrt((changes**2).mean() / 6.0))  # of white noise a second difference has six times the variance
 
 
-def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Finding]:
+def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Reason]:
     """A constant covariance that the data contradict."""
     variances = topic.variances[used]
     if np.isnan(variances).any() or (variances != variances[0]).any():
@@ -193,10 +192,10 @@ def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Finding]:
         )
     else:
         wrong = not NO_RECEIVER[0] <= claimed <= NO_RECEIVER[1]
-    return [named("DOCTOR_COVARIANCE", topic=topic.topic, claimed=claimed, shown=shown)] if wrong else []
+    return [finding("DOCTOR_COVARIANCE", topic=topic.topic, claimed=claimed, shown=shown)] if wrong else []
 
 
-def orientation_findings(imu: Recorded) -> list[Finding]:
+def orientation_findings(imu: Recorded) -> list[Reason]:
     """Whether an IMU gives an orientation at all."""
     q = imu.values
     finite = np.isfinite(q @ np.ones(4))  # of four at once: a sum of narrow rows takes longer than all else here
@@ -209,4 +208,4 @@ def orientation_findings(imu: Recorded) -> list[Finding]:
         why = "the same in every message"
     else:
         return []
-    return [named("DOCTOR_NO_ORIENTATION", topic=imu.topic, why=why)]
+    return [finding("DOCTOR_NO_ORIENTATION", topic=imu.topic, why=why)]

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.findings import Finding, Severity
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.observability import MEASURES_VERTICAL
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
@@ -22,8 +21,9 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look
 from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording, open_recording
+from ..verdict.kinds import Severity
+from ..verdict.reasons import Reason, finding
 from . import checks
-from .kinds import named
 
 # A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
@@ -72,7 +72,7 @@ class Examination:
     seconds: float
     contents: tuple[Content, ...]
     discovery: Discovery
-    findings: tuple[Finding, ...]
+    findings: tuple[Reason, ...]
     speed_mps: float
     shown: tuple[Shown, ...]
     notes: tuple[str, ...]
@@ -171,9 +171,9 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
     return flu @ rotation_from_rpy(parameters.mounting_rpy).T
 
 
-def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Finding]:
+def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:
     dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
-    found: list[Finding] = []
+    found: list[Reason] = []
     for topic in streams.values():
         found += checks.stamp_findings(topic) + checks.gap_findings(topic)
     # where velocities and turns show how the clocks stand, it does not matter when messages arrived
@@ -186,21 +186,21 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found += checks.velocity_findings(reference, False)
         if len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
             rate_hz = 1.0 / checks.interval_s(reference)
-            found.append(named("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
+            found.append(finding("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
     if imu is not None and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
         found += checks.orientation_findings(imu)
     if imu is None:
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
         what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
-        found.append(named("DOCTOR_NO_IMU", what=what) if in_body else named("DOCTOR_NO_IMU_EARTH"))
-    found += [named("DOCTOR_FRAMES", said=doubt) for doubt in discovery.contradictions]
+        found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
+    found += [finding("DOCTOR_FRAMES", said=doubt) for doubt in discovery.contradictions]
     parameters = discovery.parameters
     speed = np.linalg.norm(velocity, axis=1)
     units = [] if reference is None else _units(dvl, reference)
     if units:
         found += units
     elif not len(speed) or (speed > parameters.min_speed).mean() < MOVES_SHARE:
-        found.append(named("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
+        found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None:
         found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
     return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
@@ -210,11 +210,11 @@ def _are_clocks_known(discovery: Discovery) -> bool:
     return discovery.clocks is not None and discovery.clocks.registration.are_known
 
 
-def _has_error(found: Sequence[Finding]) -> bool:
+def _has_error(found: Sequence[Reason]) -> bool:
     return any(each.severity is Severity.ERROR for each in found)
 
 
-def _units(dvl: Recorded, reference: Recorded) -> list[Finding]:
+def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
     """DVL and reference whose speeds differ by the factor between two units."""
     speeds = []
     for topic in (dvl, reference):
@@ -231,17 +231,17 @@ def _units(dvl: Recorded, reference: Recorded) -> list[Finding]:
         for which, value in (("the DVL", factor), ("the reference", 1.0 / factor)):
             if abs(value / of_unit - 1.0) < 0.1:
                 guess = f" ({which} in {unit}?)"
-    return [named("DOCTOR_UNITS", factor=factor, guess=guess)]
+    return [finding("DOCTOR_UNITS", factor=factor, guess=guess)]
 
 
-def _disagreement(discovery: Discovery, noise: float) -> list[Finding]:
+def _disagreement(discovery: Discovery, noise: float) -> list[Reason]:
     """DVL and reference that no frames bring together.
 
     noise: of the reference per axis, as a share of the speed.
     """
     if discovery.agreement is None or discovery.agreement.best_left**2 - 3.0 * noise**2 < FITS**2:
         return []
-    return [named("DOCTOR_DISAGREE", left=discovery.agreement.best_left)]
+    return [finding("DOCTOR_DISAGREE", left=discovery.agreement.best_left)]
 
 
 _NEEDS = {

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.findings import Finding, finding
 from ..calibration.frames import FLU_FROM_FRD, Array, Vector
 from ..calibration.imu_alignment import ImuAlignment
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from ..verdict.reasons import Reason, finding
 from .drivers import VelocityType, velocity_type
 from .fixes import FixDifference
 
@@ -152,7 +152,7 @@ class MessageDecoder:
 
     def forget(self) -> None:
         """Forget the problems and the frames seen."""
-        self.problems: dict[str, Finding] = {}
+        self.problems: dict[str, Reason] = {}
         self.zero_stamps = 0
         self.dvl_frame: str | None = self.parameters.dvl_frame or None
         self._dvl_reader: _Reader | None = None
@@ -308,7 +308,7 @@ class MessageDecoder:
         if self.imu_alignment.is_identity and frame_id.lstrip("/") != base.lstrip("/"):
             self._problem("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
 
-    def _problem(self, kind: str, found: Finding) -> None:
+    def _problem(self, kind: str, found: Reason) -> None:
         is_new = kind not in self.problems
         self.problems[kind] = found
         if is_new:  # two frames in turn, or ever new garbage, must not be told of at every message

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.findings import Finding, finding
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
+from ..verdict.reasons import Reason, finding
 
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -98,7 +98,7 @@ class VelocityType:
                 return rule
         return None
 
-    def advice(self, counts: Mapping[str, int]) -> list[Finding]:
+    def advice(self, counts: Mapping[str, int]) -> list[Reason]:
         """What is wrong with the messages that were not used for breaking rules; from `Calibrator.counts` of dvl."""
         return [
             finding("DVL_REFUSED", count=counts[rule.counter], reason=rule.in_words, remedy=rule.remedy)

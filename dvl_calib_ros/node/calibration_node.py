@@ -28,7 +28,6 @@ from std_srvs.srv import Trigger
 from ..calibration import kalman
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, lever_arm, twist_terms
-from ..calibration.findings import Finding, finding
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import mounting_pose
@@ -51,6 +50,7 @@ from ..files.result_file import (
 from ..messages.decode import heading_variance
 from ..messages.feed import MessageFeed
 from ..streams import say
+from ..verdict.reasons import Reason, finding
 from .answering import AnsweringNode
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
@@ -107,7 +107,7 @@ class CalibrationNode(AnsweringNode):
         self._published = self._mounting_published = ("", 0)
         self._pauses = Pauses(steady_s())
         self._silence, self._recent = Silence(self._pauses.running_s(steady_s())), RecentCounts()
-        self._save_problem: Finding | None = None
+        self._save_problem: Reason | None = None
 
         self._estimate = self._output_message()
         self._corrected = self._output_message()
@@ -371,9 +371,9 @@ class CalibrationNode(AnsweringNode):
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
 
-    def _topic_problems(self) -> list[Finding]:
+    def _topic_problems(self) -> list[Reason]:
         type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
-        problems: list[Finding] = []
+        problems: list[Reason] = []
         for topic, subscription in self._inputs.items():
             problems += input_problems(self, subscription, type_parameters.get(topic))
         for publisher in (self._estimate_publisher, self._corrected_publisher, self._mounting_publisher):

@@ -17,7 +17,6 @@ from ..calibration.advice import (
     reference_advice,
 )
 from ..calibration.calibrator import Calibrator
-from ..calibration.findings import Finding, Severity, finding
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import scale_and_delay
@@ -26,6 +25,8 @@ from ..calibration.register.arrival import apart
 from ..calibration.results import Estimate
 from ..calibration.samples import Stream
 from ..messages.drivers import VelocityType
+from ..verdict.kinds import Severity
+from ..verdict.reasons import Reason, finding
 
 # A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0
@@ -77,7 +78,7 @@ class Silence:
         self._started_s = now_s
         self._seen: dict[str, _Seen] = {}
 
-    def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, Finding]:
+    def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, Reason]:
         """Stream -> what is wrong. counts: the calibrator's, as of now."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
@@ -97,7 +98,7 @@ class Silence:
         return faults | _other_times(newest_ns, coming, calibrator.parameters)
 
 
-def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters) -> dict[str, Finding]:
+def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters) -> dict[str, Reason]:
     """Of the streams that come, those whose stamps are far from the others'."""
     known = {stream: ns for stream, ns in newest_ns.items() if stream in coming and ns is not None}
     dvl_ns = known.get("dvl")
@@ -120,7 +121,7 @@ def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], paramete
 def diagnose(
     calibrator: Calibrator,
     dvl_type: VelocityType,
-    problems: Sequence[Finding],
+    problems: Sequence[Reason],
     silence: Silence,
     recent: RecentCounts,
     now_s: float,
@@ -162,13 +163,13 @@ def diagnose(
     return status
 
 
-def _level(found: Sequence[Finding]) -> bytes:
+def _level(found: Sequence[Reason]) -> bytes:
     if not found:
         return DiagnosticStatus.OK
     return DiagnosticStatus.ERROR if found[0].severity is Severity.ERROR else DiagnosticStatus.WARN
 
 
-def _restart_advice(counts: Counts) -> list[Finding]:
+def _restart_advice(counts: Counts) -> list[Reason]:
     return [finding("CLOCK_WENT_BACK")] if counts["calibration"]["restarts"] else []
 
 

@@ -8,14 +8,14 @@ from rclpy.duration import Infinite
 from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 
-from ..calibration.findings import Finding, finding
 from ..messages.drivers import TYPES_OF
+from ..verdict.reasons import Reason, finding
 
 # What ROS 2 calls a node whose topic is discovered before it is
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
-def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[Finding]:
+def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[Reason]:
     """What is wrong with the publishers of one of the node's inputs, and the remedy.
 
     type_parameter: the one that names the type of the topic, if it can be chosen.
@@ -51,7 +51,7 @@ def _other_type_remedy(name: str, type_parameter: str | None) -> str:
     return f"set {type_parameter} to it, or remap one of the two"
 
 
-def output_problems(node: Node, publisher: Any) -> list[Finding]:
+def output_problems(node: Node, publisher: Any) -> list[Reason]:
     """Which subscribers of one of the node's outputs do not hear it, and why."""
     problems = []
     for info in node.get_subscriptions_info_by_topic(publisher.topic_name):
@@ -61,7 +61,7 @@ def output_problems(node: Node, publisher: Any) -> list[Finding]:
     return problems
 
 
-def twin_problems(node: Node, publisher: Any) -> list[Finding]:
+def twin_problems(node: Node, publisher: Any) -> list[Reason]:
     """Whether others publish what the node alone should: their estimates mix, and their files replace each other."""
     publishers = node.get_publishers_info_by_topic(publisher.topic_name)
     if len(publishers) < 2:

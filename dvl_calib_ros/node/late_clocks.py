@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from ..calibration.findings import Finding, finding
 from ..calibration.parameters import Parameters
 from ..calibration.register.registration import ALIKE_S, OFFSETS, Registration
+from ..verdict.reasons import Reason, finding
 
 
 class LateClocks:
@@ -19,7 +19,7 @@ class LateClocks:
         """given: names of the parameters that the user named."""
         self._stands = bool(OFFSETS.keys() & set(given))
         self._before: Registration | None = None
-        self.found: list[Finding] = []
+        self.found: list[Reason] = []
 
     def parameters(self, registration: Registration | None, parameters: Parameters) -> Parameters | None:
         """The parameters to begin anew with, by the newest look; None for as they are."""

@@ -8,9 +8,9 @@ from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 
-from ..calibration.findings import Finding, finding
 from ..calibration.frames import quaternion_from_rotation
 from ..calibration.mounting_pose import MountingPose
+from ..verdict.reasons import Reason, finding
 from .transforms import Transforms
 
 
@@ -54,7 +54,7 @@ class MountingOutput:
             transforms.own(transform)
         self._broadcaster.sendTransform(transform)
 
-    def problems(self, dvl: str, transforms: Transforms | None) -> list[Finding]:
+    def problems(self, dvl: str, transforms: Transforms | None) -> list[Reason]:
         """Whether others publish a transform to frame `dvl` beside ours."""
         if self._broadcaster is not None and self._unknown_in:
             return [finding("POSITION_UNKNOWN", base=self._unknown_in)]

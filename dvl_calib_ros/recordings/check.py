@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Set
 
-from ..calibration.findings import Finding, finding
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES
+from ..verdict.reasons import Reason, finding
 from .recording import Recording
 from .topics import Topics
 
 
-def check_topics(recording: Recording, topics: Topics, found: list[Finding]) -> None:
+def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> None:
     """Raise InputError unless there is a DVL to be read; what else is missing is added to `found`."""
     present, where = recording.types, recording.where
     if not present:
@@ -31,7 +31,7 @@ def check_topics(recording: Recording, topics: Topics, found: list[Finding]) -> 
         found.append(finding("BAG_NO_IMU"))
 
 
-def _check_types(recording: Recording, topics: Topics, found: list[Finding]) -> None:
+def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> None:
     for role, wanted in _WANTED.items():
         name = getattr(topics, role)
         held = recording.held.get(name)

@@ -23,7 +23,6 @@ from ..calibration.comparison import (
 )
 from ..calibration.dropouts import DROPOUT_NS
 from ..calibration.extrinsics import Extrinsics
-from ..calibration.findings import Finding, finding
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.verification import Word
@@ -31,6 +30,7 @@ from ..errors import InputError
 from ..files.extrinsics import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together
 from ..recordings.topics import Topics
+from ..verdict.reasons import Reason, finding
 from .replay import Replayed, extrinsics_of_replay, replay
 
 # Files of one recording may overlap by what was on its way when the next began.
@@ -241,8 +241,8 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
 
 
 def _without_pauses(
-    findings: tuple[Finding, ...], counts: Mapping[str, Mapping[str, int]], pauses: int
-) -> tuple[tuple[Finding, ...], Mapping[str, Mapping[str, int]]]:
+    findings: tuple[Reason, ...], counts: Mapping[str, Mapping[str, int]], pauses: int
+) -> tuple[tuple[Reason, ...], Mapping[str, Mapping[str, int]]]:
     """Dropouts without the times between recordings."""
     dropouts = counts["dvl"]["dropouts"]
     left = max(dropouts - pauses, 0)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.findings import Finding, finding
 from ..calibration.frames import Array
 from ..calibration.kalman import GaussianState
 from ..calibration.results import Estimate
+from ..verdict.reasons import Reason, finding
 
 # Its rms (rad) is worth a word from here on, and where it is so many times its σ.
 SAID_FROM, SURELY = math.radians(0.3), 3.0
@@ -73,7 +73,7 @@ def comes_first(found: HeadingDeviation, estimate: Estimate) -> bool:
     return found.rms > FIRST or estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
 
 
-def heading_advice(found: HeadingDeviation | None) -> list[Finding]:
+def heading_advice(found: HeadingDeviation | None) -> list[Reason]:
     """What to say of it."""
     if found is None:
         return []

@@ -21,11 +21,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration.attitude_rates import LEVEL_BELOW
-from ..calibration.findings import Finding, finding
 from ..calibration.frames import Array, cross, skew
 from ..calibration.robust import median, robust_std
 from ..calibration.samples import Index
 from ..calibration.verification import Word
+from ..verdict.reasons import Reason, finding
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
 TILT_S = 1.0, 15.0
@@ -156,7 +156,7 @@ def left_over(
     )  # fmt: skip
 
 
-def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[tuple[Word, Finding]]:
+def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[tuple[Word, Reason]]:
     """What to say of it, and what it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.

@@ -18,7 +18,6 @@ from ..calibration.advice import data_advice, gate_advice, message_advice, one_h
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
-from ..calibration.findings import Finding, finding
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
@@ -36,6 +35,7 @@ from ..messages.drivers import REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.check import check_topics
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
+from ..verdict.reasons import Reason, finding
 from .clocks import StreamClocks
 from .heading_deviation import comes_first, heading_advice
 from .left_over import left_over_advice
@@ -65,7 +65,7 @@ class Replayed:
 
     result: Result
     notes: tuple[str, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[Reason, ...]
     dvl_frame: str
     history: RunHistory | None = None
     reference_frame: VelocityFrame | None = None
@@ -106,7 +106,7 @@ def replay(
     if not isinstance(recording, Recording):
         recording = open_recording(recording, topics, parameters)
     chosen = topics.found_in(recording.types)
-    found: list[Finding] = []
+    found: list[Reason] = []
     events: list[str] = []
     if parameters.prior_source == "initial_window":
         found.append(finding("PRIOR_HOLDS_ERROR"))
@@ -290,7 +290,7 @@ def _in_body(reference: SampleBlock, attitude: SampleBlock) -> Array:
     return velocity
 
 
-def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[Finding]:
+def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[Reason]:
     """What the counts say that a user should not overlook."""
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:

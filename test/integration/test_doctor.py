@@ -21,9 +21,9 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
-from dvl_calib_ros.examination.kinds import KINDS
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
+from dvl_calib_ros.verdict.doctor import DOCTOR
 
 SECOND = 1_000_000_000
 Row = tuple[str, int, Any]
@@ -264,7 +264,7 @@ def test_a_bag_without_a_dvl_is_refused_in_one_line(tmp_path, capsys):
 
 
 def test_every_finding_of_the_doctor_can_be_put_in_words():
-    for kind in KINDS.values():
+    for kind in DOCTOR:
         assert kind.code.startswith("DOCTOR_") and kind.means.endswith(".")
 
 

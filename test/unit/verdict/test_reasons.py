@@ -1,23 +1,25 @@
-"""Findings: the one table of warnings, its calls throughout the package, and its page in the documentation."""
+"""Reasons: the tables of what is said, their calls throughout the package, and their page in the documentation."""
 
 from __future__ import annotations
 
 import ast
+import json
 import string
 from functools import cache
 
+import numpy as np
 import pytest
 from conftest import ROOT
 from documentation import section
 
-from dvl_calib_ros.calibration.findings import FINDINGS, FindingKind, Severity, finding, finding_table
-from dvl_calib_ros.examination.kinds import KINDS
+from dvl_calib_ros.verdict.kinds import Kind, Severity
+from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, table
 
 PACKAGE = ROOT / "dvl_calib_ros"
-MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.name != "findings.py"]
+MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent.name != "verdict"]
 
 
-def fields(kind: FindingKind) -> set[str]:
+def fields(kind: Kind) -> set[str]:
     """What has to be put into its sentences."""
     parsed = string.Formatter().parse(kind.says + kind.remedy)
     return {name for _, name, _, _ in parsed if name}
@@ -57,21 +59,51 @@ def test_every_call_gives_its_entry_exactly_the_fields_it_has():
     calls = literal_calls()
     assert len(calls) > 25
     for code, names, more in calls:
-        wanted = fields(FINDINGS[code])
+        wanted = fields(KINDS[code])
         assert names <= wanted and (more or names == wanted), code
 
 
 def test_every_entry_of_the_table_is_said_somewhere():
     constants = {node.value for node in nodes() if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    assert [code for code in FINDINGS if code not in constants] == []
+    assert [code for code in KINDS if code not in constants] == []
 
 
 @pytest.mark.parametrize("code", ["lower_case", "WITH SPACE", ""])
 def test_a_code_is_one_word_in_capitals(code):
     with pytest.raises(ValueError, match="code"):
-        FindingKind(code, "a", "b", "c")
+        Kind(code, "a", "b", "c")
 
 
-@pytest.mark.parametrize(("name", "kinds"), [("findings", FINDINGS), ("doctor", KINDS)])
-def test_the_troubleshooting_page_has_the_tables(name, kinds):
-    assert section(name) == finding_table(kinds.values()).strip(), "take it from: python -m validation figures --render"
+@pytest.mark.parametrize("name", TABLES)
+def test_the_troubleshooting_page_has_the_tables(name):
+    assert section(name) == table(TABLES[name]).strip(), "take it from: python -m validation figures --render"
+
+
+def test_no_code_stands_in_two_tables():
+    codes = [kind.code for kinds in TABLES.values() for kind in kinds]
+    assert len(codes) == len(set(codes)) == len(KINDS) > 80
+
+
+def test_the_page_that_says_more_is_there_with_its_heading():
+    for page, _, anchor in {kind.page.partition("#") for kind in KINDS.values()}:
+        headings = [
+            line.lstrip("# ").lower() for line in (ROOT / "docs" / page).read_text().splitlines() if line[:1] == "#"
+        ]
+        assert anchor in {"-".join(heading.split()) for heading in headings}, (page, anchor)
+
+
+def test_json_has_the_numbers_as_numbers():
+    found = finding("CLOCK_OR_ARM", metres=np.float64(0.25), seconds=0.5).as_dict()
+    assert json.loads(json.dumps(found))["numbers"] == {"metres": 0.25, "seconds": 0.5}
+    assert found["page"] == "troubleshooting.md#all-warnings"
+    assert finding("RESULT_NOT_SAVED", reason=OSError("disk full")).as_dict()["numbers"] == {"reason": "disk full"}
+
+
+def test_the_worst_comes_first_and_of_equal_ones_the_first():
+    several = [
+        finding("DVL_DROPOUTS", count=1),
+        finding("GNSS_LOSSES", count=2),
+        finding("DOCTOR_UNITS", factor=3.0, guess=""),
+    ]
+    assert [each.code for each in by_severity(several)] == ["DOCTOR_UNITS", "DVL_DROPOUTS", "GNSS_LOSSES"]
+    assert by_severity([several[0], several[1].weighed(Severity.REJECT)])[0].code == "GNSS_LOSSES"

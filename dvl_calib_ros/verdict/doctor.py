@@ -1,158 +1,160 @@
-"""What the doctor can find wrong with a recording: every finding with its code, meaning and remedy, in one table."""
+"""What the doctor can find wrong with a recording: every finding with its code, meaning and remedy."""
 
 from __future__ import annotations
 
-from ..calibration.findings import Finding, FindingKind, Severity
+from dataclasses import replace
+
+from .kinds import Kind, Severity
 
 _KINDS = (
-    FindingKind(
+    Kind(
         "DOCTOR_STAMP_ZERO",
         "{topic}: {share:.0%} of the messages have no stamp",
         "header.stamp is zero; the time of reception stands in, which is late by the transport.",
         "let the driver fill header.stamp with the time of measurement",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_STAMP_RECEPTION",
         "{topic}: stamps jitter with the reception ({jitter_ms:.0f} ms about {period_ms:.0f} ms), not with the sensor",
         "The driver stamps when a message arrives, not when the sensor measured: late by transport, worse in turns.",
         "let the driver take the sensor's own time; then dvl-calib diagnose BAG shows what delay is left",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_STAMP_BACK",
         "{topic}: stamps go back {count} times, by up to {seconds:.1f} s",
         "A clock was set, two publishers share the topic, or the bag looped.",
         "set clocks before the recording; one publisher per topic",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_STAMP_JUMP",
         "{topic}: stamps jump ahead by {seconds:.1f} s while recording went on",
         "The clock of the driver was set during the recording; what comes after does not pair with the rest.",
         "set clocks before the recording, or cut the recording there",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_CLOCKS",
         "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
         "Two drivers stamp by different clocks, so that velocities of different times are compared.",
         "synchronise clocks (PTP, NTP or GNSS); {here}",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
         "One of them came only while the other did not, or a clock is off by more than the recording is long.",
         "record both at once; if they were, check the clocks, and for import the times of both files",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_REPEATED_STAMP",
         "{topic}: {share:.0%} of the stamps repeat the one before",
         "Two publishers, or a driver that sends everything twice.",
         "stop the second publisher (ros2 topic info -v {topic})",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_STANDING_STAMP",
         "{topic}: {share:.0%} of the stamps repeat the one before, so hardly a message can be used",
         "The driver fills header.stamp once, or from a clock that stands still.",
         "let the driver stamp every message with its time of measurement",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_TOO_FEW",
         "{topic}: {count} messages are too few",
         "It was hardly recorded; nothing can be said of it, nor learnt from it.",
         "record all topics for some minutes",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_GAPS",
         "{topic}: silent for {seconds:.1f} s in {count} gaps, the longest at {at_s:.0f} s",
         "The sensor, its cable, its fix or its driver dropped out.",
         "check power, cable, bottom lock and fix at that time",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_ZEROS",
         "{topic}: {share:.0%} of the velocities are exactly zero",
         "No sensor measures exactly nothing on three axes: the driver sends zeros without bottom lock.",
         "let the driver send nothing, or mark it invalid; these are not used",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_REFUSED",
         "{topic}: {share:.0%} of the messages are refused: {reason}",
         "The message itself says that it is not to be believed.",
         "{remedy}",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_FROZEN",
         "{topic}: {share:.0%} of the velocities repeat the one before exactly",
         "The driver sends its last value again while the sensor is silent or slower.",
         "let the driver send new measurements only; -p max_repeats:=1 leaves the others out",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_COVARIANCE",
         "{topic}: claims a noise of {claimed:.3g} m/s in every message, the data show {shown:.3g} m/s",
         "A constant of the driver, not the sensor's own figure: weights and standard deviations follow it.",
         "let the driver send the sensor's figure; for this bag: -p use_message_covariance:=false",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_AXIS",
         "{topic}: {axes} is exactly zero in every message: not measured",
         "Course and speed over ground have no vertical. It is no error, but that axis proves nothing.",
         "use a receiver's own velocity (three axes) if pitch matters",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_NOT_FINITE",
         "{topic}: {share:.0%} of the velocities are not finite",
         "The driver sends nan or infinity for want of a measurement.",
         "check lock or fix at that time; these are not used",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_NO_ORIENTATION",
         "{topic}: no orientation ({why})",
         "A reference in ENU or NED cannot be turned into the body, so the models with GNSS learn nothing.",
         "record the IMU's or INS's filtered topic, or a reference in the body frame",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_NO_IMU",
         "no IMU in the bag: {what}",
         "Attitude turns a velocity over ground into the body; turn rates take out what a lever arm adds in turns.",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_NO_IMU_EARTH",
         "no IMU in the bag: the reference is not in the body's frame, so it cannot be compared with the DVL",
         "Without an attitude, a velocity over ground says nothing of the DVL's axes.",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
         "One of them is not in m/s.",
         "let its driver convert to m/s",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_DISAGREE",
         "DVL and reference do not agree under any frames: {left:.0%} of the speed is left",
         "A wrong heading, clocks that differ by seconds, another vehicle's data, or a current in a water track.",
         "check the IMU's heading (yaw 0 is east and counts to the left), the stamps, and the DVL's bottom lock",
         Severity.ERROR,
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_FRAMES",
         "{said}",
         "What the recording declares and what its data show are not the same.",
         "check frames and transforms; the option named insists",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_SLOW_REFERENCE",
         "{topic}: {rate_hz:.2g} Hz is too slow for turns",
         "Between two reference samples the velocity is taken as a straight line.",
         "set the receiver to 1 Hz or more, better 5 Hz",
     ),
-    FindingKind(
+    Kind(
         "DOCTOR_NOT_MOVING",
         "{topic}: the vehicle does not move faster than min_speed ({min_speed:g} m/s)",
         "Nothing can be learnt at rest.",
@@ -160,10 +162,4 @@ _KINDS = (
         Severity.ERROR,
     ),
 )  # fmt: skip
-KINDS = {kind.code: kind for kind in _KINDS}
-
-
-def named(code: str, **fields: object) -> Finding:
-    """The doctor's finding of this code, filled in. Raises KeyError for an unknown code or a missing field."""
-    kind = KINDS[code]
-    return Finding(code, kind.severity, kind.says.format(**fields), kind.remedy.format(**fields))
+DOCTOR = tuple(replace(kind, page="troubleshooting.md#what-the-doctor-finds") for kind in _KINDS)

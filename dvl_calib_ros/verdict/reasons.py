@@ -1,0 +1,94 @@
+"""What is said of data, configuration, network and result: a code, how bad it is, and the numbers.
+
+Its sentence, remedy and page come from the tables beside this module. Terminal, report, JSON, /diagnostics and docs
+speak from them, so a sentence is mended in one place. Codes are stable: users search for them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from .doctor import DOCTOR
+from .findings import FINDINGS
+from .kinds import Kind, Severity
+
+_FIELD = re.compile(r"\{[^{}]*\}")
+# What each table is of.
+TABLES: Mapping[str, Sequence[Kind]] = {"findings": FINDINGS, "doctor": DOCTOR}
+KINDS: Mapping[str, Kind] = {kind.code: kind for kinds in TABLES.values() for kind in kinds}
+# The worst first.
+_WORST_FIRST = (Severity.ERROR, Severity.REJECT, Severity.MARGINAL, Severity.WARNING, Severity.ACCEPT)
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Something that was found: an entry of the tables with what was put in. ``str()`` of it is what people read."""
+
+    code: str
+    severity: Severity
+    numbers: Mapping[str, Any]
+
+    @property
+    def says(self) -> str:
+        """What is the matter."""
+        return KINDS[self.code].says.format(**self.numbers)
+
+    @property
+    def remedy(self) -> str:
+        """What to do; '' where there is nothing to do."""
+        return KINDS[self.code].remedy.format(**self.numbers)
+
+    @property
+    def page(self) -> str:
+        """Where the documentation says more."""
+        return KINDS[self.code].page
+
+    def __str__(self) -> str:
+        remedy = self.remedy
+        return f"{self.says}; {remedy} [{self.code}]" if remedy else f"{self.says} [{self.code}]"
+
+    def weighed(self, severity: Severity) -> Reason:
+        """The same, as bad as this."""
+        return replace(self, severity=severity)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain data, for JSON."""
+        return {
+            "code": self.code,
+            "severity": self.severity.value,
+            "says": self.says,
+            "remedy": self.remedy,
+            "page": self.page,
+            "numbers": {name: _plain(value) for name, value in self.numbers.items()},
+        }
+
+
+def finding(code: str, **numbers: object) -> Reason:
+    """The entry of this code with its numbers. Raises KeyError for an unknown code or a missing number."""
+    found = Reason(code, KINDS[code].severity, numbers)
+    str(found)  # a number that is missing is an error here, not where it is read
+    return found
+
+
+def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
+    """The worst first, else in the order that they came in."""
+    return sorted(reasons, key=lambda each: _WORST_FIRST.index(each.severity))
+
+
+def table(kinds: Iterable[Kind]) -> str:
+    """A table of the documentation, in Markdown; … stands for what is put in."""
+    lines = ["| code | it says | which means | what to do |", "|---|---|---|---|"]
+    for kind in kinds:
+        code = f"`{kind.code}`" + ("" if kind.severity is Severity.WARNING else f" ({kind.severity.value})")
+        cells = (_FIELD.sub("…", text).replace("|", "\\|") for text in (kind.says, kind.means, kind.remedy))
+        lines.append(f"| {code} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _plain(value: object) -> object:
+    """For JSON: a number as one, a truth value as one, all else as its words."""
+    value = value.item() if hasattr(value, "item") else value
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
