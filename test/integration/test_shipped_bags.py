@@ -17,6 +17,8 @@ COMMANDS = [
     shlex.split(line)[1:] for line in (BAGS / "README.md").read_text().splitlines() if line.startswith("dvl-calib ")
 ]
 SIMULATED = {command[1]: command for command in COMMANDS if command[0] == "simulate"}
+# Keys of what is said in words: their codes and numbers stand beside them.
+WORDS = ("says", "remedy", "reasons")
 REPLAYED = {command[command.index("--json") + 1]: command for command in COMMANDS if command[0] == "replay"}
 
 
@@ -56,6 +58,7 @@ def test_the_estimates_of_a_shipped_bag_are_the_committed_ones(golden, tmp_path,
         for key in ("state", "covariance"):
             np.testing.assert_allclose(now["models"][name].pop(key), model.pop(key), rtol=1e-9, atol=1e-12)
     found, expected = [], []
+    # codes and numbers; the words are the snapshot's (test/unit/verdict)
     assert without_numbers(now, found) == without_numbers(then, expected)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
@@ -63,7 +66,7 @@ def test_the_estimates_of_a_shipped_bag_are_the_committed_ones(golden, tmp_path,
 def without_numbers(document, numbers):
     """A document whose floats are put into a list: another build of NumPy may give another last bit."""
     if isinstance(document, dict):
-        return {key: without_numbers(value, numbers) for key, value in document.items()}
+        return {key: without_numbers(value, numbers) for key, value in document.items() if key not in WORDS}
     if isinstance(document, list):
         return [without_numbers(value, numbers) for value in document]
     if isinstance(document, float):
