@@ -1,7 +1,7 @@
 """Calibrate a Doppler velocity log before a dive: live on ROS 2 Jazzy and over recorded bags.
 
-The public interface, which is `api`: replay, compare, doctor, diagnose, simulate, evaluate, and what they take and
-give. It is imported when it is asked for, since the command line must not wait for NumPy to print its help.
+The public interface, which is `api`: what the commands do, as functions, and what they take and give. It is imported
+when it is asked for, since the command line must not wait for NumPy to print its help.
 """
 
 import sys as _sys
@@ -17,11 +17,16 @@ if TYPE_CHECKING:
         ParameterError,
         Parameters,
         Scenario,
+        apply,
         compare,
         diagnose,
         doctor,
         evaluate,
+        export,
+        import_files,
         replay,
+        report,
+        salvage,
         simulate,
     )
 
@@ -32,11 +37,16 @@ __all__ = [
     "ParameterError",
     "Parameters",
     "Scenario",
+    "apply",
     "compare",
     "diagnose",
     "doctor",
     "evaluate",
+    "export",
+    "import_files",
     "replay",
+    "report",
+    "salvage",
     "simulate",
 ]
 
@@ -57,21 +67,25 @@ def _version() -> str:
 __version__ = _version()
 
 
+# Subpackages that have the name of a public function
+_ALSO_FUNCTIONS = ("export", "replay", "report")
+
+
 class _Callable(_ModuleType):
-    """The subpackage `replay`, which has the public function's name: called, it is `api.replay`."""
+    """A subpackage that has a public function's name: called, it is that function of `api`."""
 
-    def __call__(self, *bags: object, **options: object) -> object:
-        """See `dvl_calib_ros.api.replay`."""
-        from .api import replay
+    def __call__(self, *given: object, **options: object) -> object:
+        """See the function of that name in `dvl_calib_ros.api`."""
+        from . import api
 
-        return replay(*bags, **options)  # type: ignore[arg-type]
+        return getattr(api, self.__name__.rpartition(".")[2])(*given, **options)
 
 
 class _Package(_ModuleType):
-    """This package: importing any module of `replay` sets that name to the subpackage, which stays callable."""
+    """This package: importing a module of such a subpackage sets the name to it, and it stays callable."""
 
     def __setattr__(self, name: str, value: object) -> None:
-        if name == "replay" and isinstance(value, _ModuleType):
+        if name in _ALSO_FUNCTIONS and isinstance(value, _ModuleType):
             value.__class__ = _Callable
         super().__setattr__(name, value)
 
@@ -84,8 +98,8 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib
 
-    if name == "replay":  # a subpackage, which is callable
-        return importlib.import_module(".replay", __name__)
+    if name in _ALSO_FUNCTIONS:
+        return importlib.import_module(f".{name}", __name__)
     return getattr(importlib.import_module(".api", __name__), name)
 
 

@@ -39,7 +39,7 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "demo": (*_READ, "files", "node"),
     "api": (
         *_READ, "parallel", "disk", "files", "discovery", "examination", "replay", "diagnosis", "unpaired",
-        "simulation", "evaluation", "report",
+        "export", "simulation", "evaluation", "report",
     ),
     "cli": (
         *_READ, "streams", "parallel", "disk", "files", "effects", "discovery", "examination", "replay", "diagnosis",

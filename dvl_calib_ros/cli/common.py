@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
@@ -216,9 +215,9 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def write_json(path: Path, document: Any) -> None:
     """Write JSON, whole or not at all."""
-    from ..disk.atomic import save_text
+    from ..disk.json_files import write_json as write
 
-    save_text(path, as_json(document))
+    write(path, document)
 
 
 def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Path], object]]) -> None:
@@ -244,19 +243,6 @@ def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Pa
         give_up(sys.stdout)
     if failed:
         raise InputError("; ".join(failed))
-
-
-def as_json(document: Any) -> str:
-    """JSON, in which numbers that are not finite are null."""
-    return json.dumps(_finite(document), indent=1, allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def estimate_cells(estimate: Estimate) -> list[str]:

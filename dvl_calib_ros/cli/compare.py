@@ -81,20 +81,15 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
 
     if not is_bag(path):
         return load_extrinsics(path, name)
-    from ..errors import InputError
-    from ..replay.replay import extrinsics_of_replay, replay
+    from ..replay.compared import calibrated
 
     parameters = common.load(arguments)
     recording = common.opened([path], parameters)
     discovery = common.discovered(arguments, recording, parameters)
     with common.progress(f"replaying {name}") as on_progress:
-        replayed = replay(recording, discovery.parameters, discovery.topics, on_progress, judged=False)
-    known = {str(each) for each in replayed.findings}
-    common.print_warnings([note for note in replayed.notes if note not in known])  # what is damaged or missing
-    found = extrinsics_of_replay(replayed, name)
-    if found is None:
-        raise InputError(f"{path}: no sample of it could be used to calibrate; ask dvl-calib doctor {path}")
-    return found
+        found = calibrated(recording, discovery.parameters, discovery.topics, name, on_progress)
+    common.print_warnings(found.notes)
+    return found.extrinsics
 
 
 # ------------------------------------------------------------------ tables

@@ -31,23 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read, write both files, print."""
-    from .. import __version__
-    from ..disk.atomic import own_stream, save_all
-    from ..export.description import load_description
-    from ..export.simulator import export, export_document
-    from ..export.simulators import SIMULATORS
+    from ..export.simulators import missing_beside, write_settings
 
-    missing = None
-    if own_stream(arguments.output) is None:
-        missing = arguments.output.with_name(f"{arguments.output.name}.missing.json")
+    missing = missing_beside(arguments.output)
     beside = {} if missing is None else {"--output, for what is missing,": missing}
     common.check_outputs(arguments, "output", also_written=beside)
-    description = load_description(arguments.source)
-    exported = export(arguments.simulator, SIMULATORS[arguments.simulator], description)
-    files = {arguments.output: exported.settings.text.encode()}
-    if missing is not None:
-        files[missing] = common.as_json(export_document(exported, description, __version__)).encode()
-    save_all(files)
+    exported = write_settings(arguments.simulator, arguments.source, arguments.output)
     if missing is not None:
         _print(exported, arguments)
 

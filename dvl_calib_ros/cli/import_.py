@@ -40,28 +40,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Import one recording, or a folder of them."""
     from ..bags.writer import Compression, Storage
-    from ..errors import InputError
-    from ..files.trajectories import ImportOptions, import_folder, import_recording
+    from ..files.trajectories import ImportOptions, import_files
 
-    if not 0.0 <= arguments.start < 2.0**31:
-        raise InputError("--start: give seconds since 1970, 0 .. 2147483647")
     options = ImportOptions(
         frame=arguments.frame,
         gnss_frame=arguments.gnss_frame,
         dvl_std=arguments.dvl_std,
         gnss_std=arguments.gnss_std,
-        start_ns=round(arguments.start * 1e9),
+        start=arguments.start,
         storage=Storage(arguments.storage),
         compression=Compression(arguments.compression),
     )
     common.check_outputs(arguments, folders=["output"])
-    if arguments.dvl.is_dir():
-        if arguments.gnss or arguments.attitude:
-            raise InputError("--gnss and --attitude go with a file; in a folder they are found by their names")
-        written = import_folder(arguments.dvl, arguments.output, options)
-    else:
-        imported = import_recording(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
-        written = {arguments.output: imported}
+    written = import_files(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
     common.print_warnings([note for imported in written.values() for note in imported.notes])
     for path, (counts, _) in written.items():
         print(f"{path}: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count))

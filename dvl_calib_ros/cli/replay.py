@@ -36,12 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Look into the bags, replay them, save, print."""
-    from ..calibration.comparison import comparison_document
     from ..calibration.models import MODELS
     from ..files.result_file import result_document, save_result
     from ..replay.checked import checked_replay
-    from ..replay.navigation import navigation_document
-    from ..replay.replay import replay_document
+    from ..replay.document import replay_document
 
     asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
     models = list(MODELS) if arguments.verbose or not asked else asked
@@ -62,17 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
     result = replayed.result
 
     def write(path: Path) -> None:
-        common.write_json(
-            path,
-            replay_document(result, models)
-            | {
-                "dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned},
-                "findings": [found.as_dict() for found in replayed.findings],
-                "recordings": None if replayed.recordings is None else comparison_document(replayed.recordings),
-                "discovery": discovery.document(),
-                "navigation": navigation_document(replayed.navigation),
-            },
-        )
+        common.write_json(path, replay_document(replayed, models) | {"discovery": discovery.document()})
 
     def save(path: Path) -> None:
         document = result_document(result, replayed.dvl_frame, replayed.turned)

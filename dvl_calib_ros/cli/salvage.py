@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from pathlib import Path
 
 from . import common
-
-PROGRESS_EVERY = 1000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,24 +17,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, say what was lost."""
-    from ..bags.reader import BagReader
-    from ..bags.writer import BagWriter, Compression, Storage
-    from ..errors import InputError, printable
+    from ..bags.recover import recover
+    from ..bags.writer import Compression, Storage
+    from ..errors import printable
 
     common.check_outputs(arguments, folders=["output"])
-    counts: Counter[str] = Counter()
-    with BagReader(arguments.bags) as reader:
-        topics, total = reader.topics, max(sum(reader.message_counts.values()), 1)
-        if not topics:
-            raise InputError(f"{', '.join(map(str, arguments.bags))}: there is no message in it; record it again")
-        writer = BagWriter(arguments.output, Storage(arguments.storage), Compression(arguments.compression))
-        with common.progress("salvaging") as on_progress, writer:
-            for number, (log_ns, channel, data) in enumerate(reader.raw_messages(topics)):
-                writer.raw(channel, log_ns, data)
-                counts[channel.topic] += 1
-                if number % PROGRESS_EVERY == 0:
-                    on_progress(number / total)
-        common.print_warnings(reader.notes)
-    for topic, count in sorted(counts.items()):
+    storage, compression = Storage(arguments.storage), Compression(arguments.compression)
+    with common.progress("salvaging") as on_progress:
+        recovered = recover(arguments.bags, arguments.output, storage, compression, on_progress)
+    common.print_warnings(recovered.notes)
+    for topic, count in recovered.counts.items():
         print(printable(f"{topic}: {count} messages"))
-    print(f"{arguments.output}: {counts.total()} messages")
+    print(f"{arguments.output}: {sum(recovered.counts.values())} messages")

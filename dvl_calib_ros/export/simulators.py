@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
+from .. import __version__
+from ..disk.atomic import own_stream, save_all
+from ..disk.json_files import as_json
+from ..errors import InputError
 from . import dave, dvl_simulator, gazebo, holoocean, stonefish, uuv_simulator
-from .simulator import Simulator
+from .description import load_description
+from .simulator import Export, Simulator, export, export_document
 
 SIMULATORS: Mapping[str, Simulator] = {
     "gazebo": gazebo.SIMULATOR,
@@ -15,3 +21,25 @@ SIMULATORS: Mapping[str, Simulator] = {
     "dave": dave.SIMULATOR,
     "uuv_simulator": uuv_simulator.SIMULATOR,
 }
+
+
+def missing_beside(output: Path) -> Path | None:
+    """Where what a simulator cannot represent is written to; None beside a stream."""
+    return None if own_stream(output) is not None else output.with_name(f"{output.name}.missing.json")
+
+
+def write_settings(simulator: str, source: Path, output: Path) -> Export:
+    """Write what a source says of a DVL as the settings of a simulator, and beside it what that cannot represent.
+
+    source: a diagnosis (JSON), a result or a parameter file (YAML). Both files are written or none. Raises InputError.
+    """
+    if simulator not in SIMULATORS:
+        raise InputError(f"{simulator!r} is none of {', '.join(SIMULATORS)}")
+    description = load_description(source)
+    exported = export(simulator, SIMULATORS[simulator], description)
+    files = {output: exported.settings.text.encode()}
+    missing = missing_beside(output)
+    if missing is not None:
+        files[missing] = as_json(export_document(exported, description, __version__)).encode()
+    save_all(files)
+    return exported

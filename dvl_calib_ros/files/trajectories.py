@@ -27,6 +27,7 @@ from ..messages.encode import SampleWriter
 from .dvl_logs import is_dvl_log, read_dvl_log
 
 N_COLUMNS = 4
+FRAMES = ("frd", "flu", "enu", "ned")  # those of a body first
 SUFFIXES = ("csv", "npy")
 # What is written in a cell where there is no value, beside nan
 NO_VALUE = ("", "na", "n/a", "null", "none", "-")
@@ -222,14 +223,14 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
 class ImportOptions:
     """How recordings become bags: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given).
 
-    Raises InputError.
+    start: stamp of time 0, s since 1970. Raises InputError.
     """
 
     frame: str = "frd"
     gnss_frame: str = "frd"
     dvl_std: float = 0.0
     gnss_std: float = 0.0
-    start_ns: int = 1_600_000_000_000_000_000
+    start: float = 1_600_000_000.0
     storage: Storage = Storage.MCAP
     compression: Compression = Compression.NONE
 
@@ -237,6 +238,16 @@ class ImportOptions:
         for name, std in (("--dvl-std", self.dvl_std), ("--gnss-std", self.gnss_std)):
             if not 0.0 <= std <= 100.0:
                 raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
+        if not 0.0 <= self.start < 2.0**31:
+            raise InputError("--start: give seconds since 1970, 0 .. 2147483647")
+        for option, given, known in (("--frame", self.frame, FRAMES[:2]), ("--gnss-frame", self.gnss_frame, FRAMES)):
+            if given not in known:
+                raise InputError(f"{option}: {given!r} is none of {', '.join(known)}")
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of time 0, ns."""
+        return round(self.start * 1e9)
 
 
 class Imported(NamedTuple):
@@ -247,6 +258,17 @@ class Imported(NamedTuple):
 
     counts: dict[str, int]
     notes: tuple[str, ...] = ()
+
+
+def import_files(
+    dvl: Path, gnss: Path | None, attitude: Path | None, output: Path, options: ImportOptions
+) -> dict[Path, Imported]:
+    """Write one recording to a new bag, or of a folder each to one in `output`. Raises InputError."""
+    if not dvl.is_dir():
+        return {output: import_recording(dvl, gnss, attitude, output, options)}
+    if gnss is not None or attitude is not None:
+        raise InputError("--gnss and --attitude go with a file; in a folder they are found by their names")
+    return import_folder(dvl, output, options)
 
 
 def import_recording(

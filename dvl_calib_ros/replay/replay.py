@@ -6,14 +6,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import __version__
 from ..calibration.advice import data_advice, gate_advice, message_advice, one_heading_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
@@ -27,9 +25,9 @@ from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..calibration.told_arm import told_arm_advice
-from ..calibration.verification import Word, verification_document
+from ..calibration.verification import Word
 from ..errors import InputError
-from ..files.result_file import days_document, estimate_document, load_initial_calibration
+from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.check import check_topics
@@ -312,27 +310,3 @@ def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
 
 def _counted(counts: Any) -> str:
     return ", ".join(f"{value} {name}" for name, value in counts.items() if value) or "none received"
-
-
-def replay_document(result: Result, models: Sequence[str]) -> dict[str, Any]:
-    """`replay --json`: plain data of the models asked for. Segments are in s since the first DVL sample."""
-    segments = []
-    with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
-        ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
-        segments = [
-            {
-                "from_s": (segment.from_ns - result.first_ns) * 1e-9,  # type: ignore[operator]
-                "to_s": (end - result.first_ns) * 1e-9,  # type: ignore[operator]
-                "model": segment.model,
-            }
-            for segment, end in zip(result.segments, ends, strict=True)
-        ]
-    return {
-        "models": {name: estimate_document(result.estimates[name]) for name in models},
-        "verification": {name: verification_document(result.verifications[name]) for name in models},
-        "selected": segments,
-        **days_document(result),
-        "counts": {name: dict(counts) for name, counts in result.counts.items()},
-        "parameters": dict(result.parameters),
-        "version": __version__,
-    }

@@ -121,6 +121,7 @@ def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
         ({"lever_arm": {"xm": 0.5}}, "did you mean 'x_m'"),
         ({"lever_arm": {"x_m": "far"}}, "is no number"),
         ({"lever_arm": {}}, "does nothing"),
+        (["lever_arm"], "effects are by name"),
     ):
         with pytest.raises(dc.InputError, match=message):
             dc.simulate(tmp_path / "none", effects=wrong)
@@ -140,6 +141,70 @@ def test_topics_are_named_for_an_evaluation_as_for_a_replay(bag, tmp_path):
     assert checked.models == ("G1",)
     with pytest.raises(dc.InputError, match="no sample has a reference"):
         dc.evaluate([bag, other], models=["G1"], gnss_topic="nowhere")
+
+
+def test_a_damaged_recording_is_salvaged_as_by_the_command(bag, tmp_path):
+    recovered = dc.salvage(bag, tmp_path / "whole", storage="sqlite3")
+    assert recovered.notes == () and min(recovered.counts.values()) > 100
+    assert dc.replay(tmp_path / "whole", history=False).mounting == dc.replay(bag, history=False).mounting
+    with pytest.raises(dc.InputError, match="exists already"):
+        dc.salvage(bag, tmp_path / "whole")
+    with pytest.raises(dc.InputError, match="storage is one of mcap, sqlite3"):
+        dc.salvage(bag, tmp_path / "other", storage="paper")
+
+
+def test_files_are_imported_as_by_the_command(tmp_path):
+    dvl = tmp_path / "t_dvl.csv"
+    dvl.write_text("".join(f"{0.2 * k},1.5,0.0,0.0\n" for k in range(100)))
+    made = dc.import_files(dvl, tmp_path / "bag", gnss=dvl, start=1_700_000_000.0)
+    assert made[tmp_path / "bag"].counts["dvl/twist"] == 100
+    assert main(["import", str(dvl), "--gnss", str(dvl), "--start", "1700000000", "-o", str(tmp_path / "same")]) == 0
+    assert dc.doctor(tmp_path / "bag").document()["verdict"] == dc.doctor(tmp_path / "same").document()["verdict"]
+    for wrong, message in (
+        ({"frame": "enu"}, "'enu' is none of frd, flu"),
+        ({"start": -1.0}, "since 1970"),
+        ({"attitude": dvl}, "in a folder they are found by their names"),
+    ):
+        with pytest.raises(dc.InputError, match=message):
+            dc.import_files(tmp_path if "attitude" in wrong else dvl, tmp_path / "none", **wrong)
+
+
+def test_what_was_found_is_exported_as_by_the_command(calibration, tmp_path, capsys):
+    saved = calibration.save(tmp_path / "c.yaml")
+    made = dc.export("gazebo", saved, tmp_path / "dvl.sdf")
+    succeed(capsys, "export", "gazebo", saved, "-o", tmp_path / "same.sdf")
+    assert (tmp_path / "dvl.sdf").read_text() == (tmp_path / "same.sdf").read_text() == made.settings.text
+    assert (tmp_path / "dvl.sdf.missing.json").is_file()
+    with pytest.raises(dc.InputError, match="none of gazebo"):
+        dc.export("matlab", saved, tmp_path / "none")
+
+
+def test_results_become_pages_and_json(calibration, bag, tmp_path, capsys):
+    assert dc.report(calibration, tmp_path / "r.html").read_text().startswith("<!DOCTYPE html>")
+    both = ["--json", tmp_path / "command.json", "--report", tmp_path / "command.html"]  # which keeps the history, too
+    succeed(capsys, "replay", bag, *both)
+    dc.report(calibration, tmp_path / "r.json")
+    assert json.loads((tmp_path / "r.json").read_text()) == json.loads((tmp_path / "command.json").read_text())
+    examined = dc.doctor(bag)
+    assert json.loads(dc.report(examined, tmp_path / "d.json").read_text())["verdict"] == "yes"
+    checked = dc.evaluate([bag, dc.simulate(tmp_path / "made", seconds=60.0)], models=["G1"])
+    dc.report(checked, tmp_path / "c.html")
+    for wrong, message in ((examined, "has no page"), ("yes", "str is no result")):
+        with pytest.raises(dc.InputError, match=message):
+            dc.report(wrong, tmp_path / "x.html")
+
+
+def test_a_calibration_is_applied_to_all_files_or_none(calibration, tmp_path):
+    saved = calibration.save(tmp_path / "c.yaml")
+    params, launch = tmp_path / "p.yaml", tmp_path / "l.xml"
+    assert dc.apply(saved).written == ()
+    assert dc.apply(saved, params=params).written == (params,)
+    assert dc.apply(saved, params=params).unchanged == (params,)
+    with pytest.raises(dc.InputError, match="no such URDF"):
+        dc.apply(saved, urdf=tmp_path / "none.urdf", launch=launch)
+    assert not launch.exists()
+    with pytest.raises(dc.InputError, match="go with --urdf"):
+        dc.apply(saved, joint="dvl")
 
 
 def test_a_saved_calibration_is_one_that_apply_takes(calibration, tmp_path, capsys):

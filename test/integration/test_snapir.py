@@ -118,8 +118,8 @@ def test_three_recordings_together_are_accepted_with_one_lever_arm_and_a_delay_f
     bags = []
     for day, name in enumerate(("T01", "T03", "T05")):
         files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
-        start_ns = (1_700_000_000 + 86_400 * day) * 1_000_000_000
-        options = ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01, start_ns=start_ns)
+        start = 1_700_000_000.0 + 86_400.0 * day
+        options = ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01, start=start)
         import_recording(*files, tmp_path / name, options)
         bags.append(tmp_path / name)
     replayed = checked_replay(bags, Parameters())

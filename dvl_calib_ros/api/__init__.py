@@ -1,0 +1,497 @@
+"""The library's public interface: what the commands do, as functions that give dataclasses.
+
+    import dvl_calib_ros as dc
+    run = dc.replay("my_bag")
+    run.mounting
+    run.plot()
+
+Angles in degrees and lengths in metres where a name says so, else SI. Errors of files, topics and values are
+`InputError`, of parameters `ParameterError`, each one sentence with the remedy. (Long, because it is a table of
+functions with their documentation.)
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace as with_values
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..calibration.models import MODELS
+from ..calibration.parameters import ParameterError, Parameters
+from ..diagnosis.results import Diagnosis
+from ..discovery.discover import Discovery, Given, discover
+from ..errors import InputError
+from ..examination.examine import Examination
+from ..recordings.recording import Recording, open_recording
+from ..simulation.scenario import Scenario
+from .calibrated import Calibration, Mounting
+
+if TYPE_CHECKING:
+    from ..bags.recover import Recovered
+    from ..bags.writer import Compression, Storage
+    from ..calibration.comparison import Comparison
+    from ..evaluation.bags import CrossCheck
+    from ..evaluation.results import Evaluation
+    from ..export.simulator import Export
+    from ..files.applying import Applied
+    from ..files.trajectories import Imported
+    from ..unpaired.results import UnpairedComparison
+
+__all__ = [
+    "Calibration",
+    "InputError",
+    "Mounting",
+    "ParameterError",
+    "Parameters",
+    "Scenario",
+    "apply",
+    "compare",
+    "diagnose",
+    "doctor",
+    "evaluate",
+    "export",
+    "import_files",
+    "replay",
+    "report",
+    "salvage",
+    "simulate",
+]
+StrPath = str | os.PathLike[str]
+Bags = StrPath | Sequence[StrPath]
+
+
+def replay(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    history: bool = True,
+    merge: bool = False,
+    **parameters: Any,
+) -> Calibration:
+    """Calibrate with recorded bags, as ``dvl-calib replay`` does.
+
+    Parameters
+    ----------
+    bags
+        A rosbag2 folder, a .mcap or .db3 file, or several of them, which are read as one.
+    dvl_topic, gnss_topic, imu_topic
+        Topics; found by type, name and content where not named. gnss_topic, imu_topic: "none" does without.
+    params
+        A ROS 2 parameter file.
+    history
+        Keep the run over time, for `Calibration.plot`, `to_pandas` and `report`.
+    merge
+        Take several bags together even if the mounting moved between them.
+    **parameters
+        Any of the node's parameters, in SI units, such as ``mounting_rpy=(0, 0, 0.785)``.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For what is no bag, has no DVL, or cannot be a parameter.
+    """
+    from ..replay.checked import checked_replay
+
+    paths = _paths(bags)
+    recording, discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
+    replayed = checked_replay(recording, discovery.parameters, discovery.topics, merge=merge, with_history=history)
+    return Calibration(replayed, discovery, tuple(paths))
+
+
+def compare(
+    *results: StrPath | Calibration,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Comparison:
+    """Compare calibrations of one DVL, as ``dvl-calib compare``: has the mounting moved?
+
+    Parameters
+    ----------
+    *results
+        Result files, bags, or what `replay` gave; two or more. A bag is calibrated first.
+    dvl_topic, gnss_topic, imu_topic, params, **parameters
+        Of bags, as of `replay`.
+
+    Returns
+    -------
+    Comparison
+        ``word``: same, suspicious or moved, and all that is behind it; `calibration.comparison` has its `sentences`.
+
+    Raises
+    ------
+    InputError
+        For what is no result file, holds no sample, is one of the others, or has nothing in common with them.
+    """
+    from ..bags.files import is_bag
+    from ..calibration.comparison import check_distinct
+    from ..calibration.comparison import compare as run
+    from ..files.extrinsics import load_extrinsics
+    from ..replay.compared import calibrated
+    from ..replay.replay import extrinsics_of_replay
+
+    found = []
+    for given in results:
+        if isinstance(given, Calibration):
+            name = ", ".join(map(str, given.bags))
+            extrinsics = extrinsics_of_replay(given.replayed, name)
+            if extrinsics is None:
+                raise InputError(f"{name}: no sample of it could be used to calibrate; leave it out")
+            found.append(extrinsics)
+        elif is_bag(Path(given)):
+            topics = (dvl_topic, gnss_topic, imu_topic)
+            recording, discovery = _discovered([Path(given)], topics, params, parameters)
+            found.append(calibrated(recording, discovery.parameters, discovery.topics, str(given)).extrinsics)
+        else:
+            found.append(load_extrinsics(Path(given), str(given)))
+    check_distinct(found)
+    return run(found)
+
+
+def doctor(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Examination:
+    """Say what is in recordings, what is wrong with them, and whether they can calibrate; arguments as `replay`."""
+    from ..examination.examine import examine
+
+    merged, names = _parameters(params, parameters)
+    return examine(_paths(bags), merged, Given(dvl_topic, gnss_topic, imu_topic, names))
+
+
+def diagnose(
+    bags: Bags,
+    *,
+    simulator: Bags | None = None,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Diagnosis | UnpairedComparison:
+    """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``.
+
+    Parameters
+    ----------
+    bags, dvl_topic, gnss_topic, imu_topic, params, **parameters
+        As of `replay`.
+    simulator
+        Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
+
+    Raises
+    ------
+    InputError, ParameterError
+        As `replay`.
+    """
+    topics = (dvl_topic, gnss_topic, imu_topic)
+    sides = [
+        _discovered(_paths(each), topics, params, {"min_speed": 0.0} | parameters)
+        for each in ([bags] if simulator is None else [bags, simulator])
+    ]
+    if simulator is not None:
+        from ..unpaired.compare import compare as against
+        from ..unpaired.logs import Source
+
+        real, made = (Source(recording, found.parameters, found.topics) for recording, found in sides)
+        return against(real, made)
+    from ..diagnosis.diagnose import diagnose as run
+
+    ((recording, discovery),) = sides
+    return run(recording, discovery.parameters, discovery.topics)
+
+
+def simulate(
+    bag: StrPath,
+    scenario: Scenario | None = None,
+    *,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    **scenario_fields: Any,
+) -> Path:
+    """Write a simulated bag, as ``dvl-calib simulate``.
+
+    Parameters
+    ----------
+    bag
+        Folder to write; must not exist.
+    scenario
+        What to simulate; by default ten minutes along a box.
+    effects
+        By name, each with its parameters, such as ``{"lever_arm": {"x_m": 0.5}}``.
+    **scenario_fields
+        Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
+
+    Raises
+    ------
+    InputError
+        If the bag exists, or cannot be written; for an effect or parameter that there is not.
+    """
+    from ..bags.writer import Compression, Storage
+    from ..simulation.injection import injection_of
+    from ..simulation.scenario import write_bag
+
+    if scenario is not None and scenario_fields:
+        raise InputError("simulate: give a scenario or fields of one, not both")
+    target, made = Path(bag), scenario or Scenario(**scenario_fields)
+    if effects is not None:
+        if not isinstance(effects, Mapping):
+            raise InputError("simulate: effects are by name, such as {'lever_arm': {'x_m': 0.5}}")
+        made = with_values(made, effects=tuple(injection_of(name, given) for name, given in effects.items()))
+    write_bag(made, target, Storage.MCAP, Compression.NONE, with_truth=True)
+    return target
+
+
+def evaluate(
+    paths: Bags | None = None,
+    *,
+    models: Sequence[str] | None = None,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    **parameters: Any,
+) -> Evaluation | CrossCheck:
+    """Evaluate the models, as ``dvl-calib evaluate``.
+
+    Parameters
+    ----------
+    paths
+        A folder of trajectories for the published procedure, None for the project's own trajectories, or two bags and
+        more, of which each calibrates and all others verify.
+    models
+        Names; all by default.
+    dvl_topic, gnss_topic, imu_topic
+        Of bags; those of `dvl-calib simulate` where not named.
+    **parameters
+        Any of the node's parameters, in SI units.
+    """
+    from ..evaluation.bags import cross_check
+    from ..evaluation.evaluate import DEFAULTS, EVALUATED
+    from ..evaluation.evaluate import evaluate as run
+    from ..parallel import Workers
+    from ..recordings.topics import Topics
+
+    found = [] if paths is None else _paths(paths)
+    named = {"dvl": dvl_topic, "gnss": gnss_topic, "imu": imu_topic}
+    topics = Topics(**{stream: topic for stream, topic in named.items() if topic is not None})
+    known = tuple(MODELS) if len(found) > 1 else EVALUATED
+    names = known if models is None else tuple(models)
+    for name in names:
+        if name not in known:
+            raise InputError(f"models: {name!r} is none of {', '.join(known)}")
+    if len(found) > 1:
+        return cross_check(found, Parameters.from_mapping(parameters), names, topics, Workers())
+    return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)
+
+
+def salvage(bags: Bags, output: StrPath, *, storage: str = "mcap", compression: str = "none") -> Recovered:
+    """Write all that can be read of damaged recordings into a new bag, as ``dvl-calib salvage``.
+
+    Parameters
+    ----------
+    bags
+        As of `replay`.
+    output
+        Folder to write; must not exist.
+    storage, compression
+        mcap or sqlite3; none, chunk (MCAP's own), message or file.
+
+    Returns
+    -------
+    Recovered
+        ``counts`` of messages by topic, and ``notes`` of what was lost.
+
+    Raises
+    ------
+    InputError
+        For what is no bag or holds no message, and if the new one cannot be written.
+    """
+    from ..bags.recover import recover
+
+    return recover(_paths(bags), Path(output), *_form(storage, compression))
+
+
+def import_files(
+    dvl: StrPath,
+    output: StrPath,
+    *,
+    gnss: StrPath | None = None,
+    attitude: StrPath | None = None,
+    frame: str = "frd",
+    gnss_frame: str = "frd",
+    dvl_std: float = 0.0,
+    gnss_std: float = 0.0,
+    start: float = 1_600_000_000.0,
+    storage: str = "mcap",
+    compression: str = "none",
+) -> dict[Path, Imported]:
+    """Turn trajectories (CSV, NPY) or the log of a DVL into a bag, as ``dvl-calib import``.
+
+    Parameters
+    ----------
+    dvl
+        A file of time and velocity (m/s), a log of the DVL, or a folder of recordings.
+    output
+        Bag to write; for a folder the folder of bags.
+    gnss, attitude
+        Files of the reference's velocity, and of roll, pitch, yaw or heading.
+    frame, gnss_frame
+        Of the velocities: frd or flu; of the reference also enu or ned.
+    dvl_std, gnss_std
+        Standard deviations to write as covariance, m/s; 0: none.
+    start
+        Stamp of time 0, s since 1970.
+    storage, compression
+        As of `salvage`.
+
+    Returns
+    -------
+    dict
+        Of each bag written: ``counts`` of messages by topic, and ``notes`` of what was left out.
+
+    Raises
+    ------
+    InputError
+        Naming file and row; then nothing is written.
+    """
+    from ..files.trajectories import ImportOptions
+    from ..files.trajectories import import_files as run
+
+    options = ImportOptions(frame, gnss_frame, dvl_std, gnss_std, start, *_form(storage, compression))
+    return run(Path(dvl), _path(gnss), _path(attitude), Path(output), options)
+
+
+def apply(
+    result: StrPath,
+    *,
+    urdf: StrPath | None = None,
+    joint: str | None = None,
+    output: StrPath | None = None,
+    keep_position: bool = False,
+    params: StrPath | None = None,
+    launch: StrPath | None = None,
+    fusion: StrPath | None = None,
+    force: bool = False,
+) -> Applied:
+    """Write a saved calibration into the files that a vehicle is configured by, as ``dvl-calib apply``.
+
+    All are written or none; the one before is kept beside each.
+
+    Parameters
+    ----------
+    result
+        Result file, as `Calibration.save` writes it.
+    urdf, joint, output, keep_position
+        URDF whose joint of the DVL is turned and moved; the joint's name where the DVL's frame does not tell; where to
+        write instead; leave the position as it is.
+    params, launch, fusion
+        Parameter file of the node, launch file with a static transform, parameters of robot_localization.
+    force
+        Also what is rejected, not converged, or of another mounting.
+
+    Returns
+    -------
+    Applied
+        Files ``written`` and ``unchanged``, where the one before is (``kept``), and ``notes``.
+
+    Raises
+    ------
+    InputError
+        For what is no result file, must not be applied, or cannot be written.
+    """
+    from ..files.applying import Targets, write_calibration
+    from ..files.mounting import load_calibrated_mounting
+
+    targets = Targets(_path(urdf), _path(output), joint, keep_position, _path(params), _path(launch), _path(fusion))
+    return write_calibration(load_calibrated_mounting(Path(result)), targets, force)
+
+
+def export(simulator: str, source: StrPath, output: StrPath) -> Export:
+    """Write what was found of a DVL as the settings of another simulator, as ``dvl-calib export``.
+
+    Parameters
+    ----------
+    simulator
+        Such as ``"gazebo"``.
+    source
+        What ``report(diagnosis, "found.json")`` wrote; or a result or parameter file.
+    output
+        File to write; what the simulator cannot represent is beside it, as FILE.missing.json.
+
+    Raises
+    ------
+    InputError
+        For another simulator, a source that is none of these, or a file that cannot be written.
+    """
+    from ..export.simulators import write_settings
+
+    return write_settings(simulator, Path(source), Path(output))
+
+
+def report(
+    result: Calibration | Comparison | Examination | Diagnosis | UnpairedComparison | Evaluation | CrossCheck,
+    path: StrPath,
+) -> Path:
+    """Write a result as a page (HTML), or with all its figures as JSON where the path ends in .json.
+
+    They are what ``--report`` and ``--json`` of the commands write; a `Comparison` may be a picture (.png) as well.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written, or a page needs what was not kept or is not installed.
+    """
+    from .reports import write
+
+    target = Path(path)
+    write(result, target)
+    return target
+
+
+def _path(given: StrPath | None) -> Path | None:
+    return None if given is None else Path(given)
+
+
+def _form(storage: str, compression: str) -> tuple[Storage, Compression]:
+    """Of a bag to write. Raises InputError."""
+    from ..bags.writer import Compression, Storage
+
+    try:
+        return Storage(storage), Compression(compression)
+    except ValueError as error:
+        known = (", ".join(each.value for each in kind) for kind in (Storage, Compression))
+        raise InputError("{}; storage is one of {}; compression of {}".format(error, *known)) from None
+
+
+def _paths(bags: Bags) -> list[Path]:
+    return [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
+
+
+def _parameters(params: StrPath | None, given: Mapping[str, Any]) -> tuple[Parameters, frozenset[str]]:
+    """Parameters of a file and of a call, and the names that either sets."""
+    from ..files.parameter_files import given_parameters, load_parameters
+
+    path = None if params is None else Path(params)
+    return load_parameters(path).replace(**given), given_parameters(path) | frozenset(given)
+
+
+def _discovered(
+    paths: list[Path],
+    topics: tuple[str | None, str | None, str | None],
+    params: StrPath | None,
+    given: Mapping[str, Any],
+) -> tuple[Recording, Discovery]:
+    parameters, names = _parameters(params, given)
+    dvl, gnss, imu = topics
+    recording = open_recording(paths, None, parameters)
+    return recording, discover(recording, parameters, Given(dvl, gnss, imu, names))

@@ -1,0 +1,220 @@
+"""What a replay gives: the mounting, and the calibration that it is of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.models import MODELS
+from ..calibration.parameters import Parameters
+from ..calibration.quantities import Quantity, quantities
+from ..discovery.discover import Discovery
+from ..errors import InputError
+from ..replay.replay import Replayed
+from ..verdict.reasons import Reason
+
+if TYPE_CHECKING:
+    import os
+
+    import pandas
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """How the DVL is mounted, as it was calibrated.
+
+    Parameters
+    ----------
+    rpy_deg
+        Corrected roll, pitch, yaw of the DVL in the body, degrees, as in a URDF origin (fixed axes X, Y, Z).
+    std_deg
+        Their standard deviations (1σ), degrees.
+    nominal_rpy_deg
+        What the calibration began with.
+    xyz_m, xyz_std_m
+        Lever arm: position of the DVL from the reference point, body frame, m, as it was found, else as it was given;
+        its standard deviations, nan where the model has no lever arm.
+    position_m
+        The DVL in the body, m; None where nothing says where the reference point is.
+    time_offset_s, time_offset_std_s
+        By how much the DVL's stamps are late, s, likewise; of several recordings in the last one (`Result.delays`).
+    scale_percent, scale_std_percent
+        How much too long a motion ahead is measured; nan where the model has no scale.
+    base_frame, dvl_frame
+        Names of the frames.
+    """
+
+    rpy_deg: tuple[float, float, float]
+    std_deg: tuple[float, float, float]
+    nominal_rpy_deg: tuple[float, float, float]
+    xyz_m: tuple[float, float, float]
+    xyz_std_m: tuple[float, float, float]
+    time_offset_s: float
+    time_offset_std_s: float
+    scale_percent: float
+    scale_std_percent: float
+    base_frame: str
+    dvl_frame: str
+    position_m: tuple[float, float, float] | None = None
+
+    @property
+    def urdf(self) -> str:
+        """The origin of the DVL's joint, to paste into a URDF: of forward-left-up axes, as `mounting_rpy` is."""
+        from ..files.urdf import origin_tag
+
+        return origin_tag(self.position_m, np.radians(self.rpy_deg))
+
+    def __str__(self) -> str:
+        angles = (
+            f"{name} {angle:.2f}° ± {std:.2f}°"
+            for name, angle, std in zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
+        )
+        return f"{self.dvl_frame} in {self.base_frame}: {', '.join(angles)}"
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a replay gives.
+
+    Parameters
+    ----------
+    replayed
+        All of it: every model's estimate, counts, verification, history.
+    discovery
+        What was found in the bags, and with which topics and parameters they were replayed.
+    bags
+        Where the bags are.
+    """
+
+    replayed: Replayed = field(repr=False)
+    discovery: Discovery = field(repr=False)
+    bags: tuple[Path, ...]
+
+    def __repr__(self) -> str:
+        return f"{self.verdict} ({self.model}): {self.mounting}"
+
+    @property
+    def model(self) -> str:
+        """Name of the model that was selected."""
+        return self.replayed.result.selected
+
+    @property
+    def verdict(self) -> str:
+        """What the held-out data say: accept, marginal or reject."""
+        return self.replayed.result.verifications[self.model].verdict.value
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why, in sentences, the decisive one first."""
+        return self.replayed.result.verifications[self.model].reasons
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """What was found in the bags, in sentences."""
+        return self.discovery.found
+
+    @property
+    def findings(self) -> tuple[Reason, ...]:
+        """What is wrong with the data, each with its code and remedy."""
+        return self.replayed.findings
+
+    @property
+    def mounting(self) -> Mounting:
+        """The corrected mounting with its standard deviations."""
+        result = self.replayed.result
+        estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
+        found = {each.name: each for each in quantities(result)}
+        roll, pitch, yaw = (found[name] for name in ("roll", "pitch", "yaw"))
+        arm = [found.get(f"lever arm {axis}", _none(at)) for axis, at in zip("xyz", parameters.lever_arm, strict=True)]
+        scale = found.get("scale", _none(math.nan))
+        offset_std = estimate.std_of("time_offset")
+        return Mounting(
+            (roll.value, pitch.value, yaw.value),
+            (roll.std, pitch.std, yaw.std),
+            (roll.nominal, pitch.nominal, yaw.nominal),
+            (arm[0].value, arm[1].value, arm[2].value),
+            (arm[0].std, arm[1].std, arm[2].std),
+            estimate.dvl_time_offset(parameters.dvl_time_offset),
+            math.nan if offset_std is None else float(offset_std[0]),
+            scale.value,
+            scale.std,
+            parameters.base_frame,
+            self.replayed.dvl_frame,
+            result.position_in_body,
+        )
+
+    def correct(self, velocity_dvl: Array, angular_velocity: Array | None = None) -> Array:
+        """Measured velocities (..., 3) m/s, forward-left-up axes of the DVL, to corrected ones in the body.
+
+        With angular_velocity, (..., 3) rad/s in the body, they are those of the reference point, by the lever arm that
+        was found; without, of the place where the DVL is. They are of ``mounting.time_offset_s`` before their stamps.
+        """
+        rotation = self.discovery.parameters.rotation_dvl_from_body
+        velocity = self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
+        if angular_velocity is None:
+            return velocity
+        return velocity - np.cross(np.asarray(angular_velocity, dtype=float), self.mounting.xyz_m)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The selected model over time: time in s since the first DVL sample, states in SI with their σ as *_std.
+
+        Raises InputError without pandas, or if the replay kept no history.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise InputError("to_pandas needs the Python package pandas; pip install pandas") from None
+        history = self.replayed.history
+        if history is None:
+            raise InputError("this replay kept no history; replay with history=True")
+        model, estimate = history.models[self.model], self.replayed.result.estimate
+        first_ns = self.replayed.result.first_ns or 0
+        columns: dict[str, Array] = {"time_s": 1e-9 * (history.stamps_ns - first_ns)}
+        for index, name in enumerate(estimate.state_names):
+            columns[name], columns[f"{name}_std"] = model.state[:, index], model.std[:, index]
+        return pandas.DataFrame(columns)
+
+    def plot(self) -> Figure:
+        """The mounting over time with its ±1σ, and the velocity error before and after, as a matplotlib Figure."""
+        from ..report.calibration_figure import calibration_figure
+
+        if self.replayed.history is None:
+            raise InputError("this replay kept no history; replay with history=True")
+        return calibration_figure(self.replayed)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the result file (YAML), from which the node and `dvl-calib apply` go on. Raises InputError."""
+        from ..files.result_file import result_document, save_result
+
+        target = Path(path)
+        document = result_document(self.replayed.result, self.replayed.dvl_frame, self.replayed.turned)
+        save_result(target, document, round(self.discovery.parameters.result_backups))
+        return target
+
+    def report(self, path: str | os.PathLike[str]) -> Path:
+        """Write the report (HTML) with pictures. Raises InputError."""
+        from ..report import write_replay_report
+
+        target = Path(path)
+        write_replay_report(target, self.replayed, self.bags, list(MODELS))
+        return target
+
+    def document(self, models: Sequence[str] = tuple(MODELS)) -> dict[str, Any]:
+        """All of it as plain data, of the models named: what `dvl-calib replay --json` writes."""
+        from ..replay.document import replay_document
+
+        return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}
+
+
+def _none(value: float) -> Quantity:
+    """What a model does not have, but for what was given."""
+    return Quantity("", value, value, math.nan, "", False)

@@ -1,0 +1,64 @@
+"""Results as pages and as JSON, by what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..calibration.comparison import Comparison
+from ..diagnosis.results import Diagnosis
+from ..disk.json_files import write_json
+from ..errors import InputError
+from ..examination.examine import Examination
+from .calibrated import Calibration
+
+
+def write(result: object, path: Path) -> None:
+    """Write a result as JSON where the path ends so, else as a page. Raises InputError."""
+    document, page = _forms(result)
+    if path.suffix.lower() == ".json":
+        write_json(path, document())
+        return
+    if not page:
+        raise InputError(f"{path}: this result has no page; name a file that ends in .json")
+    if isinstance(result, Calibration):
+        result.report(path)
+        return
+    try:
+        from .. import report
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{path}: a page needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2"
+        ) from error
+    getattr(report, page)(path, result)
+
+
+def _forms(result: Any) -> tuple[Callable[[], Any], str]:
+    """What makes plain data of a result, and the function of `report` that writes its page, '' for none."""
+    if isinstance(result, Calibration):
+        return result.document, "write_replay_report"
+    if isinstance(result, Examination):
+        return result.document, ""
+    if isinstance(result, Comparison):
+        from ..calibration.comparison import comparison_document
+
+        return lambda: comparison_document(result), "write_comparison_report"
+    if isinstance(result, Diagnosis):
+        from ..diagnosis.results import diagnosis_document
+
+        return lambda: diagnosis_document(result), "write_diagnosis_report"
+    from ..evaluation.bags import CrossCheck, cross_check_document
+    from ..evaluation.documents import evaluation_document
+    from ..evaluation.results import Evaluation
+    from ..unpaired.results import UnpairedComparison, unpaired_document
+
+    if isinstance(result, Evaluation):
+        return lambda: evaluation_document(result), "write_evaluation_report"
+    if isinstance(result, CrossCheck):
+        return lambda: cross_check_document(result), "write_cross_check_report"
+    if isinstance(result, UnpairedComparison):
+        return lambda: unpaired_document(result), "write_unpaired_report"
+    raise InputError(
+        f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
+    )
