@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Container, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,11 @@ def searched(examples: int, *unchecked: HealthCheck) -> settings:
     """Settings of a search that takes another number of examples than 100: so many, as the profile scales them."""
     scaled = max(5, round(examples * settings.default.max_examples / 100))
     return settings(max_examples=scaled, suppress_health_check=[HealthCheck.too_slow, *unchecked])
+
+
+def few(cases: Iterable[Any], waited_for: Container[Any]) -> list[Any]:
+    """Cases of one test of which those that are not waited for are slow: they are of the same rule."""
+    return [case if case in waited_for else pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 
 def made_once(path: Path, make: Callable[[Path], Any]) -> Path:

@@ -44,11 +44,11 @@ def said(command, bag, tmp_path, capsys):
 @pytest.mark.parametrize(
     "late",
     [
-        {"reference_time_offset": 5.0},
+        pytest.param({"reference_time_offset": 5.0}, marks=pytest.mark.slow),
         pytest.param({"reference_time_offset": 0.8}, marks=pytest.mark.slow),
         pytest.param({"reference_time_offset": 30.0}, marks=pytest.mark.slow),
         pytest.param({"dvl_time_offset": 7.5}, marks=pytest.mark.slow),
-        {"attitude_time_offset": 2.0},
+        pytest.param({"attitude_time_offset": 2.0}, marks=pytest.mark.slow),
         {"dvl_time_offset": 5.0, "reference_time_offset": 2.5},
     ],
     ids=lambda late: ", ".join(f"{name[:3]} {seconds}" for name, seconds in late.items()),

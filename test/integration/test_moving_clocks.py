@@ -57,7 +57,10 @@ def test_a_reference_whose_clock_moves_is_named_by_all_and_not_accepted(moves, w
 
 @pytest.mark.parametrize(
     ("moves", "words"),
-    [({"leap": 1.0}, "the DVL's clock leaps ahead by"), ({"drift": 1e-3}, "the DVL's clock drifts by")],
+    [
+        ({"leap": 1.0}, "the DVL's clock leaps ahead by"),
+        pytest.param({"drift": 1e-3}, "the DVL's clock drifts by", marks=pytest.mark.slow),
+    ],
     ids=["leap", "drift"],
 )
 def test_a_dvl_whose_clock_moves_is_named_and_calibrated_with_it_taken_off(moves, words, tmp_path, capsys):

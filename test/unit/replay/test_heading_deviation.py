@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from conftest import few
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
@@ -62,7 +63,7 @@ def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
 
 
 @pytest.mark.parametrize("legs, every", [(16, math.pi / 4.0), (16, math.pi)], ids=["all around", "to and fro"])
-@pytest.mark.parametrize("size", [0.0, pytest.param(0.5, marks=pytest.mark.slow), 2.0])
+@pytest.mark.parametrize("size", few([0.0, 0.5, 2.0], [2.0]))
 def test_yaw_is_within_its_sigma(legs, every, size):
     off = []
     for seed in range(4):
