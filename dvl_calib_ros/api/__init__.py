@@ -99,8 +99,15 @@ def replay(
 
     paths = _paths(bags)
     recording, discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
-    replayed = checked_replay(recording, discovery.parameters, discovery.topics, merge=merge, with_history=history)
-    return Calibration(replayed, discovery, tuple(paths))
+    replayed = checked_replay(
+        recording,
+        discovery.parameters,
+        discovery.topics,
+        merge=merge,
+        with_history=history,
+        mounting_is_guessed=bool(discovery.mounting_because),
+    )
+    return Calibration(replayed, discovery.with_mounting(replayed.result.parameters["mounting_rpy"]), tuple(paths))
 
 
 def compare(

@@ -85,6 +85,12 @@ def rpy_from_rotation(rotation: ArrayLike) -> Array:
     return np.array([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
 
 
+def whole_degrees(rotation: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw (rad) of a rotation (3, 3), to whole degrees."""
+    roll, pitch, yaw = (np.radians(np.round(np.degrees(rpy_from_rotation(rotation)))) + 0.0).tolist()
+    return roll, pitch, yaw
+
+
 def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
     """Unit quaternion (x, y, z, w), w >= 0, of one rotation (3, 3). Shepperd's method: the largest term first."""
     r = np.asarray(rotation, dtype=float)

@@ -208,13 +208,18 @@ def _lever_arm_findings(turns: str, is_found: bool, parameters: Parameters) -> l
     return [(Word.REJECT, f"{known}, and {turns}: {remedy}")]
 
 
-def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
-    """How far the DVL is turned, degrees, about the body's axes that are known: what is not shown proves nothing."""
+def shown_misalignment(model: Model, state: GaussianState, parameters: Parameters) -> Array:
+    """By what the DVL is turned (3,) about the body's axes, as φ is; 0 about those that the data do not show."""
     t = parameters.rotation_dvl_from_body
     about = t.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
     shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > SURELY * std)
-    return math.degrees(math.atan(float(np.linalg.norm(about[shown]))))
+    return np.where(shown, about, 0.0)
+
+
+def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
+    """How far the DVL is turned, degrees, about the body's axes that are known: what is not shown proves nothing."""
+    return math.degrees(math.atan(float(np.linalg.norm(shown_misalignment(model, state, parameters)))))
 
 
 def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> str:

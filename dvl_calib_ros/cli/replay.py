@@ -56,8 +56,10 @@ def run(arguments: argparse.Namespace) -> None:
             on_progress,
             merge=arguments.merge,
             with_history=arguments.report is not None,
+            mounting_is_guessed=bool(discovery.mounting_because),
         )
     result = replayed.result
+    discovery = discovery.with_mounting(result.parameters["mounting_rpy"])
 
     def write(path: Path) -> None:
         common.write_json(path, replay_document(replayed, models) | {"discovery": discovery.document()})

@@ -77,7 +77,8 @@ class Discovery:
     bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`, beside
     `clocks.offsets`, which a calibration takes off and a diagnosis names. agreement:
     how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
-    knows_imu: whether it is known in which axes the IMU measures.
+    knows_imu: whether it is known in which axes the IMU measures. mounting_because: why the mounting is what it is,
+    where it is guessed from the data; else ''.
     """
 
     topics: Topics
@@ -90,6 +91,21 @@ class Discovery:
     reference_frame: VelocityFrame | None = None
     knows_imu: bool = False
     clocks: FoundClocks | None = None
+    mounting_because: str = ""
+
+    def with_mounting(self, rpy: Sequence[float]) -> Discovery:
+        """The same where a calibration has found a better mounting (rad) than the one that was guessed."""
+        before, roll_pitch_yaw = self.parameters.mounting_rpy, tuple(map(float, rpy))
+        if not self.mounting_because or roll_pitch_yaw == before:
+            return self
+        said = _mounting_said(before, self.mounting_because)
+        again = _mounting_said(roll_pitch_yaw, self.mounting_because)
+        return replace(
+            self,
+            parameters=self.parameters.replace(mounting_rpy=roll_pitch_yaw),
+            values={**self.values, "mounting_rpy": roll_pitch_yaw},
+            notes=tuple(again if note == said else note for note in self.notes),
+        )
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -160,6 +176,7 @@ class _Search:
         self._found: list[str] = []
         self._notes: list[str] = list(self._tree.problems)
         self._contradictions: list[str] = []
+        self._mounting_because = ""
         self._chosen: Agreement | None = None
         self._readings: Readings  # of DVL and reference, once these are compared
 
@@ -180,6 +197,7 @@ class _Search:
             self._chosen,
             self._reference_frame(reference),
             self._knows_imu(imu),
+            mounting_because=self._mounting_because,
         )
 
     # ------------------------------------------------------------------ topics
@@ -555,12 +573,8 @@ class _Search:
         if not any(rpy):
             return
         self._values["mounting_rpy"] = rpy
-        # of a level vehicle, a heading that counts from elsewhere looks the same
-        quarter = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
-        self._notes.append(
-            f"mounting {_degrees(rpy)}, {why}: nothing in the bag says how the DVL is mounted (-p "
-            f"mounting_rpy:={_option(rpy)}){quarter}"
-        )
+        self._mounting_because = why
+        self._notes.append(_mounting_said(rpy, why))
 
     def _mounting_from_motion(self, dvl: Look, turned: bool) -> None:
         """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well."""
@@ -593,6 +607,15 @@ class _Search:
                 said.append(f"lever arm {_metres(position)} m")
         if said:
             self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
+
+
+def _mounting_said(rpy: Sequence[float], why: str) -> str:
+    # of a level vehicle, a heading that counts from elsewhere looks the same
+    quarter = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
+    return (
+        f"mounting {_degrees(rpy)}, {why}: nothing in the bag says how the DVL is mounted (-p "
+        f"mounting_rpy:={_option(rpy)}){quarter}"
+    )
 
 
 def _decided(found: Sequence[Agreement], wanted: Reading, declared: bool) -> Agreement | None:

@@ -6,11 +6,14 @@ what an `initial_calibration` says that the data contradict.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from ..calibration.comparison import (
     CHANCE,
@@ -22,10 +25,14 @@ from ..calibration.comparison import (
     sentences,
 )
 from ..calibration.dropouts import DROPOUT_NS
+from ..calibration.error_model import corrected_mounting
 from ..calibration.extrinsics import Extrinsics
+from ..calibration.frames import whole_degrees
+from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
-from ..calibration.verification import Word
+from ..calibration.results import Result
+from ..calibration.verification import Word, shown_misalignment
 from ..errors import InputError
 from ..files.extrinsics import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together
@@ -103,11 +110,14 @@ def checked_replay(
     *,
     merge: bool = False,
     with_history: bool = False,
+    mounting_is_guessed: bool = False,
 ) -> Replayed:
     """`replay`, after several recordings, or an initial calibration, have been held against each other.
 
     merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
-    What `initial_calibration` says is left out, and said to be, if the data contradict it. Raises InputError.
+    What `initial_calibration` says is left out, and said to be, if the data contradict it. mounting_is_guessed: nobody
+    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more.
+    Raises InputError.
     """
     topics = topics or Topics()
     if not isinstance(recording, Recording):
@@ -122,7 +132,26 @@ def checked_replay(
     if parts:
         recordings = _each_by_itself(recording, parameters, topics, progress_of)
     replayed = _with_fitting_start(recording, parameters, topics, progress_of, parts, with_history)
+    if mounting_is_guessed and (rpy := _mounting_found(replayed.result)) is not None:
+        better = parameters.replace(mounting_rpy=rpy)
+        return checked_replay(recording, better, topics, on_progress, merge=merge, with_history=with_history)
     return replayed if recordings is None else _judged(replayed, recordings, merge)
+
+
+def _mounting_found(result: Result) -> tuple[float, float, float] | None:
+    """The mounting (rad, whole degrees) that a calibration found instead of one that was guessed; None near that."""
+    parameters, estimate = Parameters.from_mapping(result.parameters), result.estimate
+    model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.recording_covariance)
+    about = shown_misalignment(model, state, parameters)
+    if math.atan(float(np.linalg.norm(about))) < parameters.reject_misalignment or parameters.initial_calibration:
+        return None
+    t = parameters.rotation_dvl_from_body
+    found = np.array(whole_degrees(corrected_mounting(t @ about, t)))
+    # what may as well be a misalignment stays one
+    guessed = np.array(parameters.mounting_rpy)
+    is_other = np.cos(found - guessed) < math.cos(0.5 * parameters.reject_misalignment)
+    roll, pitch, yaw = np.where(is_other, found, guessed).tolist()
+    return roll, pitch, yaw
 
 
 # ------------------------------------------------------------------ several recordings

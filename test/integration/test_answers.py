@@ -8,9 +8,10 @@ import math
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion
+from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.discovery.discover import discover
@@ -155,3 +156,28 @@ def test_a_mounting_that_nobody_told_is_no_roll_that_motion_does_not_show(tmp_pa
     write_survey(draw(seed), tmp_path / "bag")
     found = discover([tmp_path / "bag"], Parameters()).parameters.mounting_rpy
     np.testing.assert_allclose(np.degrees(found), (0.0, 0.0, yaw_deg), atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "yaw_deg"), [(28097, 45.0), (30897, 45.0), (30993, 45.0), (31356, 90.0)])
+def test_on_a_circle_a_mounting_that_nobody_told_is_no_late_reference(tmp_path, seed, yaw_deg):
+    """At one rate of turn a late reference is a yaw. Rolls of 180 degrees came of it, one of them accepted."""
+    write_survey(draw(seed), tmp_path / "bag")
+    found = discover([tmp_path / "bag"], Parameters()).parameters.mounting_rpy
+    np.testing.assert_allclose(np.degrees(found), (0.0, 0.0, yaw_deg), atol=1e-6)
+
+
+def test_a_mounting_that_was_found_and_is_off_is_found_better_and_not_called_misaligned(tmp_path):
+    """Drawn mountings are guessed: 45 for one of 37, which was rejected as off by 6.6 degrees."""
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, math.radians(37.0)))
+    vehicle(told)
+    told.imu("/imu", "base_link")
+    run = dc.replay(told.write(tmp_path / "bag"), history=False)
+    assert run.verdict != "reject", run.reasons
+    truth = np.degrees(rpy_from_rotation(true_mounting((0.0, 0.0, math.radians(37.0)))))
+    assert run.mounting.rpy_deg[2] == pytest.approx(truth[2], abs=0.5)
+    nominal = math.degrees(run.discovery.parameters.mounting_rpy[2])
+    assert nominal == pytest.approx(truth[2], abs=1.0) and f"mounting 0° 0° {nominal:g}°" in " ".join(
+        run.discovery.notes
+    )

@@ -25,13 +25,14 @@ from ..frames import (
     nearest_rotation,
     quaternion_from_rotation,
     rpy_from_rotation,
+    whole_degrees,
 )
 from ..imu_alignment import quaternion_product
 from ..samples import VelocityFrame
 from .configuration import DRAWN, angle_between, misfit, nearest
 from .curves import GAP_S, Curves
 from .far import covered, velocity_at
-from .fine import FEW_ROWS, SLOW_MPS, Fit
+from .fine import FEW_ROWS, REFERENCE, SLOW_MPS, Fit
 from .motion import Motion
 
 # Fewer samples say nothing about frames.
@@ -159,8 +160,8 @@ class Readings:
         return sorted(found, key=lambda each: round(each.left + (0.02 * each.angle if known is None else 0.0), 9))
 
     def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> tuple[float, Array]:
-        """What a reading leaves with the lever arm and the delay that suit it best, as a share of the speed; and its
-        rotation_dvl_from_body (3, 3).
+        """What a reading leaves with the lever arm and the DVL's delay that suit it best, as a share of the speed; and
+        its rotation_dvl_from_body (3, 3). The reference is in time: late on a circle it is any yaw at all.
 
         rotation_dvl_from_body: the mounting, which stands but for a small misalignment; None to find it. Of a rotation
         that is found and the same turned about the direction of travel, which a lever arm makes alike, that with the
@@ -176,7 +177,7 @@ class Readings:
 
         def of(rotation: Array | None) -> tuple[float, Array]:
             nominal = None if rotation is None else rotation.T @ turn
-            found = nearest(fit, nominal, ())
+            found = nearest(fit, nominal, (REFERENCE,))
             if found is None:
                 return math.inf, np.eye(3)
             left = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
@@ -261,7 +262,7 @@ def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
     """The mounting that somebody may have meant (rad): as mountings are drawn where it is close, else whole degrees."""
     rpy = rpy_from_rotation(rotation_body_from_dvl)
     near = DRAWN * np.round(rpy / DRAWN)
-    meant = np.where(np.abs(rpy - near) < MEANT_WITHIN, near, np.radians(np.round(np.degrees(rpy))))
+    meant = np.where(np.abs(rpy - near) < MEANT_WITHIN, near, whole_degrees(rotation_body_from_dvl))
     roll, pitch, yaw = (meant + 0.0).tolist()
     return roll, pitch, yaw
 
