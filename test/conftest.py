@@ -29,7 +29,7 @@ from hypothesis import HealthCheck, settings
 # A busy machine takes its time over an example. Who waits for the suite sees fewer of them than CI, and both the same
 # ones each time, so that what fails is what was changed; who searches for new ones takes --hypothesis-profile=search.
 settings.register_profile(
-    "patient", deadline=None, max_examples=40, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    "patient", deadline=None, max_examples=25, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.register_profile("brief", settings.get_profile("patient"), max_examples=10)  # versions that differ little
 settings.register_profile("ci", settings.get_profile("patient"), max_examples=200)

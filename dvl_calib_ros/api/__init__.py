@@ -1,12 +1,12 @@
-"""The library's public interface: what the commands do, as functions that give dataclasses.
+"""What a command does a function does; it gives a dataclass.
 
     import dvl_calib_ros as dc
     run = dc.replay("my_bag")
     run.mounting
     run.plot()
 
-Angles in degrees and lengths in metres where a name says so, else SI. Errors of files, topics and values are
-`InputError`, of parameters `ParameterError`, each one sentence with the remedy. (Long, because it is a table of
+Angles are in degrees and lengths in metres where a name says so, else SI. Wrong files, topics and values are
+`InputError`, wrong parameters `ParameterError`: one sentence each, with the remedy. (Long, because it is a table of
 functions with their documentation.)
 """
 

@@ -19,6 +19,7 @@ import dvl_calib_ros
 from dvl_calib_ros.errors import InputError
 
 SETUP = (ROOT / "setup.py").read_text()
+PROJECT = (ROOT / "pyproject.toml").read_text()
 PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 MODULES = sorted((ROOT / "dvl_calib_ros").rglob("*.py"))
 # how distributions call what we import, where it is not the module's own name
@@ -29,8 +30,9 @@ NOT_REQUIRED |= {"argcomplete", "distributed", "pandas"}
 
 
 def required() -> dict[str, str]:
-    """Lowest version of every distribution that setup.py asks for."""
-    return dict(re.findall(r'["\']([a-z][a-z0-9_.]*)>=([\d.]+)', SETUP.partition("DASK =")[0]))
+    """Lowest version of every distribution that is asked for."""
+    asked = PROJECT.partition("\ndependencies = [")[2].partition("\n]")[0]
+    return dict(re.findall(r'["\']([a-z][a-z0-9_.]*)>=([\d.]+)', asked))
 
 
 def parts(version: str) -> list[int]:
@@ -62,7 +64,7 @@ def test_everything_that_is_imported_is_declared():
     assert {DISTRIBUTIONS.get(name, name) for name in others} - required().keys() == set()
 
 
-def test_the_lowest_versions_that_ci_tries_are_those_that_setup_asks_for():
+def test_the_lowest_versions_that_ci_tries_are_those_that_are_asked_for():
     tried = dict(re.findall(r"^([\w.]+)==([\d.]+)$", (ROOT / ".ci" / "lowest.txt").read_text(), re.M))
     assert tried.keys() == required().keys()
     for name, lowest in required().items():
