@@ -115,7 +115,12 @@ class Calibration:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why, in sentences, the decisive one first."""
-        return self.replayed.result.verifications[self.model].reasons
+        return tuple(each.sentence for each in self.replayed.result.verifications[self.model].reasons)
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """The codes of ``reasons``, which never change their meaning."""
+        return tuple(each.code for each in self.replayed.result.verifications[self.model].reasons)
 
     @property
     def found(self) -> tuple[str, ...]:

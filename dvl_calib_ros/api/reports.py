@@ -41,7 +41,7 @@ def _forms(result: Any) -> tuple[Callable[[], Any], str]:
     if isinstance(result, Examination):
         return result.document, ""
     if isinstance(result, Comparison):
-        from ..calibration.comparison import comparison_document
+        from ..calibration.comparison_words import comparison_document
 
         return lambda: comparison_document(result), "write_comparison_report"
     if isinstance(result, Diagnosis):

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .comparison import date
+from .comparison_words import date
 from .days import OFFSETS, OFTEN_OFF
 from .parameters import Parameters
 from .results import Day, Estimate

@@ -12,17 +12,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..verdict.kinds import Severity
 from .chi_square import chi2_sf
 from .extrinsics import (
-    COMPONENTS,
     LEVER_ARM,
     N_COMPONENTS,
     SCALE,
@@ -32,17 +31,12 @@ from .extrinsics import (
     rotation_of,
     turn_between,
 )
-from .frames import Array, rpy_from_rotation
+from .frames import Array
 
 # A difference that chance brings more seldom than this is none of chance, over all that is looked at together.
 CHANCE = 0.01
 # Of a mounting: as seldom as a normal error is beyond 4 σ it has moved, beyond 2 σ that is suspicious.
 MOVED, SUSPICIOUS = chi2_sf(16.0, 1), chi2_sf(4.0, 1)
-# An axis that takes more than this share of a turn is the one that it is about.
-ABOUT = 0.9
-# What a vehicle's builder would not have let pass unseen, m: a lever arm taken as known that is off by more turns the
-# yaw by tenths of a degree.
-ARM_MATTERS = 0.3
 
 _ALL = np.arange(N_COMPONENTS)
 MOUNTING, ONLY_SCALE, ONLY_CLOCK = _ALL[: LEVER_ARM.stop], _ALL[[SCALE]], _ALL[[TIME_OFFSET]]
@@ -96,16 +90,20 @@ class Difference:
         d = self.value[at]
         return ChiSquare.of(float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d)), len(at))
 
-    def chance(self, components: NDArray[np.intp] = _ALL) -> float:
+    def chance(self, components: NDArray[np.intp] = _ALL, together: ChiSquare | None = None) -> float:
         """How often chance makes as much of some components: of all together, or of the one that stands out most.
 
         Both, as one angle that moved is little among five that did not; by Bonferroni. 1 if there are none.
+        together: their `test`, where that is known.
         """
         at = components[self.compared[components]]
-        if len(at) <= 1:
-            return self.test(at).p if len(at) else 1.0
+        if not len(at):
+            return 1.0
+        p = (together or self.test(at)).p
+        if len(at) == 1:
+            return p
         one = chi2_sf(float(((self.value / self.std)[at] ** 2).max()), 1)
-        return min(1.0, 2.0 * min(self.test(at).p, len(at) * one))
+        return min(1.0, 2.0 * min(p, len(at) * one))
 
 
 @dataclass(frozen=True)
@@ -116,6 +114,20 @@ class Change:
     difference: Difference
     last_before: Extrinsics
     first_after: Extrinsics
+
+
+class Answer(NamedTuple):
+    """What comes of a comparison's word. severity: as of a verdict, which colours it. exit_code: of the command."""
+
+    severity: Severity
+    exit_code: int
+
+
+ANSWERS = {
+    "same": Answer(Severity.ACCEPT, 0),
+    "suspicious": Answer(Severity.MARGINAL, 3),
+    "moved": Answer(Severity.REJECT, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -143,9 +155,29 @@ class Comparison:
         return "moved" if self.moved else "suspicious" if self.suspicious else "same"
 
     @property
+    def answer(self) -> Answer:
+        """What comes of the word."""
+        return ANSWERS[self.word]
+
+    @property
+    def contradicting(self) -> tuple[Change, ...]:
+        """Changes of the mounting by which one average of all is the mounting of none: by a limit of its own, as an
+        average of two mountings does more harm than a warning."""
+        surely = CHANCE / (len(self.calibrations) - 1)
+        return tuple(each for each in (*self.moved, *self.suspicious) if each.difference.chance(MOUNTING) < surely)
+
+    @property
     def same_mounting(self) -> bool:
         """Whether nothing says that the mounting moved, nor makes it suspicious."""
         return self.word == "same"
+
+
+def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
+    """What takes an initial calibration to one of other data, where that is no chance; None where they agree."""
+    if not (initial.shown[MOUNTING] & found.shown[MOUNTING]).any():
+        return None
+    difference = Difference.between(initial, found)
+    return difference if difference.chance(MOUNTING) < CHANCE else None
 
 
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
@@ -258,7 +290,8 @@ def _changes(
         difference = Difference.between(together(series[:k]), together(series[k:]))
         # by how surprising it is: where few components are compared, a smaller sum is as much. Beyond what a double
         # holds as a probability the sum itself decides
-        surprise = difference.chance(components), -difference.test(components).value
+        test = difference.test(components)
+        surprise = difference.chance(components, test), -test.value
         if surprise[0] < chance and (best is None or surprise < best):
             best, found, at = surprise, difference, k
     if best is None:
@@ -281,192 +314,3 @@ def _scatter(series: list[Extrinsics], starts: list[Extrinsics], together: _Toge
             test = Difference.between(together(stretch[:k]), stretch[k]).test(MOUNTING)
             total, freedom = total + test.value, freedom + test.freedom
     return ChiSquare.of(total, freedom)
-
-
-# ------------------------------------------------------------------ in words
-
-
-def sentences(comparison: Comparison) -> list[str]:
-    """What there is to say, the mounting first."""
-    said = [_moved(change) for change in comparison.moved]
-    said = said + [_suspicious(change) for change in comparison.suspicious] or [_same(comparison)]
-    said += [
-        f"The scale has changed by {100 * change.difference.value[SCALE]:+.2f} % ± "
-        f"{100 * change.difference.std[SCALE]:.2f} % {_between(change)}: the speed of sound, or the DVL's settings."
-        for change in comparison.scale_changed
-    ]
-    for change in comparison.clock_changed:
-        seconds, std = change.difference.value[TIME_OFFSET], change.difference.std[TIME_OFFSET]
-        way = "later" if seconds > 0.0 else "earlier"
-        said.append(
-            f"The DVL's stamps come {abs(seconds):.2f} s ± {std:.2f} s {way} {_between(change)}: a clock, not the "
-            "mounting."
-        )
-    scatter = comparison.scatter
-    if scatter.freedom and scatter.p < CHANCE:
-        by = math.sqrt(scatter.value / scatter.freedom)
-        said.append(
-            f"Beside that they scatter by {by:.1f} times their σ: what is said to have moved is as uncertain as that."
-            if comparison.moved
-            else f"They scatter by {by:.1f} times their σ, without one instant that would explain it: σ is too small."
-        )
-    return said
-
-
-def _same(comparison: Comparison) -> str:
-    pairs = [pair for pair in comparison.pairs if pair.compared[TURN].any()]
-    apart = max((float(np.nanmax(np.abs(pair.value[TURN]))) for pair in pairs), default=0.0)
-    scatter = comparison.scatter
-    scattered = scatter.freedom and scatter.p < CHANCE
-    begins = "The mounting has moved at no one instant" if scattered else "The same mounting within σ"
-    return (
-        f"{begins}: {len(comparison.calibrations)} calibrations differ by at most "
-        f"{math.degrees(apart):.2f}° about any axis (χ² {scatter.value:.1f} of {scatter.freedom}, p {_p(scatter.p)})."
-    )
-
-
-def _moved(change: Change) -> str:
-    """The sentence on a mounting that moved."""
-    return f"The mounting has moved {moved_in_words(change.difference)} {_between(change)}."
-
-
-def _suspicious(change: Change) -> str:
-    """The sentence on a mounting that may have moved."""
-    often = 1.0 / change.difference.chance(MOUNTING)
-    return (
-        f"The mounting may have moved {moved_in_words(change.difference)} {_between(change)}; chance makes as much of "
-        f"one that did not in 1 of {often:.0f} comparisons. Calibrate once more before you rely on either."
-    )
-
-
-def moved_in_words(difference: Difference) -> str:
-    """By how much a mounting moved, such as ``by 0.70° ± 0.05° about z``."""
-    turn, arm = difference.test(MOUNTING[TURN]), difference.test(MOUNTING[LEVER_ARM])
-    parts = []
-    if turn.freedom and (turn.p < CHANCE or not arm.p < CHANCE):
-        parts.append(f"by {turn_in_words(difference)}")
-    if arm.freedom and (arm.p < CHANCE or not parts):
-        found = ((axis, difference.value[LEVER_ARM][i], difference.std[LEVER_ARM][i]) for i, axis in enumerate("xyz"))
-        shown = (f"{axis} {value:+.2f} m ± {std:.2f} m" for axis, value, std in found if std == std)
-        parts.append(f"in its place (lever arm {', '.join(shown)})")
-    return " and ".join(parts)
-
-
-def turn_in_words(difference: Difference) -> str:
-    """Size, σ and axis of a turn, such as ``0.70° ± 0.05° about z``."""
-    turn = np.where(difference.compared[TURN], difference.value[TURN], 0.0)
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return "0.00°"
-    axis = turn / angle
-    std = math.sqrt(float(axis @ difference.covariance[TURN, TURN] @ axis))
-    size = f"{math.degrees(angle):.2f}° ± {math.degrees(std):.2f}°"
-    most = int(np.argmax(np.abs(axis)))
-    if abs(axis[most]) > ABOUT:
-        return f"{'-' if axis[most] < 0.0 else ''}{size} about {'xyz'[most]}"
-    each = (
-        f"{name} {math.degrees(value):+.2f}°"
-        for name, value, known in zip("xyz", turn, difference.compared[TURN], strict=True)
-        if known
-    )
-    return f"{size} ({', '.join(each)})"
-
-
-def _between(change: Change) -> str:
-    before, after = change.last_before, change.first_after
-    if before.last_ns > after.first_ns:  # simulated, or stamped from a start of their own
-        return f"between {before.name} and {after.name}"
-    return f"between {date(before.last_ns)} ({before.name}) and {date(after.first_ns)} ({after.name})"
-
-
-def date(stamp_ns: int) -> str:
-    """A stamp as people read it, UTC."""
-    try:
-        return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).strftime("%Y-%m-%d %H:%M")
-    except (ValueError, OverflowError, OSError):
-        return f"{stamp_ns * 1e-9:.0f} s"
-
-
-def _p(p: float) -> str:
-    return f"{p:.2f}" if p >= 0.01 else f"{p:.0e}"
-
-
-def remarks(comparison: Comparison) -> list[str]:
-    """What makes the differences worth less than they look, in sentences."""
-    found = [f"{each.name}: {remark}" for each in comparison.calibrations for remark in each.remarks]
-    models = dict.fromkeys(each.model for each in comparison.calibrations)
-    if len(models) > 1:
-        found.append(
-            f"the models differ ({', '.join(models)}): so may their errors; calibrate all with one model (-p model:=G2)"
-        )
-    assumed = [each for each in comparison.calibrations if not each.shown[LEVER_ARM].any()]
-    known = [each for each in comparison.calibrations if each.shown[LEVER_ARM].any()]
-    for each in assumed:
-        for other in (*known, *assumed):
-            off = np.where(other.shown[LEVER_ARM] | (other not in known), other.lever_arm - each.lever_arm, 0.0)
-            if float(np.linalg.norm(off)) > ARM_MATTERS:
-                numbers = ", ".join(f"{value:.2f}" for value in other.lever_arm)
-                verb = "finds" if other in known else "assumes"
-                found.append(
-                    f"{each.name} assumes another lever arm than {other.name} {verb}, {numbers} m, and its angles "
-                    f"suffer: calibrate it again with -p lever_arm:=[{numbers}]"
-                )
-                break
-    return found
-
-
-# ------------------------------------------------------------------ plain data
-
-
-def comparison_document(comparison: Comparison) -> dict[str, Any]:
-    """`compare --json`: SI units, turns about the body's axes."""
-    return {
-        "verdict": comparison.word,
-        "same_mounting": comparison.same_mounting,
-        "says": sentences(comparison),
-        "remarks": remarks(comparison),
-        "calibrations": [
-            {
-                "name": each.name,
-                "model": each.model,
-                "first_ns": each.first_ns,
-                "last_ns": each.last_ns,
-                "used": each.used,
-                "mounting_rpy": rpy_from_rotation(each.rotation_body_from_dvl).tolist(),
-                "lever_arm": each.lever_arm.tolist(),
-                "scale": each.scale,
-                "dvl_time_offset": each.time_offset,
-                "std": dict(zip(COMPONENTS, each.std.tolist(), strict=True)),
-            }
-            for each in comparison.calibrations
-        ],
-        "pairs": [_difference_document(each) for each in comparison.pairs],
-        "against_rest": [_difference_document(each) for each in comparison.against_rest],
-        **{
-            name: [
-                {
-                    "last_before": change.last_before.name,
-                    "first_after": change.first_after.name,
-                    **_difference_document(change.difference),
-                }
-                for change in getattr(comparison, name)
-            ]
-            for name in ("moved", "suspicious", "scale_changed", "clock_changed")
-        },
-        "scatter": comparison.scatter._asdict(),
-    }
-
-
-def _difference_document(difference: Difference) -> dict[str, Any]:
-    return {
-        "first": difference.first.name,
-        "second": difference.second.name,
-        "value": dict(zip(COMPONENTS, difference.value.tolist(), strict=True)),
-        "std": dict(zip(COMPONENTS, difference.std.tolist(), strict=True)),
-        "chi_square": {
-            "mounting": difference.test(MOUNTING)._asdict(),
-            "scale": difference.test(ONLY_SCALE)._asdict(),
-            "clock": difference.test(ONLY_CLOCK)._asdict(),
-            "all": difference.test()._asdict(),
-        },
-    }

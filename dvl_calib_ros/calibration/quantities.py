@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .comparison import date
+from .comparison_words import date
 from .frames import rpy_from_rotation
 from .kalman import GaussianState
 from .models import MODELS

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
 
+from ..verdict.kinds import Severity
+from ..verdict.reasons import Reason, by_severity, finding
 from .chi_square import chi2_isf
 from .error_model import CORRECTION_JACOBIAN, correction_matrix
 from .folds import FOLDS, Moments
@@ -108,31 +109,24 @@ def _calibration_variance(covariance: Array, vv: Array, rotation_body_from_dvl: 
 _JACOBIAN_BY_ERROR: Array = CORRECTION_JACOBIAN.reshape(3, 3, 6).swapaxes(1, 2)
 
 
-class Word(Enum):
-    """What to do with a calibration."""
-
-    ACCEPT = "accept"
-    MARGINAL = "marginal"
-    REJECT = "reject"
-
-
 @dataclass(frozen=True)
 class Verification:
-    """The verdict on one model's calibration, with reasons (sentences, the decisive ones first).
+    """The verdict on one model's calibration, with reasons, the decisive ones first.
 
-    mounting: what there is to inspect about the mounting, '' for nothing: a good calibration may be of a bad one.
+    verdict: reject, marginal or accept. mounting: what there is to inspect about the mounting, None for nothing: a good
+    calibration may be of a bad one.
     """
 
     model: str
     held_out: HeldOutError | None
-    verdict: Word
-    reasons: tuple[str, ...]
-    mounting: str = ""
+    verdict: Severity
+    reasons: tuple[Reason, ...]
+    mounting: Reason | None = None
 
-    def with_objections(self, objections: Sequence[tuple[Word, str]]) -> Verification:
+    def with_objections(self, objections: Sequence[Reason]) -> Verification:
         """With what else is known of it, as said first; the verdict is the worst of all."""
-        worst = min((self.verdict, *(word for word, _ in objections)), key=_SEVERITY.index)
-        return replace(self, verdict=worst, reasons=(*(sentence for _, sentence in objections), *self.reasons))
+        reasons = (*objections, *self.reasons)
+        return replace(self, verdict=by_severity(reasons)[0].severity, reasons=reasons)
 
 
 def verify(
@@ -167,45 +161,38 @@ def verify(
     own_error: Velocity error that its σ by blocks of time leads one to expect, m/s rms, as of `calibration_error`.
 
     """
-    findings = [
-        *use_findings(used_and_gated),
-        *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
-        *([(Word.REJECT, f"{suggestion}, not the configuration given")] if suggestion else []),
-        *_size_findings(model, state, parameters),
-        *_convergence_findings(convergence),
-        _error_finding(held_out, parameters, reference_claims, typical_error, own_error),
-    ]
-    findings.sort(key=lambda finding: _SEVERITY.index(finding[0]))
-    reasons = tuple(sentence for _, sentence in findings)
-    return Verification(model.name, held_out, findings[0][0], reasons, _to_inspect(model, state, parameters))
+    reasons = by_severity(
+        [
+            *use_findings(used_and_gated),
+            *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
+            *([finding("CONFIGURATION_WRONG", says=suggestion).weighed(Severity.REJECT)] if suggestion else []),
+            *_size_findings(model, state, parameters),
+            *_convergence_findings(convergence),
+            _error_finding(held_out, parameters, reference_claims, typical_error, own_error),
+        ]
+    )
+    inspect = _to_inspect(model, state, parameters)
+    return Verification(model.name, held_out, reasons[0].severity, tuple(reasons), inspect)
 
 
-Finding = tuple[Word, str]
-_SEVERITY = (Word.REJECT, Word.MARGINAL, Word.ACCEPT)
-
-
-def use_findings(used_and_gated: tuple[int, int] | None) -> list[Finding]:
+def use_findings(used_and_gated: tuple[int, int] | None) -> list[Reason]:
     """What it says of an estimate how many samples it used, and threw out."""
     if used_and_gated is None:
         return []
     used, gated = used_and_gated
     if not used:
-        return [(Word.REJECT, "no sample was used: there is nothing to apply")]
+        return [finding("NO_SAMPLE_USED")]
     if gated > MOST_GATED * (used + gated):
-        return [
-            (Word.REJECT, f"{gated} of {used + gated} samples contradict it and were gated: it is that of the rest")
-        ]
+        return [finding("MOST_SAMPLES_GATED", gated=gated, given=used + gated, used=used)]
     return []
 
 
-def _lever_arm_findings(turns: str, is_found: bool, parameters: Parameters) -> list[Finding]:
+def _lever_arm_findings(turns: str, is_found: bool, parameters: Parameters) -> list[Reason]:
     if not turns:
         return []
-    remedy = "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways"
     if is_found:
-        return [(Word.MARGINAL, f"the lever arm is not shown well, and {turns}: {remedy}")]
-    known = f"the lever arm is known to ±{parameters.initial_std_lever_arm:.2g} m"
-    return [(Word.REJECT, f"{known}, and {turns}: {remedy}")]
+        return [finding("LEVER_ARM_NOT_SHOWN", turns=turns)]
+    return [finding("LEVER_ARM_TURNS_ANGLE", std=parameters.initial_std_lever_arm, turns=turns)]
 
 
 def shown_misalignment(model: Model, state: GaussianState, parameters: Parameters) -> Array:
@@ -222,20 +209,17 @@ def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> fl
     return math.degrees(math.atan(float(np.linalg.norm(shown_misalignment(model, state, parameters)))))
 
 
-def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> str:
+def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> Reason | None:
     angle, from_deg = _angle_deg(model, state, parameters), math.degrees(parameters.accept_misalignment)
-    if angle < from_deg:
-        return ""
-    return f"inspect the mounting: it is {angle:.1f}° from mounting_rpy, {from_deg:.1f}° or more"
+    return None if angle < from_deg else finding("MOUNTING_FAR", degrees=angle, limit=from_deg)
 
 
-def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Finding]:
+def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Reason]:
     errors = model.error_terms_from_state @ state.x
     angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
     findings = []
     if angle >= reject:
-        remedy = "is mounting_rpy right, and are the frames?"
-        findings.append((Word.REJECT, f"the misalignment is {angle:.1f}°, {reject:.1f}° or more: {remedy}"))
+        findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject))
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
     known = (variance > 0.0) & (
@@ -243,8 +227,7 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     )
     scale = float(np.abs(errors[3:][known]).max(initial=0.0))
     if scale > parameters.max_scale_error:
-        limit = 100.0 * parameters.max_scale_error
-        findings.append((Word.REJECT, f"a scale is {100.0 * scale:.1f} % off, more than {limit:.1f} %"))
+        findings.append(finding("SCALE_LARGE", percent=100.0 * scale, limit=100.0 * parameters.max_scale_error))
     return findings
 
 
@@ -254,46 +237,40 @@ def _error_finding(
     reference_claims: bool,
     typical_error: float | None,
     own_error: float,
-) -> Finding:
+) -> Reason:
     if held_out is None:
-        return Word.MARGINAL, "too few samples with a reference velocity to verify it on held-out data"
+        return finding("HELD_OUT_TOO_FEW")
     uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
-    found = (
-        f"on {held_out.samples} samples that it had not seen the velocity error is {uncorrected:.3f} m/s rms without "
-        f"correction, {corrected:.3f} with it, {predicted:.3f} predicted"
-    )
+    said: dict[str, float] = {
+        "samples": held_out.samples,
+        "uncorrected": uncorrected,
+        "corrected": corrected,
+        "predicted": predicted,
+    }
     # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts
     # that is more than the filter says, and being worse is no contradiction
     worse = corrected**2 - uncorrected**2
     is_large = corrected > SEVERAL * predicted
     if is_large and typical_error is not None and typical_error < SEVERAL * predicted:
         # nor do they say which is the worse
-        return Word.MARGINAL, f"{found}, {typical_error:.3f} without outliers: there are many of them"
+        return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
     if worse > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
-        return Word.REJECT, f"{found}: the calibration makes it worse"
+        return finding("HELD_OUT_WORSE", **said)
     if is_large:
-        return Word.REJECT, (
-            f"{found}, several times less: the configuration is wrong, or an effect is missing from the model "
-            "(dvl-calib diagnose looks for it)"
-        )
+        return finding("HELD_OUT_SEVERAL_TIMES", **said)
     if reference_claims and corrected < IMPLAUSIBLE * predicted:
-        return Word.REJECT, (
-            f"{found}: implausibly small. Was the DVL fused into the reference? Then that cannot judge it; take GNSS "
-            "alone"
-        )
+        return finding("HELD_OUT_IMPLAUSIBLE", **said)
     if worse > WORSE_FROM * held_out.calibration**2:
-        return Word.MARGINAL, f"{found}: it gets no better, which may be for want of data, as σ says"
+        return finding("HELD_OUT_NO_BETTER", **said)
     dof = 3 * held_out.samples
     by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)
     if corrected > predicted * parameters.max_error_ratio * by_chance:
-        return Word.MARGINAL, f"{found}: the reference is noisier than it says, or an effect is missing from the model"
-    return Word.ACCEPT, found
+        return finding("HELD_OUT_NOISIER", **said)
+    return finding("HELD_OUT", **said)
 
 
-def _convergence_findings(convergence: Convergence) -> list[Finding]:
-    if convergence is Convergence.COLLECTING:
-        return [(Word.MARGINAL, "the data has shown none of the angles yet")]
-    return []
+def _convergence_findings(convergence: Convergence) -> list[Reason]:
+    return [finding("NO_ANGLE_SHOWN")] if convergence is Convergence.COLLECTING else []
 
 
 def verification_document(verification: Verification) -> dict[str, Any]:
@@ -301,8 +278,9 @@ def verification_document(verification: Verification) -> dict[str, Any]:
     held_out = verification.held_out
     return {
         "verdict": verification.verdict.value,
-        "reasons": list(verification.reasons),
-        "mounting": verification.mounting,
+        "reasons": [each.sentence for each in verification.reasons],
+        "findings": [each.as_dict() for each in verification.reasons],
+        "mounting": verification.mounting.sentence if verification.mounting is not None else "",
         "held_out": None
         if held_out is None
         else {

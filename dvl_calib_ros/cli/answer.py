@@ -40,7 +40,7 @@ def print_answer(out: Console, replayed: Replayed) -> None:
     from rich.markup import escape
 
     from ..calibration.samples import VelocityFrame
-    from ..calibration.verification import Word
+    from ..verdict.kinds import Severity
 
     result = replayed.result
     for found in replayed.findings:
@@ -48,13 +48,13 @@ def print_answer(out: Console, replayed: Replayed) -> None:
             out.print(f"[bold]{escape(_capital(found.says))}.[/]")
     verification = result.verifications[result.selected]
     advice, colour = VERDICTS[verification.verdict.value]
-    reasons = "; ".join(verification.reasons)
+    reasons = "; ".join(each.sentence for each in verification.reasons)
     text = f"{advice} {_capital(reasons) if advice.endswith('.') else reasons}."
     out.print(f"[bold {colour}]{verification.verdict.value}[/]: {escape(text)}")
-    if verification.mounting:
-        out.print(escape(f"{_capital(verification.mounting)}."))
+    if verification.mounting is not None:
+        out.print(escape(f"{_capital(verification.mounting.sentence)}."))
     out.print()
-    rejected = verification.verdict is Word.REJECT
+    rejected = verification.verdict is Severity.REJECT
     out.print(f"[dim]Not to be used: {escape(_headline(replayed))}[/]" if rejected else escape(_headline(replayed)))
     out.print(_table(replayed), style="dim" if rejected else None)
     if replayed.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):

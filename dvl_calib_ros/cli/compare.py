@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from ..streams import give_up
 from . import common
+from .answer import VERDICTS
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print."""
-    from ..calibration.comparison import check_distinct, compare, comparison_document
+    from ..calibration.comparison import check_distinct, compare
+    from ..calibration.comparison_words import comparison_document
     from ..errors import InputError
 
     paths: list[Path] = arguments.results
@@ -65,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except BrokenPipeError:  # | head: the answer is the exit code all the same
         give_up(sys.stdout)
-    return {"same": 0, "moved": 1, "suspicious": 3}[comparison.word]
+    return comparison.answer.exit_code
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -98,15 +100,14 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
 def _print(comparison: Comparison) -> None:
     from rich.markup import escape
 
-    from ..calibration.comparison import remarks, sentences
+    from ..calibration.comparison_words import reasons, remarks
     from ..errors import printable
 
-    common.print_warnings(remarks(comparison))
+    common.print_warnings([str(each) for each in remarks(comparison)])
     out = common.console()
-    word = comparison.word
-    colour = {"same": "green", "suspicious": "yellow", "moved": "red"}[word]
-    first, *others = sentences(comparison)
-    out.print(f"[bold {colour}]{word}[/]: {escape(printable(first))}")
+    _, colour = VERDICTS[comparison.answer.severity.value]
+    first, *others = (each.full_sentence for each in reasons(comparison))
+    out.print(f"[bold {colour}]{comparison.word}[/]: {escape(printable(first))}")
     for sentence in others:
         out.print(escape(printable(sentence)))
     out.print()
@@ -139,7 +140,7 @@ def _calibrations(comparison: Comparison) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    from ..calibration.comparison import date
+    from ..calibration.comparison_words import date
     from ..calibration.frames import rpy_from_rotation
     from ..errors import printable
 

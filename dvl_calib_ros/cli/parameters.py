@@ -5,6 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+# Tables of what is said, by their names in `verdict.reasons`.
+_TABLES = {
+    "findings": "every warning with its meaning and remedy",
+    "doctor": "everything that the doctor can find wrong with a bag",
+    "verdicts": "every reason for which a calibration is or is not to be used",
+    "comparisons": "everything that compare can say",
+}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
@@ -13,8 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
     what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
-    what.add_argument("--findings", action="store_true", help="every warning with its meaning and remedy")
-    what.add_argument("--doctor", action="store_true", help="everything that the doctor can find wrong with a bag")
+    for name, told in _TABLES.items():
+        what.add_argument(f"--{name}", action="store_true", help=told)
     what.add_argument("--commands", action="store_true", help="every command with an example")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
@@ -42,10 +50,10 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.commands:
         print(command_table(), end="")
         return
-    if arguments.findings or arguments.doctor:
+    if asked := next((name for name in _TABLES if getattr(arguments, name)), None):
         from ..verdict.reasons import TABLES, table
 
-        print(table(TABLES["findings" if arguments.findings else "doctor"]), end="")
+        print(table(TABLES[asked]), end="")
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters

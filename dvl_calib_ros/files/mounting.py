@@ -21,8 +21,10 @@ from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import position_in_body, scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
-from ..calibration.verification import Word, use_findings
+from ..calibration.verification import use_findings
 from ..errors import InputError
+from ..verdict.kinds import VERDICT_WORDS, Severity
+from ..verdict.reasons import finding
 from .parameter_edit import as_yaml, new_file, with_parameters
 from .parameter_files import NODE_NAME, changed_parameters, load_parameters
 from .result_file import load_result, static_transform_arguments
@@ -159,19 +161,20 @@ def _judged(
     if verification is None:
         doubts.append("it is not verified on held-out data, as the node cannot; `dvl-calib replay` of a recording does")
         return tuple(objections), tuple(doubts)
-    verdict, reason = Word(verification["verdict"]), str(verification["reasons"][0])
-    if verdict is Word.REJECT:
+    verdict, reason = VERDICT_WORDS[verification["verdict"]], str(verification["reasons"][0])
+    if verdict is Severity.REJECT:
         objections.append(f"its verdict is reject: {reason}")
-    elif verdict is Word.MARGINAL:
+    elif verdict is Severity.MARGINAL:
         doubts.append(f"its verdict is marginal: {reason}")
     return tuple(objections), tuple(doubts)
 
 
 def _unverified(content: Mapping[str, Any], model: Model) -> tuple[str, ...]:
     """Objections to what the node saved, which it cannot verify but knows to be of a wrong configuration."""
-    objections = [f"{content['suggestion']}, not the configuration given"] if content.get("suggestion") else []
+    says = content.get("suggestion")
+    objections = [finding("CONFIGURATION_WRONG", says=says).sentence] if says else []
     used_and_gated = (int(content["used"]), int(content["gated"]))
-    objections += [sentence for _, sentence in use_findings(used_and_gated)] if model.aided else []
+    objections += [each.sentence for each in use_findings(used_and_gated)] if model.aided else []
     return tuple(objections)
 
 

@@ -15,15 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import (
-    CHANCE,
-    MOUNTING,
-    Comparison,
-    Difference,
-    compare,
-    moved_in_words,
-    sentences,
-)
+from ..calibration.comparison import Comparison, compare, contradicts
+from ..calibration.comparison_words import between, moved_in_words, scale_changed, suspicious
 from ..calibration.dropouts import DROPOUT_NS
 from ..calibration.error_model import corrected_mounting
 from ..calibration.extrinsics import Extrinsics
@@ -32,7 +25,7 @@ from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
-from ..calibration.verification import Word, shown_misalignment
+from ..calibration.verification import shown_misalignment
 from ..errors import InputError
 from ..files.extrinsics import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together
@@ -61,45 +54,25 @@ class Recordings:
     pauses_ns: tuple[int, ...]
     number: int
 
-    def objections(self, model: str, parted: bool) -> list[tuple[Word, str]]:
+    def objections(self, model: str, parted: bool) -> list[Reason]:
         """Why an estimate of all of them together by this model is not to be used as it is.
 
         parted: whether it has a delay for each."""
-        found = []
+        found: list[Reason] = []
         if self.overlapping is not None:
             first, second = self.overlapping
-            found.append(
-                (
-                    Word.REJECT,
-                    f"{first} and {second} hold the DVL at the same time, so of many samples only the first is used: "
-                    "replay each by itself, and compare them",
-                )
-            )
+            found.append(finding("BAGS_OVERLAP", first=first, second=second))
         if self.comparison is None:
             return found
-        said = sentences(self.comparison)
-        mountings = [*self.comparison.moved, *self.comparison.suspicious]
-        surely = CHANCE / (len(self.comparison.calibrations) - 1)
-        for change, sentence in zip(mountings, said, strict=False):
-            rejected = change.difference.chance(MOUNTING) < surely
-            averaged = ": all together are averaged, which is the mounting of neither" if rejected else ""
-            found.append((Word.REJECT if rejected else Word.MARGINAL, f"{_decapitalised(sentence)}{averaged}"))
+        for change in (*self.comparison.moved, *self.comparison.suspicious):
+            if change in self.comparison.contradicting:
+                words = moved_in_words(change.difference)
+                found.append(finding("BAGS_MOUNTING_DIFFERS", moved=words, between=between(change)))
+            else:
+                found.append(suspicious(change))
         if self.comparison.clock_changed and "time_offset" in MODELS[model].state_names and not parted:
-            found.append(
-                (
-                    Word.REJECT,
-                    "the DVL's stamps are late by another delay in each, and one is taken for all that follow each "
-                    "other so closely: calibrate each by itself",
-                )
-            )
-        n_mountings = max(1, len(mountings))  # without any there is one sentence that says so
-        scales = said[n_mountings : n_mountings + len(self.comparison.scale_changed)]
-        found += [(Word.MARGINAL, _decapitalised(sentence)) for sentence in scales]
-        return found
-
-
-def _decapitalised(sentence: str) -> str:
-    return sentence[:1].lower() + sentence[1:].removesuffix(".")
+            found.append(finding("BAGS_DELAY_CHANGED"))
+        return [*found, *map(scale_changed, self.comparison.scale_changed)]
 
 
 def checked_replay(
@@ -250,7 +223,7 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
     for name, verification in result.verifications.items():
         objections = recordings.objections(name, parted=len(result.days) >= recordings.number)
         if name == result.selected and merge:
-            notes += [f"merged as asked: {sentence}" for _, sentence in objections]
+            notes += [f"merged as asked: {each.sentence}" for each in objections]
         verifications[name] = verification if merge else verification.with_objections(objections)
     if recordings.unchecked:
         names = ", ".join(recordings.unchecked)
@@ -303,16 +276,8 @@ def _with_fitting_start(
         recording, parameters.replace(initial_calibration=""), topics, progress_of(first + 1), with_history=with_history
     )
     found = extrinsics_of_replay(alone, "these data")
-    contradiction = None if found is None else _contradiction(load_extrinsics(Path(saved), saved), found)
+    contradiction = None if found is None else contradicts(found, load_extrinsics(Path(saved), saved))
     if contradiction is None:
         return replayed
-    said = finding("INITIAL_CONTRADICTED", file=saved, difference=contradiction)
+    said = finding("INITIAL_CONTRADICTED", file=saved, difference=moved_in_words(contradiction))
     return replace(alone, findings=(*alone.findings, said), notes=(*alone.notes, str(said)))
-
-
-def _contradiction(initial: Extrinsics, found: Extrinsics) -> str | None:
-    """In what the mounting that data alone show differs from an initial one; None if it does not."""
-    if not (initial.shown[:6] & found.shown[:6]).any():
-        return None
-    difference = Difference.between(initial, found)
-    return moved_in_words(difference) if difference.chance(MOUNTING) < CHANCE else None

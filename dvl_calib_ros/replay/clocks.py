@@ -10,7 +10,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.register.arrival import apart
 from ..calibration.robust import median
 from ..calibration.samples import SampleBlock, Stamps, Stream, Streams
-from ..calibration.verification import Word
+from ..verdict.reasons import Reason, finding
 
 SPOKEN: Mapping[Stream, str] = {
     Stream.DVL: "the DVL's",
@@ -40,7 +40,7 @@ class StreamClocks:
             before = np.searchsorted(dvl.arrival, other.arrival) - 1
             self._ahead[stream].add(other.stamps_ns - dvl.stamps_ns[before])
 
-    def objections(self, parameters: Parameters) -> list[tuple[Word, str]]:
+    def objections(self, parameters: Parameters) -> list[Reason]:
         """What clocks that differ by more than any model looks for say against every calibration."""
         ahead = {Stream.DVL: 0.0}
         for stream, spread in self._ahead.items():
@@ -50,11 +50,13 @@ class StreamClocks:
         for each in apart(ahead, parameters):
             known = WELL_KNOWN.get(round(abs(each.ahead)))
             said.append(
-                (
-                    Word.REJECT,
-                    f"{SPOKEN[each.stream]} stamps are {abs(each.ahead):.1f} s {each.side} {SPOKEN[each.other]} with "
-                    f"which they came{f' ({known})' if known else ''}: set the clocks by one source, correct the "
-                    "recording's stamps",
+                finding(
+                    "CLOCKS_APART",
+                    whose=SPOKEN[each.stream],
+                    seconds=abs(each.ahead),
+                    side=each.side,
+                    other=SPOKEN[each.other],
+                    known=f" ({known})" if known else "",
                 )
             )
         return said

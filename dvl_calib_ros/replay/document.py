@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from .. import __version__
-from ..calibration.comparison import comparison_document
+from ..calibration.comparison_words import comparison_document
 from ..calibration.verification import verification_document
 from ..files.result_file import days_document, estimate_document
 from .navigation import navigation_document

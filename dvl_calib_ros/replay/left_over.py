@@ -24,7 +24,7 @@ from ..calibration.attitude_rates import LEVEL_BELOW
 from ..calibration.frames import Array, cross, skew
 from ..calibration.robust import median, robust_std
 from ..calibration.samples import Index
-from ..calibration.verification import Word
+from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
@@ -156,28 +156,29 @@ def left_over(
     )  # fmt: skip
 
 
-def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[tuple[Word, Reason]]:
-    """What to say of it, and what it is to the verdict.
+def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[Reason]:
+    """What to say of it, as bad as it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
     """
     if found is None:
         return []
     if found.circular > max(FOLLOWED_SURELY * found.circular_std, FOLLOWED_FROM):
-        return [(Word.REJECT, finding("CIRCULAR_REFERENCE", seconds=found.circular_s))]
+        return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
     seconds = math.sqrt(2.0 * abs(found.smoothed))
     is_ours = of_positions and found.smoothed > 0.0
     if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
-        word = Word.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Word.MARGINAL
+        word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
         # what else it follows then comes of that
-        return [(word, finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds))]
+        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(word)]
     said = []
     for axis, name in enumerate(("roll", "pitch")):
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
         if abs(share) > max(SURELY * std, NOT_FOLLOWED):
             off = abs(share * float(found.lean[axis]))
-            word = Word.REJECT if off > WRONG_FROM or abs(share) > WRONG_SIGN_FROM else Word.MARGINAL
-            said.append((word, finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))))
+            word = Severity.REJECT if off > WRONG_FROM or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
+            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
+            said.append(found_tilt.weighed(word))
     size = np.abs(found.bias)
     shown = (size > SURELY * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():
@@ -187,8 +188,8 @@ def left_over_advice(found: Followed | None, of_positions: bool = False) -> list
             if shown[i]
         )
         turned = float(size[shown].max()) / found.speed
-        word = Word.REJECT if turned > WRONG_FROM else Word.MARGINAL
-        said.append((word, finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned))))
+        word = Severity.REJECT if turned > WRONG_FROM else Severity.MARGINAL
+        said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
     return said
 
 

@@ -22,7 +22,7 @@ from ..calibration.kalman import GaussianState
 from ..calibration.parameters import Parameters
 from ..calibration.robust import median
 from ..calibration.samples import Index
-from ..calibration.verification import Word
+from ..verdict.reasons import Reason, finding
 from .heading_deviation import HeadingDeviation, heading_deviation
 from .left_over import Followed, left_over
 
@@ -268,7 +268,7 @@ def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
     }
 
 
-def objections(navigation: Navigation | None) -> list[tuple[Word, str]]:
+def objections(navigation: Navigation | None) -> list[Reason]:
     """What the drift says against a calibration: velocities may fit better and the track worse."""
     if navigation is None or navigation.stretches < ENOUGH:
         return []
@@ -276,15 +276,8 @@ def objections(navigation: Navigation | None) -> list[tuple[Word, str]]:
     if after < WORSE * before or after**2 - before**2 < (2.0 * noise) ** 2:
         if float(metres(after)) <= float(metres(before)):
             return []
-        figures = f"{metres(after)} m per km with it, {metres(before)} as mounted"
-        return [(Word.MARGINAL, f"on data held out dead reckoning gets no better: {figures}")]
-    return [
-        (
-            Word.REJECT,
-            f"on data held out dead reckoning drifts by {metres(after)} m per km with it, by {metres(before)} as "
-            "mounted: an effect is missing from the model (dvl-calib diagnose looks for it)",
-        )
-    ]
+        return [finding("DRIFT_NO_BETTER", after=after, before=before)]
+    return [finding("DRIFT_WORSE", after=after, before=before)]
 
 
 def in_words(navigation: Navigation) -> list[str]:

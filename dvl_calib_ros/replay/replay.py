@@ -25,7 +25,6 @@ from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..calibration.told_arm import told_arm_advice
-from ..calibration.verification import Word
 from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
@@ -33,6 +32,7 @@ from ..messages.drivers import REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.check import check_topics
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
+from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .clocks import StreamClocks
 from .heading_deviation import comes_first, heading_advice
@@ -42,10 +42,6 @@ from .recorder import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
 BLOCK_SIZE = 2048
-
-NOTHING_COMPARED = (
-    "there is no IMU, so no DVL sample can be compared with the reference: record its topic, with orientation"
-)
 
 
 @dataclass(frozen=True)
@@ -147,16 +143,16 @@ def replay(
         REFERENCE_TYPES[recording.types[chosen.gnss]].is_position if chosen.gnss in recording.types else False
     )
     left = left_over_advice(navigation.followed, of_positions) if navigation is not None else []
-    found += [each for _, each in left]
+    found += [each.weighed(Severity.WARNING) for each in left]
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived
     of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
-    of_clocks += [(Word.MARGINAL, each.says) for each in told] + [(word, each.says) for word, each in left]
+    of_clocks += [each.weighed(Severity.MARGINAL) for each in told] + left
     deviation = navigation.deviation if navigation is not None else None
     if deviation is not None and comes_first(deviation, result.estimate):
-        of_clocks += [(Word.REJECT, each.says) for each in deviates]
+        of_clocks += [each.weighed(Severity.REJECT) for each in deviates]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
-        of_clocks += [] if result.counts["pairing"]["paired"] else [(Word.REJECT, NOTHING_COMPARED)]
+        of_clocks += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
     return Replayed(
         replace(
             result,

@@ -21,10 +21,8 @@ from ..calibration.comparison import (
     ChiSquare,
     Comparison,
     Difference,
-    date,
-    remarks,
-    sentences,
 )
+from ..calibration.comparison_words import date, reasons, remarks
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.frames import Array, rpy_from_rotation
 from ..disk.atomic import save_bytes
@@ -64,7 +62,6 @@ def write_comparison_report(path: Path, comparison: Comparison) -> None:
     if path.suffix.lower() == ".png":
         save_bytes(path, trend_png(comparison))
         return
-    first, *others = sentences(comparison)
     write_page(
         path,
         "comparison.html",
@@ -74,10 +71,10 @@ def write_comparison_report(path: Path, comparison: Comparison) -> None:
             "written": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"),
             "verdict": {
                 "word": "same mounting" if comparison.same_mounting else comparison.word,
-                "kind": {"same": "accept", "suspicious": "marginal", "moved": "reject"}[comparison.word],
-                "reasons": [first, *others],
+                "kind": comparison.answer.severity.value,
+                "reasons": [each.full_sentence for each in reasons(comparison)],
             },
-            "warnings": remarks(comparison),
+            "warnings": [str(each) for each in remarks(comparison)],
             "pictures": [_picture(comparison, quantity) for quantity in _shown(comparison)],
             "calibrations": _calibrations(comparison),
             "pairs": _differences(

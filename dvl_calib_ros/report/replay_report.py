@@ -20,11 +20,12 @@ from ..calibration.parameters import Parameters
 from ..calibration.quantities import quantities
 from ..calibration.results import Estimate, Result
 from ..calibration.samples import VelocityFrame
-from ..calibration.verification import HeldOutError, Verification, Word
+from ..calibration.verification import HeldOutError, Verification
 from ..files.result_file import result_document
 from ..replay.navigation import Navigation, metres
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
+from ..verdict.kinds import Severity
 from . import replay_figures as figures
 from .mounting_figures import mounting_pictures
 from .navigation_figures import navigation_section
@@ -86,7 +87,7 @@ def _context(replayed: Replayed, bags: Sequence[Path], models: Sequence[str]) ->
     time = TimeAxis(history.stamps_ns)
     names = ", ".join(bag.name or str(bag) for bag in bags)
     verification = result.verifications.get(result.selected)
-    rejected = verification is not None and verification.verdict is Word.REJECT
+    rejected = verification is not None and verification.verdict is Severity.REJECT
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
     notes = [note for note in replayed.notes if not note.startswith(others)]
     return {
@@ -193,7 +194,7 @@ def _verdict(verification: Verification | None) -> dict[str, Any]:
     """Word and reasons on the selected model, large."""
     if verification is None:
         return {"word": "not verified", "reasons": ("nothing was held back to verify the calibration on",)}
-    return {"word": verification.verdict.value, "reasons": verification.reasons}
+    return {"word": verification.verdict.value, "reasons": [each.sentence for each in verification.reasons]}
 
 
 def _held_out(result: Result, shown: Sequence[str]) -> dict[str, Any] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -19,6 +20,12 @@ class Severity(Enum):
     REJECT = "reject"
     MARGINAL = "marginal"
     ACCEPT = "accept"
+
+
+# Of a verdict, by its word.
+VERDICT_WORDS: Mapping[str, Severity] = {
+    each.value: each for each in (Severity.ACCEPT, Severity.MARGINAL, Severity.REJECT)
+}
 
 
 @dataclass(frozen=True)

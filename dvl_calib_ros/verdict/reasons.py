@@ -11,13 +11,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from .comparisons import COMPARISONS
 from .doctor import DOCTOR
 from .findings import FINDINGS
 from .kinds import Kind, Severity
+from .verdicts import VERDICTS
 
 _FIELD = re.compile(r"\{[^{}]*\}")
 # What each table is of.
-TABLES: Mapping[str, Sequence[Kind]] = {"findings": FINDINGS, "doctor": DOCTOR}
+TABLES: Mapping[str, Sequence[Kind]] = {
+    "findings": FINDINGS,
+    "doctor": DOCTOR,
+    "verdicts": VERDICTS,
+    "comparisons": COMPARISONS,
+}
 KINDS: Mapping[str, Kind] = {kind.code: kind for kinds in TABLES.values() for kind in kinds}
 # The worst first.
 _WORST_FIRST = (Severity.ERROR, Severity.REJECT, Severity.MARGINAL, Severity.WARNING, Severity.ACCEPT)
@@ -45,6 +52,17 @@ class Reason:
     def page(self) -> str:
         """Where the documentation says more."""
         return KINDS[self.code].page
+
+    @property
+    def sentence(self) -> str:
+        """As a reason of a verdict; a finding goes without its remedy, which is listed with the warnings."""
+        return self.says if KINDS[self.code].is_finding or not self.remedy else f"{self.says}: {self.remedy}"
+
+    @property
+    def full_sentence(self) -> str:
+        """`sentence` with a capital and a full stop."""
+        sentence = self.sentence
+        return f"{sentence[:1].upper()}{sentence[1:]}" + ("" if sentence.endswith((".", "?")) else ".")
 
     def __str__(self) -> str:
         remedy = self.remedy

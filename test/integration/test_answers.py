@@ -13,9 +13,9 @@ from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_m
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.replay.navigation import Drift, Navigation, objections
+from dvl_calib_ros.verdict.kinds import Severity
 from validation.surveys.physics import draw, write_survey
 
 
@@ -63,7 +63,7 @@ def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
     assert "reject" in fail(capsys, "export", "gazebo", saved, "-o", tmp_path / "dvl.sdf")
 
 
-@pytest.mark.parametrize(("after", "expected"), [(9.1, []), (13.0, [Word.MARGINAL]), (9.14, [])])
+@pytest.mark.parametrize(("after", "expected"), [(9.1, []), (13.0, [Severity.MARGINAL]), (9.14, [])])
 def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
     none = np.zeros((0, 2))
     found = objections(
@@ -81,7 +81,7 @@ def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
             *[none] * 5,
         )
     )
-    assert [word for word, _ in found] == expected
+    assert [each.severity for each in found] == expected
     assert all("13 m per km with it, 9.1 as mounted" in sentence for _, sentence in found)
 
 
@@ -100,7 +100,7 @@ def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(t
     assert (result.estimates["G2"].recording_std[0] >= result.parameters["initial_std_misalignment"]) == off
     assert run.mounting.position_m == pytest.approx(LEVER_ARM, abs=0.05)
     if off:
-        assert run.verdict == "marginal" and any("another lever arm" in reason for reason in run.reasons)
+        assert run.verdict == "marginal" and "LEVER_ARM_CONTRADICTED" in run.codes
 
 
 def test_the_noise_of_a_reference_that_claims_none_is_measured(tmp_path):

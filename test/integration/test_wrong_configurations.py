@@ -16,12 +16,12 @@ from yaml_text import written
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
+from dvl_calib_ros.verdict.kinds import Severity
 
 SMALL = DvlErrors((0.01, -0.015, 0.02), (0.003,) * 3, beam_std=0.005)
 BODY, ENU, NED = VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED
@@ -127,7 +127,7 @@ WRONG = {
     ),
     "body, ENU claimed": (lambda: run(frame=BODY), {"gnss_frame": "enu"}, "the reference looks like the body frame"),
     "attitude in NED": (lambda: [attitude_in_ned(s) for s in run()], {}, "the IMU's orientation looks like NED"),
-    "a reference with the DVL in it": (lambda: of_the_dvl(run()), {}, "Was the DVL fused into the reference?"),
+    "a reference with the DVL in it": (lambda: of_the_dvl(run()), {}, "as if the DVL were fused into the reference"),
     "rates negated": (lambda: rates(run(), np.negative), {}, "the data fit an angular velocity of the other sign"),
     "rates in degrees": (lambda: rates(run(), np.degrees), {}, "an angular velocity in degrees per second"),
     "a compass heading as yaw": (lambda: with_a_compass(run()), {}, "as a compass counts it (clockwise)"),
@@ -154,8 +154,8 @@ def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_ref
     samples, given, sentence = WRONG[wrong]
     result = replay([write_bag(tmp_path / "bag", samples())], Parameters(**given)).result
     verification = result.verifications[result.selected]
-    assert verification.verdict is Word.REJECT, verification.reasons
-    assert any(sentence in reason for reason in verification.reasons), verification.reasons
+    assert verification.verdict is Severity.REJECT, verification.reasons
+    assert any(sentence in each.sentence for each in verification.reasons), verification.reasons
     saved, urdf = tmp_path / "result.yaml", tmp_path / "robot.urdf"
     saved.write_text(result_text(result_document(result)))
     links = '<parent link="base_link"/><child link="dvl_link"/>'
@@ -170,7 +170,7 @@ def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_ref
 def test_a_right_configuration_is_not_rejected_and_nothing_else_is_said_to_fit(samples, tmp_path):
     result = replay([write_bag(tmp_path / "bag", samples())], Parameters()).result
     verification = result.verifications[result.selected]
-    assert verification.verdict is Word.ACCEPT, verification.reasons
+    assert verification.verdict is Severity.ACCEPT, verification.reasons
     assert result.suggestion == ""
 
 

@@ -29,7 +29,10 @@ _MARKED = re.compile(
 # Tables that the package prints: what is asked of `dvl-calib parameters`
 PRINTED: dict[str, tuple[str, ...]] = {
     "parameters": (),
-    **{name: (f"--{name}",) for name in ("models", "effects", "drivers", "findings", "doctor", "commands")},
+    **{
+        name: (f"--{name}",)
+        for name in ("models", "effects", "drivers", "findings", "doctor", "verdicts", "comparisons", "commands")
+    },
 }
 
 

@@ -11,11 +11,9 @@ from dvl_calib_ros.calibration.comparison import (
     MOUNTING,
     Difference,
     compare,
-    comparison_document,
     fused,
-    remarks,
-    sentences,
 )
+from dvl_calib_ros.calibration.comparison_words import comparison_document, reasons, remarks
 from dvl_calib_ros.calibration.error_model import corrected_mounting
 from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of, rotation_of, turn_between
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
@@ -59,9 +57,9 @@ def test_a_mounting_that_moved_is_said_with_its_size_sigma_axis_and_dates():
     found = compare([*after, *before])  # in any order
     assert [each.name for each in found.calibrations] == ["day0", "day1", "day2", "day3"]
     assert not found.same_mounting
-    assert sentences(found) == [
-        "The mounting has moved by 0.70° ± 0.05° about z between 2025-06-16 16:06 (day1) and 2025-06-17 15:06 (day2)."
-    ]
+    (said,) = reasons(found)
+    assert said.code == "MOUNTING_MOVED" and said.numbers["moved"] == "by 0.70° ± 0.05° about z"
+    assert said.numbers["between"] == "between 2025-06-16 16:06 (day1) and 2025-06-17 15:06 (day2)"
 
 
 def test_two_moves_are_both_found_and_a_clock_or_a_speed_of_sound_is_none():
@@ -73,15 +71,18 @@ def test_two_moves_are_both_found_and_a_clock_or_a_speed_of_sound_is_none():
     assert found.clock_changed
     only = compare([extrinsics(0), extrinsics(1, late=0.5, scale=0.02)])
     assert only.same_mounting and only.clock_changed and only.scale_changed
-    said = sentences(only)
-    assert said[0].startswith("The same mounting within σ")
-    assert "+2.00 % ± 0.14 %" in said[1] and "0.50 s ± 0.01 s later" in said[2]
+    said = reasons(only)
+    assert [each.code for each in said] == ["MOUNTING_SAME", "SCALE_CHANGED", "DELAY_CHANGED"]
+    assert said[1].numbers["percent"] == pytest.approx(2.0) and said[1].numbers["std"] == pytest.approx(
+        0.1414, abs=1e-3
+    )
+    assert said[2].numbers["seconds"] == pytest.approx(0.5) and said[2].numbers["way"] == "later"
 
 
 def test_a_dvl_that_was_put_elsewhere_is_said_by_its_lever_arm():
     found = compare([extrinsics(0), extrinsics(1, arm=(0.5, 0.0, 0.0))])
-    assert sentences(found)[0].startswith(
-        "The mounting has moved in its place (lever arm x +0.50 m ± 0.03 m, y +0.00 m ± 0.03 m, z +0.00 m ± 0.03 m) "
+    assert reasons(found)[0].numbers["moved"] == (
+        "in its place (lever arm x +0.50 m ± 0.03 m, y +0.00 m ± 0.03 m, z +0.00 m ± 0.03 m)"
     )
 
 
@@ -100,9 +101,8 @@ def test_one_angle_that_differs_by_some_sigma_is_no_chance_among_five_that_do_no
     std = Difference.between(extrinsics(0), extrinsics(1)).std[2]
     found = compare([extrinsics(0), extrinsics(1, (0.0, 0.0, math.degrees(sigmas * std)))])
     assert found.word == word
-    assert sentences(found)[0].startswith(
-        {"same": "The same", "suspicious": "The mounting may", "moved": "The mounting has"}[word]
-    )
+    assert reasons(found)[0].code == f"MOUNTING_{word.upper()}"
+    assert reasons(found)[0].severity is found.answer.severity
     assert comparison_document(found)["verdict"] == word
 
 
@@ -173,7 +173,7 @@ def test_what_one_of_two_has_not_shown_is_not_compared():
         "turn_z",
     ]
     assert not found.same_mounting and np.isnan(found.pairs[0].std[0])
-    assert any("the models differ (G2, M7)" in remark for remark in remarks(found))
+    assert [each.numbers["models"] for each in remarks(found) if each.code == "MODELS_DIFFER"] == ["G2, M7"]
 
 
 def test_a_lever_arm_that_is_taken_as_known_and_is_another_is_remarked():
@@ -182,7 +182,7 @@ def test_a_lever_arm_that_is_taken_as_known_and_is_another_is_remarked():
         extrinsics(0, arm=(-1.9, 0.0, 0.0)),
         extrinsics(1, shown=assumed, covariance=np.diag(np.where(assumed, STD**2, 0.0))),
     ])  # fmt: skip
-    assert "-p lever_arm:=[-1.90, 0.00, 0.00]" in " ".join(remarks(found))
+    assert "-p lever_arm:=[-1.90, 0.00, 0.00]" in " ".join(map(str, remarks(found)))
 
 
 def test_nothing_shown_by_two_is_one_line():
@@ -203,5 +203,6 @@ def test_several_together_are_their_weighted_mean():
 def test_a_scatter_beyond_sigma_without_an_instant_is_said_to_be_a_sigma_too_small():
     found = compare([extrinsics(day, [0.1 * (-1) ** day] * 3) for day in range(12)])
     assert found.same_mounting
-    assert sentences(found)[0].startswith("The mounting has moved at no one instant: 12 calibrations differ by at most")
-    assert "scatter by 1.5 times their σ" in sentences(found)[-1]
+    first, *_, last = reasons(found)
+    assert first.code == "MOUNTING_SCATTERS" and first.numbers["count"] == 12
+    assert last.code == "SCATTER" and last.numbers["by"] == pytest.approx(1.5, abs=0.05)

@@ -15,7 +15,8 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.observability import Convergence
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.verification import HeldOutError, Word, verify
+from dvl_calib_ros.calibration.verification import HeldOutError, verify
+from dvl_calib_ros.verdict.kinds import Severity
 
 PARAMETERS = Parameters(gnss_aided_std=0.03)
 SAME = np.eye(3)
@@ -48,8 +49,8 @@ def verdict(frame=VelocityFrame.ENU, reference=SAME, attitude=(SAME, SAME), dvl=
 
 def test_a_right_configuration_is_accepted_and_nothing_is_suggested():
     found = verdict()
-    assert found.verdict is Word.ACCEPT
-    assert not any("fit" in reason or "looks like" in reason for reason in found.reasons)
+    assert found.verdict is Severity.ACCEPT
+    assert [each.code for each in found.reasons] == ["HELD_OUT"]
 
 
 @pytest.mark.parametrize(
@@ -65,18 +66,19 @@ def test_a_right_configuration_is_accepted_and_nothing_is_suggested():
 )
 def test_a_wrong_configuration_is_rejected_with_the_sentence_that_names_it(wrong, sentence):
     found = verdict(**wrong)
-    assert found.verdict is Word.REJECT
-    assert any(sentence in reason for reason in found.reasons), found.reasons
+    assert found.verdict is Severity.REJECT
+    assert any(sentence in each.sentence for each in found.reasons), found.reasons
 
 
 def test_a_large_misalignment_is_no_other_configuration():
     found = verdict(dvl=rotation_from_rpy([0.0, 0.0, np.radians(11.0)]).T)
-    assert found.verdict is Word.REJECT
-    assert "the misalignment is 1" in found.reasons[0] and not any("not the configuration" in r for r in found.reasons)
+    assert found.verdict is Severity.REJECT
+    codes = [each.code for each in found.reasons]
+    assert codes[0] == "MISALIGNMENT_LARGE" and "CONFIGURATION_WRONG" not in codes
 
 
 def test_a_mounting_that_fits_is_named_in_rad():
-    reasons = " ".join(verdict(dvl=rotation_from_rpy([0.0, 0.0, 0.785]).T).reasons)
+    reasons = " ".join(each.sentence for each in verdict(dvl=rotation_from_rpy([0.0, 0.0, 0.785]).T).reasons)
     named = reasons.partition("mounting_rpy ")[2].split()[:3]
     np.testing.assert_allclose([float(each) for each in named], [0.0, 0.0, 0.785], atol=0.02)
 
@@ -103,10 +105,10 @@ def straight_in_waves(late_s, dvl=SAME):
 
 @pytest.mark.parametrize("late_s", few([-2.5, 2.5], [2.5]))
 def test_a_dvl_that_is_late_by_half_a_wave_is_not_taken_for_one_that_points_down(late_s):
-    assert not any("forward-right-down" in reason for reason in straight_in_waves(late_s).reasons)
+    assert not any("forward-right-down" in each.sentence for each in straight_in_waves(late_s).reasons)
     flipped = straight_in_waves(late_s, FLU_FROM_FRD)
-    assert flipped.verdict is Word.REJECT
-    assert any("the DVL's axes look forward-right-down (dvl_axes: frd)" in reason for reason in flipped.reasons)
+    assert flipped.verdict is Severity.REJECT
+    assert any("the DVL's axes look forward-right-down (dvl_axes: frd)" in each.sentence for each in flipped.reasons)
 
 
 def judged(**changes):
@@ -116,20 +118,20 @@ def judged(**changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "word", "sentence"),
+    ("changes", "word", "code"),
     [
-        ({}, Word.ACCEPT, "0.050 with it"),
-        ({"used_and_gated": (0, 0)}, Word.REJECT, "no sample was used"),
-        ({"used_and_gated": (400, 600)}, Word.REJECT, "600 of 1000 samples contradict it"),
-        ({"held_out": HeldOutError(1000, 0.30, 0.20, 0.05, 0.002)}, Word.REJECT, "several times less"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.005, 0.05, 0.002)}, Word.REJECT, "fused into the reference"),
+        ({}, Severity.ACCEPT, "HELD_OUT"),
+        ({"used_and_gated": (0, 0)}, Severity.REJECT, "NO_SAMPLE_USED"),
+        ({"used_and_gated": (400, 600)}, Severity.REJECT, "MOST_SAMPLES_GATED"),
+        ({"held_out": HeldOutError(1000, 0.30, 0.20, 0.05, 0.002)}, Severity.REJECT, "HELD_OUT_SEVERAL_TIMES"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.005, 0.05, 0.002)}, Severity.REJECT, "HELD_OUT_IMPLAUSIBLE"),
     ],
     ids=["good", "nothing used", "most gated", "much worse than predicted", "reference with the DVL in it"],
 )
-def test_a_verdict_protects(changes, word, sentence):
+def test_a_verdict_protects(changes, word, code):
     found = judged(**changes)
     assert found.verdict is word
-    assert sentence in found.reasons[0]
+    assert found.reasons[0].code == code
 
 
 def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
@@ -137,8 +139,9 @@ def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
     found = verify(
         MODELS["G1"], state, Convergence.FINE, HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), Parameters(), (1000, 0)
     )
-    assert found.verdict is Word.ACCEPT
-    assert "inspect the mounting: it is 2.9°" in found.mounting
+    assert found.verdict is Severity.ACCEPT
+    assert found.mounting is not None and found.mounting.code == "MOUNTING_FAR"
+    assert found.mounting.numbers["degrees"] == pytest.approx(2.9, abs=0.05)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -156,4 +159,4 @@ def test_axes_that_hardly_show_are_not_said_to_be_turned_round(seed):
         samples.append(ReferenceSample(stamp, tuple(seen.tolist()), None, VelocityFrame.ENU))
         samples.append(DvlSample(stamp, tuple((turned.T @ (1.5, 0.0, 0.0) + rng.normal(0.0, 0.01, 3)).tolist())))
     found = calibrate(samples, PARAMETERS, verified=True, models=("G1", "G2")).verification("G1")
-    assert not any("forward-right-down" in reason for reason in found.reasons), found.reasons
+    assert not any("forward-right-down" in each.sentence for each in found.reasons), found.reasons

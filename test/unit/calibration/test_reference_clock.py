@@ -46,7 +46,7 @@ def test_a_late_reference_is_named_and_the_lever_arm_that_it_bends_is_rejected(r
     assert offset_named(said, "reference_time_offset") == pytest.approx(reference, abs=0.05)
     verification = calibrator.verification("G2")
     assert verification.verdict.value == "reject"
-    assert f"{said}, not the configuration given" in verification.reasons[0]
+    assert f"{said}, not the configuration given" in verification.reasons[0].sentence
 
 
 def offset_named(sentence: str, parameter: str) -> float:

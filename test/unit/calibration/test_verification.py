@@ -20,7 +20,8 @@ from dvl_calib_ros.calibration.observability import Convergence
 from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import ReferenceSample
-from dvl_calib_ros.calibration.verification import HeldOutError, Word, held_out_error, verify
+from dvl_calib_ros.calibration.verification import HeldOutError, held_out_error, verify
+from dvl_calib_ros.verdict.kinds import Severity
 
 GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05, calibration=0.002)
 
@@ -78,7 +79,7 @@ def test_a_good_run_is_accepted_with_the_error_that_was_predicted():
     calibrator = calibrate(make_samples(run), parameters, verified=True)
     for name in ("M1", "G1"):
         verification = calibrator.verification(name)
-        assert verification.verdict is Word.ACCEPT, verification.reasons
+        assert verification.verdict is Severity.ACCEPT, verification.reasons
         held_out = verification.held_out
         assert held_out.corrected == pytest.approx(held_out.predicted, rel=0.05)
         assert held_out.corrected < 0.99 * held_out.uncorrected
@@ -91,23 +92,23 @@ def test_a_dvl_without_errors_is_not_rejected_for_what_correcting_nothing_adds()
         run = MatchedRun("box", 200.0, gnss_std=0.1, dvl_std=0.01, seed=seed)
         calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.105), verified=True)
         for name in ("G1", "F1"):  # of M3 it would be true: noise pulls its scale
-            assert calibrator.verification(name).verdict is not Word.REJECT
+            assert calibrator.verification(name).verdict is not Severity.REJECT
 
 
 def test_a_receiver_noisier_than_it_says_makes_the_calibration_marginal():
     run = MatchedRun("box", 300.0, phi=(0.005, -0.01, 0.03), gnss_std=0.05)
     calibrator = calibrate(make_samples(run), Parameters(gnss_aided_std=0.02), verified=True)
     verification = calibrator.verification("M1")
-    assert verification.verdict is Word.MARGINAL
-    assert "noisier" in verification.reasons[0]
+    assert verification.verdict is Severity.MARGINAL
+    assert verification.reasons[0].code == "HELD_OUT_NOISIER"
 
 
 def test_without_a_reference_a_calibration_is_marginal_at_best():
     run = MatchedRun("straight", 120.0, phi=(0.0, 0.0, 0.02), gnss_every=0)
     verification = calibrate(make_samples(run), verified=True).verification("M5")
     assert verification.held_out is None
-    assert verification.verdict is Word.MARGINAL
-    assert "reference" in " ".join(verification.reasons)
+    assert verification.verdict is Severity.MARGINAL
+    assert "HELD_OUT_TOO_FEW" in [each.code for each in verification.reasons]
 
 
 @pytest.mark.parametrize("block_size", [1, 512])
@@ -126,50 +127,58 @@ def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, 
 
 def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_that_is_off():
     prior = Parameters().initial_std_misalignment  # a roll that a horizontal reference leaves at the prior's
-    assert judged(degrees=6.7, scale=0.06, std=prior).verdict is Word.ACCEPT
-    assert "inspect" not in judged(degrees=6.7, std=prior).mounting
+    assert judged(degrees=6.7, scale=0.06, std=prior).verdict is Severity.ACCEPT
+    assert judged(degrees=6.7, std=prior).mounting is None
     far = judged(degrees=27.0, std=prior)  # nine of its standard deviations are no want of motion
-    assert far.verdict is Word.REJECT and "27" in far.reasons[0]
+    assert far.verdict is Severity.REJECT and far.reasons[0].numbers["degrees"] == pytest.approx(27.0, abs=1.0)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "word", "reason"),
+    ("arguments", "word", "code"),
     [
-        ({}, Word.ACCEPT, "0.050 with it"),
-        ({"degrees": 2.1}, Word.ACCEPT, "0.050 with it"),
-        ({"degrees": 2.1, "accept_misalignment": 0.1}, Word.ACCEPT, "0.050 with it"),
-        ({"degrees": 5.1}, Word.REJECT, "mounting_rpy"),
-        ({"scale": 0.051}, Word.REJECT, "scale"),
-        ({"scale": -0.051}, Word.REJECT, "scale"),
-        ({"scale": 0.051, "max_scale_error": 0.1}, Word.ACCEPT, "0.050 with it"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002)}, Word.REJECT, "worse"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002), "own_error": 0.01}, Word.MARGINAL, "no better"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.103, 0.2, 0.002), "own_error": 0.01}, Word.REJECT, "worse"),
-        ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002)}, Word.MARGINAL, "noisier"),
+        ({}, Severity.ACCEPT, "HELD_OUT"),
+        ({"degrees": 2.1}, Severity.ACCEPT, "HELD_OUT"),
+        ({"degrees": 2.1, "accept_misalignment": 0.1}, Severity.ACCEPT, "HELD_OUT"),
+        ({"degrees": 5.1}, Severity.REJECT, "MISALIGNMENT_LARGE"),
+        ({"scale": 0.051}, Severity.REJECT, "SCALE_LARGE"),
+        ({"scale": -0.051}, Severity.REJECT, "SCALE_LARGE"),
+        ({"scale": 0.051, "max_scale_error": 0.1}, Severity.ACCEPT, "HELD_OUT"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002)}, Severity.REJECT, "HELD_OUT_WORSE"),
+        (
+            {"held_out": HeldOutError(1000, 0.10, 0.101, 0.2, 0.002), "own_error": 0.01},
+            Severity.MARGINAL,
+            "HELD_OUT_NO_BETTER",
+        ),
+        (
+            {"held_out": HeldOutError(1000, 0.10, 0.103, 0.2, 0.002), "own_error": 0.01},
+            Severity.REJECT,
+            "HELD_OUT_WORSE",
+        ),
+        ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002)}, Severity.MARGINAL, "HELD_OUT_NOISIER"),
         (
             {"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002), "max_error_ratio": 1.3},
-            Word.ACCEPT,
-            "0.060 with it",
+            Severity.ACCEPT,
+            "HELD_OUT",
         ),
-        ({"held_out": HeldOutError(1000, 0.10, 0.0501, 0.05, 0.002)}, Word.ACCEPT, "0.050 with it"),
-        ({"held_out": HeldOutError(1000, 0.0500, 0.0501, 0.0501, 0.002)}, Word.ACCEPT, "0.050 with it"),
-        ({"held_out": None}, Word.MARGINAL, "reference"),
-        ({"convergence": Convergence.COLLECTING}, Word.MARGINAL, "none of the angles"),
-        ({"degrees": 3.0, "scale": 0.06}, Word.REJECT, "scale"),
+        ({"held_out": HeldOutError(1000, 0.10, 0.0501, 0.05, 0.002)}, Severity.ACCEPT, "HELD_OUT"),
+        ({"held_out": HeldOutError(1000, 0.0500, 0.0501, 0.0501, 0.002)}, Severity.ACCEPT, "HELD_OUT"),
+        ({"held_out": None}, Severity.MARGINAL, "HELD_OUT_TOO_FEW"),
+        ({"convergence": Convergence.COLLECTING}, Severity.MARGINAL, "NO_ANGLE_SHOWN"),
+        ({"degrees": 3.0, "scale": 0.06}, Severity.REJECT, "SCALE_LARGE"),
     ],
 )
-def test_the_verdict_and_its_first_reason(arguments, word, reason):
+def test_the_verdict_and_its_first_reason(arguments, word, code):
     verification = judged(**arguments)
     assert verification.verdict is word
-    assert reason in verification.reasons[0]
+    assert verification.reasons[0].code == code
 
 
 @pytest.mark.parametrize(
     ("limit", "above", "changes"),
     [
-        ("what chance makes of the prediction", Word.MARGINAL, {}),
-        ("what chance makes of the prediction", Word.MARGINAL, {"max_error_ratio": 1.5}),
-        ("several times the prediction", Word.REJECT, {}),
+        ("what chance makes of the prediction", Severity.MARGINAL, {}),
+        ("what chance makes of the prediction", Severity.MARGINAL, {"max_error_ratio": 1.5}),
+        ("several times the prediction", Severity.REJECT, {}),
     ],
 )
 def test_the_verdict_changes_at_its_limit_and_not_before(limit, above, changes):
@@ -177,22 +186,26 @@ def test_the_verdict_changes_at_its_limit_and_not_before(limit, above, changes):
     by_chance = ratio * np.sqrt(chi2.isf(0.01, 3 * 1000) / (3 * 1000))
     times = by_chance if limit.startswith("what chance") else 3.0
     words = [judged(HeldOutError(1000, 1.0, 0.05 * times * (1.0 + by), 0.05, 0.002), **changes) for by in (-1e-3, 1e-3)]
-    below = Word.ACCEPT if above is Word.MARGINAL else Word.MARGINAL
+    below = Severity.ACCEPT if above is Severity.MARGINAL else Severity.MARGINAL
     assert [each.verdict for each in words] == [below, above]
 
 
 @pytest.mark.parametrize(
-    ("typical", "word", "reason"),
-    [(None, Word.REJECT, "several times"), (0.2, Word.REJECT, "several times"), (0.06, Word.MARGINAL, "many of them")],
+    ("typical", "word", "code"),
+    [
+        (None, Severity.REJECT, "HELD_OUT_SEVERAL_TIMES"),
+        (0.2, Severity.REJECT, "HELD_OUT_SEVERAL_TIMES"),
+        (0.06, Severity.MARGINAL, "HELD_OUT_OUTLIERS"),
+    ],
 )
-def test_a_large_held_out_error_that_outliers_alone_make_does_not_reject(typical, word, reason):
+def test_a_large_held_out_error_that_outliers_alone_make_does_not_reject(typical, word, code):
     large = HeldOutError(1000, 1.0, 0.3, 0.05, 0.002)
     state = GaussianState(np.array([0.0, 0.02, 0.0, 0.0]), 1e-6 * np.eye(4))
     said = verify(MODELS["M3"], state, Convergence.FINE, large, Parameters(), typical_error=typical)
     a_hair_worse = replace(large, uncorrected=0.999 * large.corrected)
     again = verify(MODELS["M3"], state, Convergence.FINE, a_hair_worse, Parameters(), typical_error=typical)
     assert again.verdict is said.verdict  # which of two is worse by a hair is for the outliers to say
-    assert said.verdict is word and reason in said.reasons[0]
+    assert said.verdict is word and said.reasons[0].code == code
 
 
 def test_what_outliers_typically_are_is_no_part_of_the_typical_error(rng):

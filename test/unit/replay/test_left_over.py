@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.replay.left_over import left_over, left_over_advice
+from dvl_calib_ros.verdict.kinds import Severity
 
 STEP_S = 0.2
 
@@ -63,30 +63,30 @@ def test_where_all_is_right_nothing_is_said(rng, wave_deg, speeds):
     assert left_over_advice(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found()) == []
 
 
-@pytest.mark.parametrize(("trim_deg", "word"), [(0.0, Word.MARGINAL), (3.0, Word.REJECT)])
+@pytest.mark.parametrize(("trim_deg", "word"), [(0.0, Severity.MARGINAL), (3.0, Severity.REJECT)])
 def test_a_velocity_that_its_driver_has_levelled_does_not_turn_with_the_pitch(rng, trim_deg, word):
     vehicle = Vehicle(rng, trim_deg=trim_deg)
     levelled = np.einsum("nji,nj->ni", vehicle.level, vehicle.earth)
     found = vehicle.found(dvl=levelled)
     assert found.tilt[1] == pytest.approx(1.0, abs=0.2)
-    ((verdict, said),) = left_over_advice(found)
-    assert verdict is word and said.code == "TILT_NOT_FOLLOWED" and "pitch" in said.says
+    (said,) = left_over_advice(found)
+    assert said.severity is word and said.code == "TILT_NOT_FOLLOWED" and said.numbers["axis"] == "pitch"
 
 
 def test_a_pitch_of_the_other_sign_is_no_answer_whatever_the_trim(rng):
     vehicle = Vehicle(rng, trim_deg=0.0)
     yaw = np.arctan2(vehicle.turns[:, 1, 0], vehicle.turns[:, 0, 0])
     turned = [rotation_from_rpy(each) for each in zip(vehicle.roll, -vehicle.pitch, yaw, strict=True)]
-    ((verdict, said),) = left_over_advice(vehicle.found(turns=np.array(turned)))
-    assert verdict is Word.REJECT and said.code == "TILT_NOT_FOLLOWED"
+    (said,) = left_over_advice(vehicle.found(turns=np.array(turned)))
+    assert said.severity is Severity.REJECT and said.code == "TILT_NOT_FOLLOWED"
 
 
 def test_a_bias_shows_at_several_speeds(rng):
     vehicle = Vehicle(rng)
     found = vehicle.found(dvl=vehicle.body + np.array([0.02, -0.025, 0.0]))
     assert found.bias[:2] == pytest.approx([0.02, -0.025], abs=0.01)
-    ((verdict, said),) = left_over_advice(found)
-    assert verdict is Word.REJECT and said.code == "DVL_BIAS"
+    (said,) = left_over_advice(found)
+    assert said.severity is Severity.REJECT and said.code == "DVL_BIAS"
 
 
 def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
@@ -94,10 +94,10 @@ def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
     slow = smoothed(vehicle.earth, 1.5)
     in_time = np.column_stack([np.interp(vehicle.time + 1.5, vehicle.time, column) for column in slow.T])
     found = vehicle.found(reference=in_time)
-    ((verdict, said),) = left_over_advice(found)
-    assert verdict is Word.REJECT and said.code == "VELOCITY_SMOOTHED" and said.says.startswith("the reference")
-    ((verdict, said),) = left_over_advice(found, of_positions=True)
-    assert verdict is Word.MARGINAL and said.code == "VELOCITY_SMOOTHED"
+    (said,) = left_over_advice(found)
+    assert said.severity is Severity.REJECT and said.code == "VELOCITY_SMOOTHED" and said.numbers["name"] == "reference"
+    (said,) = left_over_advice(found, of_positions=True)
+    assert said.severity is Severity.MARGINAL and said.code == "VELOCITY_SMOOTHED"
 
 
 def test_an_attitude_without_tilt_and_a_short_run_say_nothing(rng):
@@ -119,8 +119,8 @@ def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seco
     vehicle.noise = 0.3 * vehicle.noise[0], vehicle.noise[1]
     found = vehicle.found(reference=vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, kept))
     assert found.circular > 0.0
-    ((verdict, said),) = left_over_advice(found)
-    assert verdict is Word.REJECT and said.code == "CIRCULAR_REFERENCE"
+    (said,) = left_over_advice(found)
+    assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
 
 
 @pytest.mark.parametrize("seed", range(20))

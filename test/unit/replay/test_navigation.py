@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import time
 
 import numpy as np
@@ -13,9 +12,9 @@ from dvl_calib_ros.calibration.delay.hold_out import NO_TERMS, Recording, Terms
 from dvl_calib_ros.calibration.delay.rows import DvlColumns, ImuColumns, ReferenceColumns
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.cli.terminal_map import terminal_map
 from dvl_calib_ros.replay.navigation import Navigation, dead_reckoned, in_words, objections
+from dvl_calib_ros.verdict.kinds import Severity
 
 YAW = math.radians(1.0)
 
@@ -138,9 +137,9 @@ def test_the_map_on_a_terminal_fits_and_names_its_tracks(width):
 def test_a_correction_that_makes_the_track_worse_is_rejected_however_well_velocities_fit():
     data = recording(1500.0, phi=(0.0, 0.0, 0.2 * YAW))
     worse = navigated(data, Terms(np.array([0.0, 0.0, -0.5 * YAW, 0.0, 0.0, 0.0]), np.zeros(3), 0.0))
-    ((word, sentence),) = objections(worse)
-    assert word is Word.REJECT
-    assert re.search(r"drifts by 12 m per km with it, by 3.5 as mounted", sentence), sentence
+    (found,) = objections(worse)
+    assert found.code == "DRIFT_WORSE" and found.severity is Severity.REJECT
+    assert (found.numbers["after"], found.numbers["before"]) == pytest.approx((12.0, 3.5), abs=0.5)
     better = navigated(data, Terms(np.array([0.0, 0.0, 0.2 * YAW, 0.0, 0.0, 0.0]), np.zeros(3), 0.0))
     assert not objections(better) and not objections(navigated(data)) and not objections(None)
     too_short = navigated(recording(60.0), Terms(0.01 * np.ones(6), np.zeros(3), 0.0))

@@ -21,7 +21,6 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.calibration.verification import Word
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.report import write_evaluation_report
@@ -30,6 +29,7 @@ from dvl_calib_ros.report.replay_figures import Line, estimate_over_time, held_o
 from dvl_calib_ros.report.replay_report import write_replay_report
 from dvl_calib_ros.report.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.report.time_axis import TimeAxis
+from dvl_calib_ros.verdict.kinds import Severity
 
 SECOND = 1_000_000_000
 
@@ -57,7 +57,7 @@ def test_the_verdict_on_the_selected_model_comes_first_with_its_reasons(made):
     page, replayed = made
     verification = replayed.result.verifications[replayed.result.selected]
     start = page.text.index(verification.verdict.value)
-    assert start < page.text.index(verification.reasons[0]) < page.text.index("Estimates")
+    assert start < page.text.index(verification.reasons[0].sentence) < page.text.index("Estimates")
 
 
 def test_the_held_out_errors_of_every_model_are_shown(made):
@@ -100,7 +100,7 @@ def test_after_a_reject_there_is_no_mounting_and_no_drift_that_it_would_be_worth
     drawn(monkeypatch)
     bag = write_bag(tmp_path / "bag", run())
     replayed = recorded(bag, mounting_rpy=(0.0, 0.0, 0.3))
-    assert replayed.result.verifications[replayed.result.selected].verdict is Word.REJECT
+    assert replayed.result.verifications[replayed.result.selected].verdict is Severity.REJECT
     write_replay_report(tmp_path / "report.html", replayed, [bag], FEW)
     text = Page(tmp_path / "report.html").text
     first = text[: text.index("Estimates")]
