@@ -162,20 +162,18 @@ def _judged(
         doubts.append("it is not verified on held-out data, as the node cannot; `dvl-calib replay` of a recording does")
         return tuple(objections), tuple(doubts)
     verdict, reason = VERDICT_WORDS[verification["verdict"]], str(verification["reasons"][0])
-    if verdict is Severity.REJECT:
-        objections.append(f"its verdict is reject: {reason}")
-    elif verdict is Severity.MARGINAL:
-        doubts.append(f"its verdict is marginal: {reason}")
+    if verdict is not Severity.ACCEPT:
+        said = objections if verdict is Severity.REJECT else doubts
+        said.append(f"its verdict is {verdict.value}: {reason}")
     return tuple(objections), tuple(doubts)
 
 
 def _unverified(content: Mapping[str, Any], model: Model) -> tuple[str, ...]:
     """Objections to what the node saved, which it cannot verify but knows to be of a wrong configuration."""
     says = content.get("suggestion")
-    objections = [finding("CONFIGURATION_WRONG", says=says).sentence] if says else []
-    used_and_gated = (int(content["used"]), int(content["gated"]))
-    objections += [each.sentence for each in use_findings(used_and_gated)] if model.aided else []
-    return tuple(objections)
+    objections = [finding("CONFIGURATION_WRONG", says=says)] if says else []
+    objections += use_findings((int(content["used"]), int(content["gated"]))) if model.aided else []
+    return tuple(each.sentence for each in objections)
 
 
 def _unseen(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
