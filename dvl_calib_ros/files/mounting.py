@@ -163,8 +163,7 @@ def _judged(
         return tuple(objections), tuple(doubts)
     verdict, reason = VERDICT_WORDS[verification["verdict"]], str(verification["reasons"][0])
     if verdict is not Severity.ACCEPT:
-        said = objections if verdict is Severity.REJECT else doubts
-        said.append(f"its verdict is {verdict.value}: {reason}")
+        (objections if verdict is Severity.REJECT else doubts).append(f"its verdict is {verdict.value}: {reason}")
     return tuple(objections), tuple(doubts)
 
 
