@@ -190,9 +190,13 @@ READERS = {
 
 def write_log(path: Path, dvl: OtherDvl, seconds: float, seed: int, reference_std: float = 0.02) -> None:
     """A log of that simulator, in which a vehicle drives about: DVL, its true velocity but for some noise, IMU."""
+    driven(seconds, seed, reference_std).write(path, dvl)
+
+
+def driven(seconds: float, seed: int, reference_std: float) -> BagLog:
+    """A vehicle that drives about in waves, by chance."""
     rng = np.random.default_rng(seed)
-    motion = add_waves(make_motion("free", seconds, 100.0, rng), Waves(0.3, 5.0), rng)
-    BagLog(motion, rng, reference_std).write(path, dvl)
+    return BagLog(add_waves(make_motion("free", seconds, 100.0, rng), Waves(0.3, 5.0), rng), rng, reference_std)
 
 
 @dataclass
@@ -203,6 +207,12 @@ class BagLog:
     start_ns: int = 1_765_000_000_000_000_000
 
     def write(self, path: Path, dvl: OtherDvl) -> None:
+        with BagWriter(path) as bag:
+            SampleWriter(bag).recording(*self.samples(dvl))
+
+    def samples(
+        self, dvl: OtherDvl, frame: VelocityFrame = VelocityFrame.ENU
+    ) -> tuple[list[ImuSample], list[ReferenceSample], list[DvlSample]]:
         time = self.motion.time
         moved = self.motion.velocity_body + np.cross(self.motion.angular_velocity, dvl.lever_arm)
         at = np.arange(0.0, time[-1], 1.0 / dvl.rate)
@@ -210,11 +220,14 @@ class BagLog:
         claimed = np.diag(dvl.std**2)
         samples = [DvlSample(self._stamp(t), tuple(row), claimed) for t, row in zip(at, said.tolist(), strict=True)]
         at = np.arange(0.05, time[-1], 0.2)
-        velocity = self._at(at, np.einsum("nij,nj->ni", self.motion.rotation_enu_from_body, self.motion.velocity_body))
+        velocity = self.motion.velocity_body
+        if frame is VelocityFrame.ENU:
+            velocity = np.einsum("nij,nj->ni", self.motion.rotation_enu_from_body, velocity)
+        velocity = self._at(at, velocity)
         velocity = velocity + self.rng.normal(0.0, self.reference_std, velocity.shape)
         truth = np.eye(3) * self.reference_std**2
         reference = [
-            ReferenceSample(self._stamp(t), tuple(row), truth, VelocityFrame.ENU)
+            ReferenceSample(self._stamp(t), tuple(row), truth, frame)
             for t, row in zip(at, velocity.tolist(), strict=True)
         ]
         every = slice(None, None, 5)
@@ -223,8 +236,7 @@ class BagLog:
         imu = [
             ImuSample(self._stamp(t), tuple(q), tuple(w)) for t, q, w in zip(time[every], attitude, rates, strict=True)
         ]
-        with BagWriter(path) as bag:
-            SampleWriter(bag).recording(imu, reference, samples)
+        return imu, reference, samples
 
     def _stamp(self, t: float) -> int:
         return self.start_ns + round(1e9 * float(t))
