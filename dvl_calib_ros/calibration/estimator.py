@@ -40,7 +40,8 @@ class Given:
     base: the estimator of the model that this one extends; None where it extends none. initial: a state to start from,
     of the model. on_evidence: to be told, once something new takes effect, of the stamp from which on DVL samples may
     go by it. verified: keep what hold-out needs. worker: does what would hold up live messages; None: at once.
-    together: how many blocks of time may be gathered before they are looked at, unless somebody asks.
+    together: how many blocks of time may be gathered before they are looked at, unless somebody asks. registered: how
+    the instruments stand in the recording that a stamp (ns) is of, where that is known already.
     """
 
     model: Model
@@ -52,6 +53,7 @@ class Given:
     verified: bool
     worker: Worker | None
     together: int
+    registered: Callable[[int], Registration | None] = lambda _: None
 
 
 class Estimator(ABC):

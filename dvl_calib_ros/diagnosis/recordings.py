@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..calibration.clocks import Clocks
 from ..calibration.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ..calibration.parameters import Parameters
+from ..calibration.register.registration import Registration
 from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ..calibration.screening import SMALLEST_VARIANCE
 from ..effects.base import Needs
@@ -48,7 +49,8 @@ class Recording:
     attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of neighbours alike in sign. rates: (G, 3) rad/s,
     body. dvl_std, reference_std: (3,) m/s, RMS of what the messages claim, the reference's in its frame; None where
     they do not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many
-    have the very velocity of the one before; spikes: how many were far off and are left out.
+    have the very velocity of the one before; spikes: how many were far off and are left out. registration: how the
+    instruments stand, where that is known already.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Recording:
     received: int = 0
     spikes: int = 0
     first_ns: int = 0
+    registration: Registration | None = None
 
     @property
     def available(self) -> frozenset[Needs]:
@@ -221,7 +224,8 @@ def load_recordings(source: Opened | Sequence[Path], parameters: Parameters, top
     known: list[Recorded] = []
     for name, path, one in zip(recording_names(paths), paths, opened.each, strict=True):
         streams, own = _read(path, one, parameters, topics)
-        recordings.append(_recording(name, streams, parameters, own))
+        registration = one.registration(topics, parameters)
+        recordings.append(replace(_recording(name, streams, parameters, own), registration=registration))
         dvl = one.recorded(topics.found_in(one.types).dvl, parameters)
         for other, its_path in zip(known, paths, strict=False):
             if hold_the_same(dvl, other):

@@ -37,6 +37,8 @@ def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
     rotation_dvl_from_body: (3, 3), the nominal mounting.
 
     """
+    if recording.registration is not None:
+        return  # they are not
     motion = _motion(recording)
     far = None if motion is None else far_clocks(motion, rotation_dvl_from_body)
     if far is not None:
@@ -45,8 +47,9 @@ def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
 
 def first_guess(recording: Recording, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
     """Delays, lever arm and mounting of one recording; none where it cannot be registered."""
-    motion = _motion(recording)
-    found = None if motion is None else register(motion, rotation_dvl_from_body.T, lever_arm)
+    found = recording.registration
+    if found is None and (motion := _motion(recording)) is not None:
+        found = register(motion, rotation_dvl_from_body.T, lever_arm)
     if found is None:
         return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
     phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)

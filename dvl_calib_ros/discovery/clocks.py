@@ -28,7 +28,7 @@ REGISTERED, CLEARLY = 0.3, 0.5
 # What a clock leaves open of the lever arm is said from here on, m: the calibration's own σ does not hold it.
 SAID_FROM_M = 0.08
 # Of a stream one sample in so long is registered, ns.
-EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
+EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 200_000_000, Stream.IMU: 50_000_000}
 # What a clock of the DVL's that drifts or leaps is told by.
 MOVING = frozenset({"dvl_clock_drift", "dvl_time_jump", "dvl_time_jump_at"})
 # Samples of the DVL that are compared to find frames: no more tell more.
@@ -122,6 +122,7 @@ def _found(
         if found is not None and (best is None or found.left < CLEARLY * best[0].left):
             best, epoch_ns = (found, hypothesis), motion.epoch_ns
         if is_first and found is not None and found.left < REGISTERED:
+            recording.register_as(found, topics, parameters)
             break
     if best is None or best[0].left >= REGISTERED:
         return None

@@ -20,6 +20,7 @@ import numpy as np
 from ..bags.columns import windows
 from ..bags.reader import BagReader
 from ..calibration.parameters import Parameters
+from ..calibration.register.registration import Registration
 from ..calibration.samples import Stamps, Stream, Streams, no_samples
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
@@ -44,7 +45,8 @@ class Recording:
     paths: of it. types: topic -> message type, of all topics; held: topic -> what it holds. counts: topic -> number of
     messages. file_spans_ns: of each file that holds a message. notes: what the user should know of what was read
     (damage). columns: of the topics that are kept, a part for each path. transforms: of tf_static; descriptions: of
-    robot_description. parts: the recordings that it is made of; none, if it is one.
+    robot_description. parts: the recordings that it is made of; none, if it is one. registrations: how its instruments
+    stand, by what it was registered with, for who asks the same again (`register_as`, `registration`).
     """
 
     paths: tuple[Path, ...]
@@ -57,6 +59,19 @@ class Recording:
     transforms: tuple[Any, ...] = ()
     descriptions: tuple[str, ...] = ()
     parts: tuple[Recording, ...] = field(default=(), repr=False)
+    registrations: dict[tuple[Topics, Parameters], Registration] = field(default_factory=dict, repr=False)
+
+    def register_as(self, found: Registration, topics: Topics, parameters: Parameters) -> None:
+        """Keep what a registration with these topics, mounting, frames and clocks found."""
+        self.registrations[self._asked(topics, parameters)] = found
+
+    def registration(self, topics: Topics, parameters: Parameters) -> Registration | None:
+        """What one with the same found; None without any."""
+        return self.registrations.get(self._asked(topics, parameters))
+
+    def _asked(self, topics: Topics, parameters: Parameters) -> tuple[Topics, Parameters]:
+        # what a calibration starts from, and leaves out of it, is no matter of how instruments stand
+        return topics.found_in(self.types), parameters.replace(min_speed=0.0, initial_calibration="")
 
     @property
     def each(self) -> tuple[Recording, ...]:

@@ -79,8 +79,9 @@ class DelayFilter(Estimator):
         self._on_block = given.on_evidence
         unknown, gate = prior(model, parameters), gate_of(model.n_measurement, parameters)
         self._solver = BlockSolver(
-            parameters, given.initial or unknown, unknown, gate, given.verified, live=given.worker is not None
-        )
+            parameters, given.initial or unknown, unknown, gate, given.verified, live=given.worker is not None,
+            registered=given.registered,
+        )  # fmt: skip
         self._worker = AtOnce() if given.worker is None else given.worker
         self._state_names = model.state_names
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU

@@ -82,8 +82,11 @@ class BlockSolver:
         verified: bool,
         *,
         live: bool = False,
+        registered: Callable[[int], Registration | None] = lambda _: None,
     ) -> None:
-        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way."""
+        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way.
+
+        registered: as `KeptClocks`."""
         self._parameters = parameters
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
@@ -93,7 +96,7 @@ class BlockSolver:
         self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
         self._dvl_stream = DvlStream()
         self._turned = False
-        self._clocks = KeptClocks(parameters, live)
+        self._clocks = KeptClocks(parameters, live, registered)
         self._is_live = live
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
@@ -303,7 +306,7 @@ class BlockSolver:
             dvl = DvlColumns(*(column[good] for column in dvl))
         from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
         kept = Kept.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
-        self._clocks.add(kept, streams.raw.frames)
+        self._clocks.add(kept, streams.raw.frames, block.from_ns)
         if self.kept is not None:
             self.kept.append(kept)
         if rows is None:

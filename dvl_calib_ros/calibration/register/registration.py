@@ -17,7 +17,22 @@ from ..frames import Array
 from ..parameters import Parameters
 from .coarse import LONGEST_S, places
 from .curves import Curves
-from .fine import APART, ARM, BOTH_ALIKE, DVL, FEW_ROWS, LATE, MOST_ROWS, REFERENCE, SCALE, TURN, Fit, Fitted, N
+from .fine import (
+    APART,
+    ARM,
+    BOTH_ALIKE,
+    DVL,
+    FEW_ROWS,
+    HELD_STD_S,
+    LATE,
+    MOST_ROWS,
+    REFERENCE,
+    SCALE,
+    TURN,
+    Fit,
+    Fitted,
+    N,
+)  # fmt: skip
 from .motion import Motion
 from .steadiness import MOST_STRETCHES, STRETCH_S, Unsteady, unsteady
 
@@ -51,6 +66,8 @@ LEFT_TO_CALIBRATION_S = 2.5
 ALIKE_S = 0.1
 # A reference's clock of which nobody says anything is in time to this, s (σ): receivers and filters are late by tenths.
 IN_TIME_STD_S = 0.5
+# Farther off than so many times that no place of the data says what one in time leaves open.
+FAR_OPEN = 2.0
 # What it leaves open of a lever arm is none to speak of below this, m (σ).
 OPEN_FROM_M = 0.08
 
@@ -184,7 +201,11 @@ def _registered(
             return seen
         # fewer references show less of a clock
         free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
-        return seen if free is None or not _is_possible(free) else replace(seen, **_open(fit, free))
+        return (
+            seen
+            if free is None or not _is_possible(free)
+            else replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
+        )
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
     return None if best is None or not _is_possible(best) else _explained(fit, best, rotation_body_from_dvl, lever_arm)
 
@@ -237,6 +258,7 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, is_told_apart = _Off.BOTH, free, True
     x, p = best.x, best.p
+    late = 0.0 if likeliest in (_Off.NONE, _Off.DVL) else float(x[LATE])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
         dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and _beyond(best.dvl_late, best.dvl_std)),
@@ -254,16 +276,21 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
         left=best.left,
         spread=best.level,
         speed=best.speed,
-        **_open(fit, free),
+        **_open(fit, free, late, rotation),
     )
 
 
-def _open(fit: Fit, free: Fitted) -> dict[str, Any]:
-    """open_late and open_by of a fit with all clocks free."""
+def _open(fit: Fit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
+    """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
     if not fit.is_turned:
         return {"open_late": 0.0, "open_by": np.zeros(4)}
-    by = free.p[:, LATE] / free.p[LATE, LATE]
-    return {"open_late": float(free.std[LATE]), "open_by": np.append(by[ARM], 1.0 + by[APART])}
+    std, p, off = float(free.std[LATE]), free.p, abs(float(free.x[LATE]) - late)
+    if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
+        # as good as in time, and so far away that it turns another arm there
+        near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
+        std, p = max(std, off), p if near is None else near.p
+    by = p[:, LATE] / p[LATE, LATE]
+    return {"open_late": std, "open_by": np.append(by[ARM], 1.0 + by[APART])}
 
 
 class _Off(Enum):

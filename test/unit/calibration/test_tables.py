@@ -100,7 +100,7 @@ def test_what_is_registered_live_is_of_the_newest_blocks_in_memory_that_is_taken
             reference,
             ImuColumns(times, np.ones((n, 4)), np.ones((n, 3))),
         )
-        clocks.add(kept, np.zeros(n, dtype=np.uint8))
+        clocks.add(kept, np.zeros(n, dtype=np.uint8), number)
         oldest = 10.0 * max(0, number + 1 - MOST)
         assert all(stream.times[stream.begin] == oldest for stream in streams)
     assert len(clocks._seen) == MOST
