@@ -21,7 +21,6 @@ from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.noise_findings import NoiseFinding
 from dvl_calib_ros.diagnosis.results import Diagnosis, FoundEffect, Verdict
 from dvl_calib_ros.diagnosis.series import DiagnosisSeries
-from dvl_calib_ros.diagnosis.twin import HeldOutTwin
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
 from dvl_calib_ros.diagnosis.where import Place
 from dvl_calib_ros.evaluation.bags import CrossCheck
@@ -191,13 +190,6 @@ def diagnosis(**changes: Any) -> Diagnosis:
         {"turning": turning, "straight": ~turning}, traces, np.deg2rad([1.0, -2.0, 3.0]), np.array([0.01, 0.0, -0.02]),
         np.array([*np.deg2rad([0.1, 0.2, 0.3]), 0.001, 0.002, 0.03]),
         Unexplained(-1.0, 0.0, "turn rate", np.zeros((n, 3, 1)), np.zeros((n, 3, 0))),
-        twins=tuple(
-            HeldOutTwin(
-                name, time[part], (slice(0, n // 2),), held_out.before[part], held_out.after[part], np.full(3, 0.02),
-                {"straight": ~turning[part], "turning": turning[part]},
-            )
-            for name, part in (("first", slice(0, n // 2)), ("<b>$second$</b>", slice(n // 2, n)))
-        ),
         followed=Followed("turn rate, °/s (to port)", "y", 5.0 * np.sin(time / 8.0), noise[:, 1]),
     )  # fmt: skip
     values: dict[str, Any] = {

@@ -49,15 +49,13 @@ class Gap:
 @dataclass(frozen=True)
 class HeldOutResiduals:
     """before, after: errors (F, 3) m/s of calibrations without and with the effects that have not seen them.
-    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling. hypotheses: those two, by
-    fold; of several recordings by recording, and of that one alone.
+    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling.
     """
 
     before: Array
     after: Array
     floor: Array
     block: Integers
-    hypotheses: tuple[tuple[Hypothesis, Hypothesis], ...] = ()
 
     def squares(self) -> tuple[Array, Array, Array]:
         """Squares of before, after and floor summed over each block (B,), (m/s)²."""
@@ -78,26 +76,23 @@ def held_out(selection: Selection) -> HeldOutResiduals:
     before, after = np.zeros((len(problem.bin_of), 3)), np.zeros((len(problem.bin_of), 3))
     hypotheses = selection.base.hypothesis, fit.hypothesis
     fold_of = folds_of(problem)
-    of_fold: list[list[Hypothesis]] = [[*hypotheses] for _ in range(int(fold_of.max(initial=-1)) + 1)]
     for fold in np.unique(fold_of):
         held = fold_of == fold
         at = held[problem.bin_of]
         train = fitter.without(held)
-        for which, (hypothesis, into) in enumerate(zip(hypotheses, (before, after), strict=True)):
+        for hypothesis, into in zip(hypotheses, (before, after), strict=True):
             fitted = train.fit(hypothesis, fit.noise, FOLD_STEPS).hypothesis
             if len(problem.recordings) > 1:
                 of_day = _with_its_own_day(selection, fitted, int(fold))
-                fitted, into[at] = of_day.hypothesis, only(problem, int(fold)).errors(of_day.seen)
+                into[at] = only(problem, int(fold)).errors(of_day.seen)
             else:
                 into[at] = problem.errors(problem.all_seen(fitted))[at]
-            of_fold[fold][which] = fitted
     block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
     return HeldOutResiduals(
         before,
         after,
         noise_floor(selection),
         np.asarray(block, dtype=np.intp),
-        tuple((without, with_effects) for without, with_effects in of_fold),
     )
 
 

@@ -13,9 +13,41 @@ from .closure import HeldOutResiduals
 from .followed import Followed, what_it_follows
 from .noise import segments_of
 from .selection import Selection
-from .twin import HeldOutTwin, held_out_twins
 from .unexplained import Unexplained
 from .where import regimes
+
+
+@dataclass(frozen=True)
+class HeldOutTwin:
+    """What the DVL of a recording measured, less what a simulated one does whose parameters had not seen it.
+
+    These are the errors that the gap is made of, on the same samples: between those of a slow reference there is none
+    of its noise, and an error without it would be of another size than the noise that is told beside it.
+
+    Parameters
+    ----------
+    name
+        Of the recording.
+    time
+        (N,) s since its start.
+    segments
+        Stretches without a gap.
+    without, with_effects
+        (N, 3) m/s, ahead, to port and up; zero on an axis that is not measured.
+    noise
+        (3,) m/s, rms of what of it is noise.
+    regimes
+        Name -> (N,) bool.
+
+    """
+
+    name: str
+    time: Array
+    segments: tuple[slice, ...]
+    without: Array
+    with_effects: Array
+    noise: Array
+    regimes: Mapping[str, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True)
@@ -26,8 +58,7 @@ class DiagnosisSeries:
     without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool.
     traces: by effect (F, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
     the calibration beside the effects, DVL frame; calibration_std: (6,) of both. rest: what is left after them.
-    measured: (3,) axes that the reference measures. twins: recorded against simulated, by recording. followed: what is
-    left beside what it follows most.
+    measured: (3,) axes that the reference measures. followed: what is left beside what it follows most.
     """
 
     recordings: tuple[str, ...]
@@ -42,8 +73,24 @@ class DiagnosisSeries:
     calibration_std: Array
     rest: Unexplained
     measured: tuple[bool, bool, bool] = (True, True, True)
-    twins: tuple[HeldOutTwin, ...] = ()
     followed: Followed | None = None
+
+    @property
+    def twins(self) -> tuple[HeldOutTwin, ...]:
+        """Recorded against simulated, by recording."""
+        return tuple(self._twin(index) for index in range(len(self.recordings)) if (self.recording_of == index).any())
+
+    def _twin(self, index: int) -> HeldOutTwin:
+        at, held = self.recording_of == index, self.held_out
+        return HeldOutTwin(
+            self.recordings[index],
+            self.time[at],
+            segments_of([self.time[at]]),
+            held.before[at],
+            held.after[at],
+            np.sqrt(held.floor[at].mean(axis=0)),
+            {name: mask[at] for name, mask in self.regimes.items() if mask[at].any()},
+        )
 
 
 def collect_series(
@@ -74,6 +121,5 @@ def collect_series(
         calibration_std=np.sqrt(np.diag(covariance)[:6]),
         rest=rest,
         measured=problem.measured,
-        twins=held_out_twins(selection, residuals),
         followed=what_it_follows(problem, fit, rest.about),
     )

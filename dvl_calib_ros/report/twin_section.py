@@ -10,7 +10,7 @@ from scipy.signal import welch
 
 from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
-from ..diagnosis.twin import HeldOutTwin
+from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
 from .page import Table
 from .style import Picture, picture
@@ -59,9 +59,9 @@ def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table | None:
         ("recording", "regime", "share", *heads, "noise, m/s"),
         rows,
         notes=(
-            "Rms of the vector in what the DVL measures, noise of DVL and reference included; the error at the top is "
-            "that after calibration. The twin moves as the reference says, and its parameters had not seen "
-            "the samples that it is compared with.",
+            "Rms of the vector, noise of DVL and reference included, where there is a reference: the error and the "
+            "noise at the top are these, of all recordings. The twin moves as the reference says, and its parameters "
+            "had not seen the samples that it is compared with.",
         ),
     )
 
