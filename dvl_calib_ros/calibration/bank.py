@@ -233,7 +233,7 @@ class Group:
             if _is_sound(*state):
                 self._x, self._p = state
                 if self._folds is not None:
-                    self._folds.add_told(by_fold / variance[:, None, None])
+                    self._folds.add_told(slice(None), by_fold / variance[:, None, None])
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
         """The models updated; one whose numbers run away stays as it was before, and is counted."""
@@ -349,7 +349,7 @@ class Group:
         for fold in range(FOLDS):
             state = None
             with suppress(np.linalg.LinAlgError):
-                without = self._folds.without(fold, index)
+                without = self._folds.state(fold, index)
                 if self._heave is not None:
                     sums = self._heave.sums(without=fold)
                     x, p = _joined(GaussianState(*(each[None] for each in without)), sums, self._parameters.motion_std)

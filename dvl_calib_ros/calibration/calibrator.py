@@ -660,12 +660,12 @@ class Calibrator:
     @property
     def _finds_another_arm(self) -> bool:
         """Whether the lever arm that was told is contradicted."""
-        if told_arm.FINDS_IT not in self._models:
-            return False
-        estimator = self._estimators[told_arm.FINDS_IT]
-        x, p = estimator.of_recording()
-        shown = GaussianState(x, p - estimator.left_open)
-        return bool(told_arm.contradicted(MODELS[told_arm.FINDS_IT], shown, self.parameters).any())
+        for model in (MODELS[name] for name in self._models if told_arm.finds_arm(MODELS[name])):
+            estimator = self._estimators[model.name]
+            x, p = estimator.of_recording()
+            shown = GaussianState(x, p - estimator.left_open)
+            return bool(told_arm.contradicted(model, shown, self.parameters).any())
+        return False
 
     def _days_of(self, name: str) -> tuple[Day, ...]:
         return self._estimators[name].days_from((self.first_ns or 0, *self._aligner.day_starts_ns))

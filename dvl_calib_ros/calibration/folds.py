@@ -8,6 +8,7 @@ second pass, constant memory.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 
 import numpy as np
@@ -82,15 +83,21 @@ class FoldSums:
 
 
 class FoldInformation:
-    """What each fold told K models: its part of Λ (FOLDS, K, n, n) and of Λx (FOLDS, K, n)."""
+    """What is known of K models, or hypotheses of one, had they not seen a fold: prior, and what each fold told.
+
+    The random walk is taken as none.
+    """
 
     def __init__(self, start: GaussianState) -> None:
         """start: x (K, n), P (K, n, n) of the filter."""
         k, n = start.x.shape
-        # of each fold, what those without it started from
-        self._prior = np.broadcast_to(np.linalg.inv(start.p), (FOLDS, k, n, n)).copy()
-        self._prior_state = (self._prior @ start.x[:, :, None])[..., 0]
         self._told = FoldSums((k, n, n), (k, n))
+        self.begin([start.information] * FOLDS)
+
+    def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
+        """Go on from Λ (K, n, n) and Λx (K, n) that are known without each fold."""
+        self._begin = known
+        self._told.clear()
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples, as far as models used them (K, N)."""
@@ -102,30 +109,32 @@ class FoldInformation:
             some = rows.take(at, axis=3)
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
-            told = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
-            self._told.add(fold, told[:, :-1, :-1], told[:, :-1, -1])
+            self.add_told(fold, weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2))
 
-    def add_told(self, told: Array) -> None:
-        """Add what rows (H, z) of each fold told (FOLDS, K, n+1, n+1)."""
-        self._told.add(slice(None), told[..., :-1, :-1], told[..., :-1, -1])
+    def add_told(self, fold: int | slice, told: Array) -> None:
+        """Add what rows (H, z) of one fold told (K, n+1, n+1), or of several (F, ...)."""
+        self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
 
-    def without(self, fold: int, index: int) -> GaussianState:
-        """The filter's x (n,) and P (n, n) of one model, had it not seen a fold."""
-        information, vector = (sums[index] for sums in self._told.without(fold))
-        p = np.linalg.inv(self._prior[fold, index] + information)
-        return GaussianState(p @ (self._prior_state[fold, index] + vector), p)
+    def without(self, fold: int) -> tuple[Array, Array]:
+        """Λ (K, n, n) and Λx (K, n) had they not seen a fold."""
+        information, vector = (
+            more + known for more, known in zip(self._told.without(fold), self._begin[fold], strict=True)
+        )
+        return information, vector
+
+    def state(self, fold: int, index: int) -> GaussianState:
+        """The filter's x (n,) and P (n, n) of one of the K, had it not seen a fold."""
+        information, vector = (of_all[index] for of_all in self.without(fold))
+        p = np.linalg.inv(information)
+        return GaussianState(p @ vector, p)
 
     def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
         """Go on from what is known, but of the states of the day (u,) from `start`, x (K, n), P (K, n, n)."""
-        prior, prior_state = np.empty_like(self._prior), np.empty_like(self._prior_state)
+        known = []
         for fold in range(FOLDS):
-            for index in range(start.x.shape[0]):
-                known = GaussianState(start.x[index], start.p[index])
-                x, p = with_states_of(self.without(fold, index), known, of_day)
-                prior[fold, index] = np.linalg.inv(p)
-                prior_state[fold, index] = prior[fold, index] @ x
-        self._prior, self._prior_state = prior, prior_state
-        self._told.clear()
+            states = zip(*(self.state(fold, index) for index in range(len(start.x))), strict=True)
+            known.append(with_states_of(GaussianState(*map(np.stack, states)), start, of_day).information)
+        self.begin(known)
 
 
 def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np.intp]) -> GaussianState:

@@ -26,12 +26,16 @@ ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 SIGMAS, MEASURED_TO = 10.0, 0.05
 # Data that know an arm so many times worse than a tape measure do not improve on it.
 WORSE_THAN_TOLD = 2.0
-FINDS_IT = "G2"
+
+
+def finds_arm(model: Model) -> bool:
+    """Whether its states have the lever arm."""
+    return set(ARM) <= set(model.state_names)
 
 
 def stands(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
     """(3,) whether it is where it was told to be, by axis: contradicted, or known less well than by a tape measure."""
-    if not any(parameters.lever_arm) or not set(ARM) <= set(model.state_names):
+    if not any(parameters.lever_arm) or not finds_arm(model):
         return np.zeros(3, dtype=bool)
     std = np.sqrt(np.diag(state.p)[[model.state_names.index(name) for name in ARM]])
     return contradicted(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * MEASURED_TO)
@@ -39,7 +43,7 @@ def stands(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
 
 def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
     """(3,) whether the data show the DVL elsewhere than it was told to be, by axis of the body."""
-    if not any(parameters.lever_arm) or not set(ARM) <= set(model.state_names):
+    if not any(parameters.lever_arm) or not finds_arm(model):
         return np.zeros(3, dtype=bool)
     at = [model.state_names.index(name) for name in ARM]
     away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])
@@ -48,12 +52,12 @@ def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> 
 
 def told_arm_advice(estimates: Mapping[str, Estimate], parameters: Parameters) -> list[Reason]:
     """Whether the lever arm that was told is another than the one that the data show."""
-    estimate = estimates.get(FINDS_IT)
-    if estimate is None or not estimate.used:
+    estimate = next((each for each in estimates.values() if each.used and finds_arm(MODELS[each.model])), None)
+    if estimate is None:
         return []
     # a late clock, which at one speed explains as much, is one of the causes
     state = GaussianState(estimate.state, estimate.covariance - estimate.left_open)
-    off = contradicted(MODELS[FINDS_IT], state, parameters)
+    off = contradicted(MODELS[estimate.model], state, parameters)
     if not off.any():
         return []
     arm = estimate.lever_arm(parameters.lever_arm)

@@ -83,10 +83,10 @@ def held_out_error(
 
 def calibration_error(model: Model, covariance: Array, moments: Moments, rotation_dvl_from_body: Array) -> float:
     """Velocity error, m/s rms, that a covariance (n, n) of a model's state makes on the samples judged; 0 for none."""
-    samples = int(moments.total[0])
+    samples, vv, *_ = moments.total
     of_errors = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
-    total = sum(_calibration_variance(of_errors, moments.of(k)[1], rotation_dvl_from_body.T) for k in range(FOLDS))
-    return math.sqrt(max(total, 0.0) / samples) if samples else 0.0
+    total = _calibration_variance(of_errors, vv, rotation_dvl_from_body.T)
+    return math.sqrt(max(total, 0.0) / float(samples)) if samples else 0.0
 
 
 def held_out_from_sums(samples: int, sums: Sequence[float] | Array) -> HeldOutError | None:

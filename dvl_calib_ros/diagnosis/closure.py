@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from .composed import Hypothesis, Problem
 from .fitting import Fit, Fitter
+from .folds import fitted_without, folds_of, stretch_of
 from .selection import Selection
 from .settings import SETTINGS
 
 RESAMPLES = 1000
 # Noise at high frequencies that is larger than what the messages claim by more than this is not taken for noise
 WORSE_THAN_CLAIMED = 3.0
-# Steps of a fit that starts from that to all of the data
-FOLD_STEPS = 6
 Integers = NDArray[np.intp]
 
 
@@ -76,15 +75,12 @@ def held_out(selection: Selection) -> HeldOutResiduals:
     before, after = np.zeros((len(problem.bin_of), 3)), np.zeros((len(problem.bin_of), 3))
     hypotheses = selection.base.hypothesis, fit.hypothesis
     fold_of = folds_of(problem)
-    for fold in np.unique(fold_of):
-        held = fold_of == fold
-        at = held[problem.bin_of]
-        train = fitter.without(held)
-        for hypothesis, into in zip(hypotheses, (before, after), strict=True):
-            fitted = train.fit(hypothesis, fit.noise, FOLD_STEPS).hypothesis
+    for fold, each in fitted_without(fitter, hypotheses, fit.noise, fold_of):
+        at = (fold_of == fold)[problem.bin_of]
+        for fitted, into in zip(each, (before, after), strict=True):
             if len(problem.recordings) > 1:
-                of_day = _with_its_own_day(selection, fitted, int(fold))
-                into[at] = only(problem, int(fold)).errors(of_day.seen)
+                of_day = _with_its_own_day(selection, fitted, fold)
+                into[at] = only(problem, fold).errors(of_day.seen)
             else:
                 into[at] = problem.errors(problem.all_seen(fitted))[at]
     block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
@@ -232,13 +228,6 @@ def _reported(problem: Problem) -> float | None:
 
 
 def _block_keys(problem: Problem) -> Integers:
-    index = np.floor(problem.time / SETTINGS.block).astype(int)
+    index = stretch_of(problem.time)
     index -= index.min()
     return np.asarray(problem.recording_of * (index.max() + 1) + index, dtype=np.intp)
-
-
-def folds_of(problem: Problem) -> Integers:
-    """(M,) fold of each bin: whole recordings, of one recording stretches in turn."""
-    if len(problem.recordings) > 1:
-        return problem.recording_of
-    return np.asarray(np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds, dtype=np.intp)

@@ -17,6 +17,7 @@ from ..calibration.frames import Array
 from .composed import Problem, Seen
 from .dictionary import ALTERNATIVES, dictionary
 from .fitting import Fit, Fitter
+from .folds import stretch_of
 from .least_squares import WhitenedLeastSquares
 from .made_up import made_up
 from .noise import Noise
@@ -228,7 +229,7 @@ def told_elsewhere(problem: Problem, noise: Noise, known: Array, raw: Array, res
     One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
     what is there tells of itself elsewhere.
     """
-    fold = np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds
+    fold = stretch_of(problem.time) % SETTINGS.folds
     sizes = [np.maximum(np.sqrt((each**2).mean(axis=(0, 1))), 1e-12) for each in (known, raw)]
     white = noise.whiten(np.concatenate([known / sizes[0], raw / sizes[1]], axis=2))
     series = noise.whiten(residual)

@@ -29,7 +29,7 @@ from ..recordings.same import hold_the_same
 from ..recordings.topics import Topics
 from ..replay.navigation import Navigation, dead_reckoned, navigation_document
 from ..replay.replay import replay
-from .metrics import Moments, vrmse
+from .metrics import RunMoments, vrmse
 from .results import Failure
 
 
@@ -65,7 +65,7 @@ class _Replayed:
     """
 
     corrections: Array
-    moments: Moments | None
+    moments: RunMoments | None
     n_paired: int
     notes: tuple[str, ...]
     delayed: Mapping[str, Terms]
@@ -195,7 +195,7 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
             rotation = parameters.rotation_dvl_from_body
             corrections[index] = correction_matrix(estimate.misalignment, estimate.scale, rotation)
     n_paired = sum(map(len, measured))
-    moments = Moments.of(np.concatenate(measured), np.concatenate(reference)) if n_paired else None
+    moments = RunMoments.of(np.concatenate(measured), np.concatenate(reference)) if n_paired else None
     result = replayed.result
     delayed = {
         name: _terms(result.estimates[name])

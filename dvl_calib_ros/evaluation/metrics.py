@@ -18,8 +18,11 @@ WITHIN_68, WITHIN_95 = (float(norm.ppf(0.5 + 0.5 * share)) for share in (0.68, 0
 
 
 @dataclass(frozen=True)
-class Moments:
+class RunMoments:
     """Second moments of measured velocities v against the truth g of ... runs: all that a VRMSE depends on.
+
+    Of whole runs, many corrections at once, against the truth, which has all axes; `calibration.folds.Moments` sums by
+    fold against references, which may lack some.
 
     vv: E[v vᵀ] (..., 3, 3). gv: E[g vᵀ] (..., 3, 3). gg: E[gᵀg] (...,). (m/s)².
     """
@@ -29,21 +32,21 @@ class Moments:
     gg: Array
 
     @staticmethod
-    def of(measured: Array, truth: Array) -> Moments:
-        """Moments of measured (..., N, 3) and true (N, 3) velocities, m/s."""
+    def of(measured: Array, truth: Array) -> RunMoments:
+        """RunMoments of measured (..., N, 3) and true (N, 3) velocities, m/s."""
         n = len(truth)
         transposed = np.swapaxes(measured, -1, -2)
         vv, vg = transposed @ measured / n, transposed @ truth / n
         gg = np.full(measured.shape[:-2], np.sum(truth * truth) / n)
-        return Moments(vv, np.swapaxes(vg, -1, -2), gg)
+        return RunMoments(vv, np.swapaxes(vg, -1, -2), gg)
 
     @staticmethod
-    def stack(each: Sequence[Moments]) -> Moments:
-        """Moments of several runs along a new first axis."""
-        return Moments(*(np.stack([getattr(one, name) for one in each]) for name in ("vv", "gv", "gg")))
+    def stack(each: Sequence[RunMoments]) -> RunMoments:
+        """RunMoments of several runs along a new first axis."""
+        return RunMoments(*(np.stack([getattr(one, name) for one in each]) for name in ("vv", "gv", "gg")))
 
 
-def vrmse(moments: Moments, correction: Array) -> Array:
+def vrmse(moments: RunMoments, correction: Array) -> Array:
     """sqrt(E‖g - C v‖²) (...,) m/s of velocities corrected by matrices C (..., 3, 3); shapes broadcast.
 
     E‖g - C v‖² = E[gᵀg] - 2 tr(C E[g vᵀ]ᵀ) + tr(C E[v vᵀ] Cᵀ), so a correction costs a few products, not a pass

@@ -17,7 +17,7 @@ from . import protocol
 from .baselines import BASELINES
 from .convergence import REFERENCE_STD, TIMES_S, curve_keys, squared_errors
 from .estimation import SensorData, estimate
-from .metrics import Moments, heading_spread, vrmse
+from .metrics import RunMoments, heading_spread, vrmse
 from .results import CalibrationRun, CalibrationSet, Failure, mean_of_known
 from .trajectories import Trajectory
 
@@ -88,7 +88,7 @@ class SeedOutcome:
 def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     """The whole procedure with the noise of one seed."""
     measured = {name: dvl_velocities(run, seed) for name, run in procedure.runs.items()}
-    moments = {name: Moments.of(measured[name], run.velocity) for name, run in procedure.runs.items()}
+    moments = {name: RunMoments.of(measured[name], run.velocity) for name, run in procedure.runs.items()}
     failures: list[Failure] = []
 
     def data(name: str) -> SensorData:
@@ -151,8 +151,8 @@ def _of_seed(failures: Sequence[Failure], seed: int) -> tuple[Failure, ...]:
     return tuple(replace(each, seed=seed) for each in failures)
 
 
-def _others(moments: Mapping[str, Moments], name: str) -> Moments:
-    return Moments.stack([each for other, each in moments.items() if other != name])
+def _others(moments: Mapping[str, RunMoments], name: str) -> RunMoments:
+    return RunMoments.stack([each for other, each in moments.items() if other != name])
 
 
 def _baselines(data: SensorData, window_s: float | None, failures: list[Failure]) -> list[Array]:
@@ -213,7 +213,7 @@ def _calibrate(
     data: SensorData,
     ends: Sequence[int],
     own: int,
-    others: Moments,
+    others: RunMoments,
     procedure: Procedure,
     failures: list[Failure],
 ) -> RunOutcome:

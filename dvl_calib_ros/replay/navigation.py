@@ -142,7 +142,7 @@ def dead_reckoned(
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
     n = len(recording.dvl.times)
-    before, after = (_Level.of(n) for _ in range(2))
+    before, after = _Level.of(n), _Level.of(n, whole=True)
     before.fill(recording, np.arange(n), NO_TERMS, parameters)
     for k, each in enumerate(terms):
         after.fill(recording, np.flatnonzero(folds == k), each, parameters)
@@ -174,8 +174,8 @@ def dead_reckoned(
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
-        error_before=before.whole[2][use[kept]],
-        error_after=after.whole[2][use[kept]],
+        error_before=before.in_body[use[kept]],
+        error_after=after.in_body[use[kept]],
         deviation=heading_deviation(recording.dvl.times[use], after.yaw[use], heading)
         if on_a_map and heading is not None
         else None,
@@ -185,20 +185,22 @@ def dead_reckoned(
 
 class _Level(NamedTuple):
     """Of N samples (N, 4) m/s ahead and to port, and east and north where that is known: reference velocity, and error
-    of the DVL's; whether that is known (N,), and yaw (N,) rad. whole: rotation_enu_from_body (N, 3, 3), velocity and
-    error (N, 3) m/s, rates (N, 3) rad/s, body."""
+    of the DVL's; whether that is known (N,), and yaw (N,) rad. in_body: error (N, 3) m/s. whole, where that is
+    wanted: rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates (N, 3) rad/s, body."""
 
     velocity: Array
     error: Array
     oriented: NDArray[np.bool_]
     yaw: Array
-    whole: tuple[Array, Array, Array, Array]
+    in_body: Array
+    whole: tuple[Array, ...]
 
     @staticmethod
-    def of(n: int) -> _Level:
+    def of(n: int, *, whole: bool = False) -> _Level:
         """To be filled."""
-        whole = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-        return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), whole)
+        error = np.empty((n, 3))
+        kept = (np.empty((n, 3, 3)), np.empty((n, 3)), error, np.empty((n, 3))) if whole else ()
+        return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
 
     def fill(self, recording: Recording, at: Index, terms: Terms, parameters: Parameters) -> None:
         """Write those of some samples, corrected by these terms."""
@@ -209,7 +211,8 @@ class _Level(NamedTuple):
             self.oriented[some] = seen.oriented
             rotation = seen.rotation_enu_from_body
             self.yaw[some] = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-            for kept, own in zip(self.whole, (rotation, seen.body, seen.error, seen.rates), strict=True):
+            self.in_body[some] = seen.error
+            for kept, own in zip(self.whole, (rotation, seen.body, seen.error, seen.rates), strict=False):
                 kept[some] = own
             for level, body in ((self.velocity, seen.body), (self.error, seen.error)):
                 level[some, :2] = body[:, :2]

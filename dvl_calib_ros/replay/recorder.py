@@ -24,19 +24,15 @@ KEPT_STATES, KEPT_VELOCITIES = 300, 800
 class ModelHistory:
     """One model over time, at the N stamps of its `RunHistory`.
 
-    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names. covariance: (N, n, n). nis:
-    (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the stamp before (about 1 for a consistent filter),
-    nan where it used none.
+    state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names; std: (N, n).
+    misalignment_covariance: (N, 3, 3) rad². nis: (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the
+    stamp before (about 1 for a consistent filter), nan where it used none.
     """
 
     state: Array
-    covariance: Array
+    std: Array
+    misalignment_covariance: Array
     nis: Array
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations (N, n)."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True)
@@ -154,7 +150,8 @@ def _model_history(
         sums.insert(0, list(zip(nis_sums.tolist(), used.tolist(), strict=True)))
     return ModelHistory(
         state=np.concatenate(states),
-        covariance=np.concatenate(covariances),
+        std=np.sqrt(np.concatenate([np.diagonal(each, axis1=1, axis2=2) for each in covariances])),
+        misalignment_covariance=np.concatenate([each[:, :3, :3] for each in covariances]),
         nis=_share(np.concatenate(sums)) / MODELS[name].n_measurement,
     )
 

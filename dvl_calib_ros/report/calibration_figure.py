@@ -47,7 +47,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
     turned = np.degrees([rpy_from_rotation(corrected_mounting(each, rotation)) for each in phi])
     turned -= np.degrees(parameters.mounting_rpy)
     turned = (turned + 180.0) % 360.0 - 180.0
-    std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.covariance, strict=True)])
+    std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.misalignment_covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         value, sleeve = turned[:, axis], std[:, axis]

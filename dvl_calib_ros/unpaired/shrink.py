@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
-from ..diagnosis.closure import FOLD_STEPS
 from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
+from ..diagnosis.folds import fitted_without, stretch_of
 from ..diagnosis.selection import Selection
 from ..diagnosis.settings import SETTINGS
 from ..diagnosis.twin import simulated
@@ -155,11 +155,10 @@ def _held_out(selection: Selection, model: Model) -> list[Array]:
     effects = [*model.added, *(effect for effect, _ in model.kept.values())]
     start = fit.hypothesis.with_effects(effects, n, kept)
     fixed = frozenset(kept)
-    bins = np.floor(problem.time / SETTINGS.block).astype(int) % SETTINGS.folds
+    bins = stretch_of(problem.time) % SETTINGS.folds
     sample_folds = [_fold_of(problem, index) for index in range(n)]
     predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
-    for fold in np.unique(bins):
-        fitted = fitter.without(bins == fold).fit(start, fit.noise, FOLD_STEPS, fixed=fixed).hypothesis
+    for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
         for index in range(n):
             at = sample_folds[index] == fold
             predicted[index][at] = simulated(problem, fitted, index)[at]
@@ -170,7 +169,7 @@ def _fold_of(problem: Problem, index: int) -> Array:
     """(N,) fold of every DVL sample of a recording: stretches of time in turn; -1 outside of what was fitted."""
     time = problem.recordings[index].dvl.time - problem.grids[index].late
     of = problem.grids[index].bin_time
-    fold = np.floor(time / SETTINGS.block).astype(int) % SETTINGS.folds
+    fold = stretch_of(time) % SETTINGS.folds
     inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
     return np.where(inside, fold, -1)
 

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from functools import reduce
 
 import numpy as np
 
 from ..correction_parameters import PriorOnErrors, to_correction
-from ..folds import FOLDS, FoldSums, folds_of, with_states_of
+from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
 from ..frames import Array, product
 from ..heading_states import Seen, all_told, heading_states, heading_terms, upwards, with_terms
 from ..heave import HeaveRows, HeaveSums, with_heave
@@ -27,7 +28,7 @@ from ..parameters import Parameters
 from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
-from .known import After, BlockRows, DayState, Ended, Found, Hypotheses, Known, Posterior, Sums, Told
+from .known import After, BlockRows, DayState, Ended, Found, Hypotheses, Known, Posterior, Sums, Told, parts
 from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, DelayedRows
 from .told import innovation_squared, told_by
 
@@ -82,8 +83,7 @@ class DelayBank:
         self.blocks = TimeBlocks()
         self._up = upwards(parameters.rotation_dvl_from_body, N_STATE)
         self._epoch_ns: int | None = None  # of the first row
-        k = len(DELAYS_S)
-        self._folds = FoldSums((k, N_STATE, N_STATE), (k, N_STATE)) if verified else None
+        self._folds = FoldInformation(self._start) if verified else None
 
     def _begin_day(self) -> None:
         """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
@@ -117,9 +117,7 @@ class DelayBank:
         self._begin_day()
         before = self._sums
         if self._folds is not None:
-            self._folds.clear()
-            for fold, (information, vector) in enumerate(begins[1:]):
-                self._folds.add(fold, begins[0][0] - information, begins[0][1] - vector)
+            self._folds.begin(begins[1:])
         information, vector = begins[0]
         x = np.linalg.solve(information, vector[..., None])[..., 0]
         square = found.misfit[best] + np.einsum("ki,ki->k", vector, x)
@@ -186,10 +184,10 @@ class DelayBank:
                 self._epoch_ns = int(stamps_ns[0])
             seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
             terms = heading_terms(rows.motion.earth, weight, seconds)
-            self.blocks.add(*with_terms(told.information, told.vector, terms, self._up), told.weight)
+            self.blocks.add(*with_terms(*told.parts[:2], terms, self._up), told.weight)
             if self._folds is not None:
-                for fold, (information, vector, _) in told.by_fold:
-                    self._folds.add(fold, information, vector)
+                for fold, of_fold in told.by_fold:
+                    self._folds.add_told(fold, of_fold)
             after.append(After(self.used, self.gated, self.mean_nis, self.known()))
         self._heave = expected.heave
         return after
@@ -221,12 +219,8 @@ class DelayBank:
         folds = folds_of(block.stamps_ns, self._parameters)
         # by folds also where nobody verifies: sums in one order are the same to the last bit
         by_fold = [(fold, told_by(block.rows, use & (folds == fold))) for fold in sorted(set(folds[use].tolist()))]
-        sums = self._sums
-        total = [np.zeros_like(each) for each in (sums.information, sums.vector, sums.square)]
-        for number, (_, one) in enumerate(by_fold):
-            total = [each + more for each, more in zip(total, one, strict=True)] if number else list(one)
-        information, vector, square = total
-        return Told(information, vector, square, float((block.rows.weight * use).sum()), by_fold)
+        of_all: Array = reduce(np.add, (told for _, told in by_fold)) if by_fold else told_by(block.rows, use)
+        return Told(of_all, float((block.rows.weight * use).sum()), by_fold)
 
     def steps(self, start: Sums, told: Sequence[Told], heave: Sequence[HeaveSums]) -> list[tuple[Sums, Hypotheses]]:
         """What is summed up, and all hypotheses by it, after each of some blocks. heave: rows of heave by then."""
@@ -234,7 +228,9 @@ class DelayBank:
             return []
         information, vector, square, weight = (
             np.add.accumulate(np.stack([np.asarray(first), *more]))[1:]
-            for first, more in zip(start[:4], zip(*(each[:4] for each in told), strict=True), strict=True)
+            for first, more in zip(
+                start[:4], zip(*((*each.parts, each.weight) for each in told), strict=True), strict=True
+            )
         )
         rows = HeaveSums.stacked(heave)
 
@@ -287,7 +283,7 @@ class DelayBank:
         """
         found = self._solve()
         level = self._level(found, self._sums.weight)
-        told, told_vector, square = told_by(rows, np.ones(len(rows), dtype=bool))
+        told, told_vector, square = parts(told_by(rows, np.ones(len(rows), dtype=bool)))
         information, vector = found.information + told, found.vector + told_vector
         x = np.linalg.solve(information, vector[..., None])[..., 0]
         raised = square + np.einsum("ki,ki->k", found.x, found.vector) - np.einsum("ki,ki->k", x, vector)
@@ -300,9 +296,7 @@ class DelayBank:
         sums, variance = self._sums, self._sums.heave_variance
         told = rows.told / variance
         if self._folds is not None:
-            of_all = slice(None)
-            weighed = by_fold / variance
-            self._folds.add(of_all, weighed[..., :N_STATE, :N_STATE], weighed[..., :N_STATE, N_STATE])
+            self._folds.add_told(slice(None), by_fold / variance)
         self._sums = sums._replace(
             information=sums.information + told[:, :N_STATE, :N_STATE],
             vector=sums.vector + told[:, :N_STATE, N_STATE],
@@ -333,8 +327,7 @@ class DelayBank:
         information, vector = sums.information, sums.vector
         if without is not None:
             assert self._folds is not None
-            told, told_vector = self._folds.of(without)
-            information, vector = information - told, vector - told_vector
+            information, vector = self._folds.without(without)
         heave = self._heave.sums(without).told / sums.heave_variance
         found = self._hypotheses(information, vector, sums.square, heave)
         if without is None:

@@ -49,18 +49,26 @@ class Sums(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What the rows of a block told, as in `Sums`, and of each fold by itself."""
+    """What the rows of a block told (K, n+1, n+1), as of `told_by`, and of each fold by itself; number of samples."""
 
-    information: Array
-    vector: Array
-    square: Array
+    of_all: Array
     weight: float
-    by_fold: list[tuple[int, tuple[Array, Array, Array]]]
+    by_fold: list[tuple[int, Array]]
 
     @property
     def is_finite(self) -> bool:
         """Whether it can be added to anything."""
-        return all(bool(np.isfinite(each).all()) for each in self[:3])
+        return bool(np.isfinite(self.of_all).all())
+
+    @property
+    def parts(self) -> tuple[Array, Array, Array]:
+        """Λ (K, n, n), Λx (K, n), zᵀR⁻¹z (K,)."""
+        return parts(self.of_all)
+
+
+def parts(told: Array) -> tuple[Array, Array, Array]:
+    """Λ (..., n, n), Λx (..., n) and zᵀR⁻¹z (...,) of what rows told (..., n+1, n+1)."""
+    return told[..., :-1, :-1], told[..., :-1, -1], told[..., -1, -1]
 
 
 class Known(NamedTuple):

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from ..frames import Array, Vector, cross, rotation_from_quaternion, skew
+from ..frames import Array, Vector, cross, rotation_from_quaternion, skew, slerps
 from ..kalman import whitening
 from ..models.own import g1_errors, g1_heave_errors
 from ..robust import median, steps
@@ -467,14 +467,5 @@ def attitude_at(
     after, before, outside = _beside(stamps, times, places(stamps, times, imu_parts, parts))
     gap = np.maximum(stamps[after] - stamps[before], 1e-12)
     fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
-    a, b = quaternions.take(before, axis=0), quaternions.take(after, axis=0)
-    dot = np.einsum("nq,nq->n", a, b)
-    angle = np.arccos(np.minimum(np.abs(dot), 1.0))
-    sine = np.sin(angle)
-    small = sine < 1e-6  # the chord is exact then
-    divisor = np.where(small, 1.0, sine)
-    left = np.where(small, 1.0 - fraction, np.sin((1.0 - fraction) * angle) / divisor)
-    right = np.where(small, fraction, np.sin(fraction * angle) / divisor) * np.where(dot < 0.0, -1.0, 1.0)
-    mixed = left[:, None] * a + right[:, None] * b
-    mixed /= np.sqrt(np.einsum("nq,nq->n", mixed, mixed))[:, None]
-    return rotation_from_quaternion(mixed), ~outside & (gap <= gap_s)
+    between = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)
+    return rotation_from_quaternion(between), ~outside & (gap <= gap_s)

@@ -14,8 +14,8 @@ _MOVING: Index = np.append(OF_DELAY, N_STATE)
 _SHOWN_BY_ROWS: Index = np.concatenate([OF_NONE, OF_DELAY])
 
 
-def told_by(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:
-    """What some rows tell each hypothesis: HᵀWH (K, n, n), HᵀWz (K, n), zᵀWz (K,)."""
+def told_by(rows: DelayedRows, use: Mask) -> Array:
+    """What some rows tell each hypothesis (K, n+1, n+1): the sums of HᵀWH, HᵀWz and zᵀWz."""
     some = rows if use.all() else rows.part(use)
     k = len(some.moving)
     moving, standing = some.moving.reshape(k, len(_MOVING), -1), some.standing.reshape(len(OF_NONE), -1)
@@ -26,7 +26,7 @@ def told_by(rows: DelayedRows, use: Mask) -> tuple[Array, Array, Array]:
     told[:, _MOVING[:, None], _MOVING] = weighted @ moving.swapaxes(1, 2)
     told[:, _MOVING[:, None], OF_NONE], told[:, OF_NONE[:, None], _MOVING] = across, across.swapaxes(1, 2)
     told[:, OF_NONE[:, None], OF_NONE] = (standing * weight) @ standing.T
-    return told[:, :N_STATE, :N_STATE], told[:, :N_STATE, N_STATE], told[:, N_STATE, N_STATE]
+    return told
 
 
 def innovation_squared(found: GaussianState, rows: DelayedRows) -> Array:

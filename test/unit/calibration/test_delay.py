@@ -283,7 +283,7 @@ def test_a_block_whose_numbers_run_away_costs_those_gathered_with_it_nothing(mon
         first = broken[0] if broken else int(block.stamps_ns[0])
         broken[:] = [first]
         is_that = first + 60_000_000_000 <= block.stamps_ns[0] < first + 70_000_000_000
-        return told._replace(vector=told.vector * np.nan) if is_that else told
+        return told._replace(of_all=told.of_all * np.nan) if is_that else told
 
     monkeypatch.setattr(delay_solver.DelayBank, "told_by", told_by)
     alone, together = (feed_columns(Calibrator(NOISE, block_size=size, models=AUTO), samples) for size in (128, 4096))

@@ -37,7 +37,7 @@ def test_leaving_a_fold_out_equals_filtering_without_it(rng, weights):
         others = Measurements(data.z, data.h, data.r, data.weight, data.usable & (folds != fold), data.gate)
         expected = kalman.recursion(x, p, others)
         for k in range(len(x)):
-            found = kept.without(fold, k)
+            found = kept.state(fold, k)
             np.testing.assert_allclose(found.x, expected.x[k], atol=1e-12)
             np.testing.assert_allclose(found.p, expected.p[k], atol=1e-12)
 

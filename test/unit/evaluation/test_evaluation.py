@@ -134,7 +134,7 @@ def test_vrmse_from_moments_is_that_of_the_samples(rng):
     correction = rng.normal(np.eye(3), 0.05, (4, 3, 3))
     corrected = np.einsum("bij,bnj->bni", correction, measured)
     direct = np.sqrt(np.mean(np.sum((truth - corrected) ** 2, axis=-1), axis=-1))
-    np.testing.assert_allclose(metrics.vrmse(metrics.Moments.of(measured, truth), correction), direct, rtol=1e-12)
+    np.testing.assert_allclose(metrics.vrmse(metrics.RunMoments.of(measured, truth), correction), direct, rtol=1e-12)
 
 
 def test_coverage_of_errors_as_large_as_claimed_is_68_and_95_per_cent(rng):
