@@ -40,13 +40,12 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from . import choose
 from .clocks import FoundClocks, find_clocks, in_time
+from .gravity import Gravity
 from .heading_claim import believed_heading
 from .transforms import FrameTree, Placed
 
 # A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
 OTHER_MOUNTING = math.radians(12.0)
-# An accelerometer at rest shows gravity upwards; one that shows so much downwards (m/s²) is turned over.
-GRAVITY_SHOWS = 5.0
 # Of a vehicle that goes ahead, the mean velocity has at least this share of the speed.
 STRAIGHT_SHARE = 0.7
 # Root mean square of the better nine tenths of normal errors in three axes, as a share of that of all.
@@ -283,6 +282,13 @@ class _Search:
         self._know_position(placed, reference)
         if imu is not None:
             self._know_heading(imu)
+            self._look_at_gravity(imu)
+
+    def _look_at_gravity(self, imu: Look) -> None:
+        """Say where acceleration and orientation contradict what the IMU's data are taken for."""
+        gravity, taken = Gravity.of(imu), self._parameters.replace(**self._values)
+        if gravity is not None and (said := gravity.says(rotation_from_rpy(taken.imu_rpy), taken.imu_frame)):
+            self._contradictions.append(f"{imu.topic}: {said}")
 
     def _know_heading(self, imu: Look) -> None:
         """How far the heading is to be believed, where the IMU says it."""
@@ -414,11 +420,14 @@ class _Search:
         frames = [upright, marine, ImuFrame(at, "ned", f"in NED, {says}")]
         if placed is not None and not np.allclose(at, np.eye(3)):
             frames.append(ImuFrame(np.eye(3), "enu", "as the body, whatever its transform says"))
-        acceleration = imu.values[np.isfinite(imu.values[:, 7:]).all(axis=1), 7:]
-        if not len(acceleration):
+        gravity = Gravity.of(imu)
+        if gravity is None:
             return frames
-        up = [float((each.rotation_body_from_imu @ acceleration.mean(axis=0))[2]) for each in frames]
-        return [each for each, height in zip(frames, up, strict=True) if height > -GRAVITY_SHOWS]
+        frames.append(ImuFrame(at @ FLU_FROM_FRD, "enu", f"turned over, {says}"))
+        wrong = [gravity.contradicts(each.rotation_body_from_imu, each.world) for each in frames]
+        # the first stays among them, for a driver may have the acceleration's sign wrong
+        kept = [at for at in range(len(frames)) if at == 0 or wrong[at] == 0]
+        return [frames[at] for at in sorted(kept, key=lambda at: wrong[at])]
 
     def _fit(
         self,

@@ -22,6 +22,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..verdict.reasons import Reason, finding
+from .px4 import of_vehicle_odometry
 
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -64,8 +65,9 @@ class VelocityType:
     are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
     is_reference, is_dvl: whether velocities of the reference and of DVLs come in this type. is_position: it holds
     satellite positions, of which velocities are made (fixes.py). reference_frame: the axes of a reference in this type,
-    whatever its frame_id says, None if that says it. definitions: for bags that embed none, the
-    versions of it that are about. install: how to get its package, where ROS does not bring it.
+    whatever its frame_id says, None if that says it. adapted: a message without header as all else reads it;
+    None: as it is. definitions: for bags that embed none, the versions of it that are about. install: how to get its
+    package, where ROS does not bring it.
     """
 
     name: str
@@ -83,6 +85,7 @@ class VelocityType:
     is_dvl: bool = True
     is_position: bool = False
     reference_frame: VelocityFrame | None = None
+    adapted: Callable[[Any], Any] | None = None
     definitions: tuple[str, ...] = ()
     install: str = ""
 
@@ -406,6 +409,19 @@ _TYPES: dict[str, VelocityType] = {
             is_dvl=False,
             reference_frame=VelocityFrame.ENU,
             install="sudo apt install ros-$ROS_DISTRO-gps-msgs",
+        ),
+        VelocityType(
+            name="px4_msgs/msg/VehicleOdometry",
+            sent_by="PX4 (uXRCE-DDS)",
+            velocity=_VELOCITY,
+            covariance=attrgetter("covariance"),
+            is_read_in_columns=False,
+            covariance_says="`velocity_variance`; nan: not given",
+            frame_says="`velocity_frame`: NED or BODY_FRD",
+            is_reference=True,
+            is_dvl=False,
+            adapted=of_vehicle_odometry,
+            install="build px4_msgs in your workspace",
         ),
         VelocityType(
             name="sensor_msgs/msg/NavSatFix",

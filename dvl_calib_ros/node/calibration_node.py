@@ -124,6 +124,7 @@ class CalibrationNode(AnsweringNode):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
+        self._adapted = self._feed.decoder.reference_type.adapted
         self._feed_from: Mapping[str, Callable[[Any, int], Any]] = {
             "dvl/twist": self._feed_dvl,
             "gnss/twist": lambda message, received_ns: self._feed.reference(message, received_ns),
@@ -242,6 +243,8 @@ class CalibrationNode(AnsweringNode):
     def _deliver(self, taken: Mapping[str, Arrived]) -> None:
         """Feed messages that were taken, by topic, and all that wait."""
         for topic, message in in_order_of_arrival(self._inputs, take, taken):
+            if self._adapted is not None and topic == "gnss/twist":
+                message = self._adapted(message)
             self._feed_from[topic](message, self._received_ns(message))
             self._publish_if_updated()
 

@@ -111,8 +111,10 @@ class Singles:
             starts.tolist(), self.end[places].tolist(), strict=True,
         )  # fmt: skip
         for arrival, log_ns, channel, start, end in rows:
+            kind = VELOCITY_TYPES.get(self.channels[channel].msgtype)
             try:
-                yield arrival, log_ns, self.decoder(self.channels[channel], self.content[start:end].tobytes()), ""
+                message = self.decoder(self.channels[channel], self.content[start:end].tobytes())
+                yield arrival, log_ns, message if kind is None or kind.adapted is None else kind.adapted(message), ""
             except DecodingError as error:
                 yield arrival, log_ns, None, str(error)
 

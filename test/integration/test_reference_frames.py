@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 from stacks import DVL_STD, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion
 
-from dvl_calib_ros.calibration.frames import FLU_FROM_FRD
+from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
-from dvl_calib_ros.messages.decode import MessageDecoder, frame_named
+from dvl_calib_ros.messages.decode import MessageDecoder, Refusal, frame_named
+from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
 from dvl_calib_ros.replay.replay import replay
 
 
@@ -47,6 +50,69 @@ def test_an_odometry_forward_right_down_gives_the_lever_arm_with_its_sign(tmp_pa
     assert found.parameters.gnss_frame == "frd" or child.endswith("_frd")
     result = replay([bag], found.parameters, found.topics).result
     np.testing.assert_allclose(result.estimates["G2"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
+
+
+PX4 = "px4_msgs/msg/VehicleOdometry"
+PX4_DEFINITION = """
+uint32 MESSAGE_VERSION = 0
+uint64 timestamp
+uint64 timestamp_sample
+uint8 POSE_FRAME_UNKNOWN = 0
+uint8 POSE_FRAME_NED = 1
+uint8 POSE_FRAME_FRD = 2
+uint8 pose_frame
+float32[3] position
+float32[4] q
+uint8 VELOCITY_FRAME_UNKNOWN = 0
+uint8 VELOCITY_FRAME_NED = 1
+uint8 VELOCITY_FRAME_FRD = 2
+uint8 VELOCITY_FRAME_BODY_FRD = 3
+uint8 velocity_frame
+float32[3] velocity
+float32[3] angular_velocity
+float32[3] position_variance
+float32[3] orientation_variance
+float32[3] velocity_variance
+uint8 reset_counter
+int8 quality
+"""
+
+
+@pytest.mark.parametrize(("frame", "taken"), [(1, VelocityFrame.NED), (3, VelocityFrame.BODY)])
+def test_a_px4_odometry_is_a_reference_in_the_frame_of_its_own_fields(tmp_path, frame, taken):
+    told, m = Told(), motion()
+    told.make.store.register(get_types_from_msg(PX4_DEFINITION, PX4))
+    told.dvl("/dvl", TWIST, "dvl_link")
+    for i, stamp in told.every(10.0, 0.04):
+        velocity = FLU_FROM_FRD @ m.velocity_body[i]
+        if frame == 1:
+            velocity = ENU_FROM_NED.T @ m.rotation_enu_from_body[i] @ m.velocity_body[i]
+        three = np.zeros(3, dtype=np.float32)
+        message = told.types(
+            PX4, 0, stamp // 1000, 1, three, np.zeros(4, dtype=np.float32), frame,
+            (velocity + told.rng.normal(0.0, 0.02, 3)).astype(np.float32), three, three, three,
+            np.full(3, 0.02**2, dtype=np.float32), 0, 100,
+        )  # fmt: skip
+        told.say(stamp, "/fmu/out/vehicle_odometry", PX4, message)
+    told.imu("/imu", "base_link")
+    bag = told.write(tmp_path / "bag")
+    found = discover([bag], Parameters())
+    assert found.topics.gnss == "/fmu/out/vehicle_odometry" and found.reference_frame is taken
+    replayed = replay([bag], found.parameters, found.topics)
+    assert replayed.result.counts["pairing"]["paired"] > 700
+    np.testing.assert_allclose(replayed.result.estimates["G2"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
+
+
+def test_a_px4_odometry_says_what_it_does_not_know_and_its_boot_time_is_no_stamp():
+    message = SimpleNamespace(
+        timestamp=81_000_000, timestamp_sample=80_000_000, velocity_frame=0, velocity=np.array([1.0, np.nan, 0.0]),
+        angular_velocity=np.zeros(3), velocity_variance=np.full(3, np.nan),
+    )  # fmt: skip
+    kind = VELOCITY_TYPES[PX4]
+    seen = kind.adapted(message)
+    assert (seen.header.stamp.sec, seen.header.stamp.nanosec) == (0, 0) and kind.frame_id(seen) == ""
+    decoder = MessageDecoder(Parameters(gnss_type=PX4))
+    assert decoder.reference(seen, 1) == Refusal("wrong_frame")
 
 
 def test_a_frame_below_a_namespace_or_with_a_suffix_says_what_it_is():
@@ -129,3 +195,60 @@ def test_what_is_written_is_the_dvl_in_base_link_or_nothing(tmp_path, capsys, fr
     assert main(["apply", str(saved), "--launch", str(launch)]) == 0
     at = [float(re.search(rf"--{axis} (\S+)", launch.read_text())[1]) for axis in "xyz"]
     np.testing.assert_allclose(at, position, atol=0.05)
+
+
+def turned_over(told: Told) -> None:
+    told.imu("/imu", "imu_link", FLU_FROM_FRD)
+
+
+def inverted(told: Told) -> None:
+    told.imu("/imu", "base_link")
+    for row in told.rows:
+        if row[1] == "/imu":
+            q = row[3].orientation
+            q.x, q.y, q.z = -q.x, -q.y, -q.z
+
+
+def down_labelled_up(told: Told) -> None:
+    """Forward-right-down in NED, where the reference does not tell."""
+    told.imu("/imu", "base_link", FLU_FROM_FRD, "ned")
+
+
+def in_g(told: Told) -> None:
+    told.imu("/imu", "base_link")
+    for row in told.rows:
+        if row[1] == "/imu":
+            row[3].linear_acceleration.z /= 9.81
+
+
+def pulls(told: Told) -> None:
+    """Gravity, and not what holds against it, as some simulators have it."""
+    told.imu("/imu", "base_link")
+    for row in told.rows:
+        if row[1] == "/imu":
+            row[3].linear_acceleration.z *= -1.0
+
+
+@pytest.mark.parametrize(
+    ("tell", "says"),
+    [
+        (turned_over, "turned over"),
+        (inverted, "an inverted attitude"),
+        (down_labelled_up, "imu_frame ned"),
+        (in_g, "1 g and not 9.81 m/s²"),
+        (pulls, "with the other sign"),
+        (lambda told: told.imu("/imu", "base_link"), ""),
+    ],
+)
+def test_gravity_turned_by_the_orientation_points_up_or_what_is_wrong_is_said(tmp_path, tell, says):
+    told, m = Told(), motion()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    tell(told)
+    for i, stamp in told.every(5.0, 0.04):
+        velocity = m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, 0.03, 3)
+        told.say(
+            stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, Sample(stamp, velocity, 0.03**2 * np.eye(3)), "map")
+        )
+    bag = told.write(tmp_path / "bag")
+    found = discover([bag], Parameters())
+    assert says in " ".join((*found.found, *found.doubts)) if says else "gravity" not in " ".join(found.doubts)

@@ -1,0 +1,81 @@
+"""Whether an IMU's acceleration says the same of up and down as its orientation does.
+
+At rest an accelerometer shows what holds against gravity: upwards, and so it stays on a vehicle whose own accelerations
+average out. Turned by the orientation it must point up in the world that the orientation is of.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..calibration.frames import Array, rotation_from_quaternion
+from ..calibration.screening import unit_quaternions
+from ..recordings.look import Look
+
+# Fewer samples, and an acceleration below this (m/s²), tell nothing.
+ENOUGH, LEAST = 20, 0.2
+# Gravity in its two units, and how far a mean may be from it, as a share.
+STANDARD, NEAR = 9.81, 0.15
+# Up is up, and down is down, from this share of gravity on.
+CLEARLY = 0.5
+# A quaternion is taken for inverted where that leaves less than half, of a tilt (rad, rms) of this and more; so large
+# an angle from up in the mean is no vehicle's.
+TILTED, LEANS = math.radians(1.0), math.radians(8.0)
+
+
+class Gravity(NamedTuple):
+    """Means: size (m/s²); body (3,) in the IMU's axes and world (3,) in those of its orientation's world, as shares of
+    it. across, inverted: rms of what is across the vertical, as a share, as given and with quaternions inverted."""
+
+    size: float
+    body: Array
+    world: Array
+    across: float
+    inverted: float
+
+    @staticmethod
+    def of(imu: Look) -> Gravity | None:
+        """None where the IMU gives no acceleration, or no orientation."""
+        quaternion, acceleration = unit_quaternions(imu.values[:, :4]), imu.values[:, 7:]
+        use = np.isfinite(quaternion).all(axis=1) & np.isfinite(acceleration).all(axis=1)
+        size = float(np.linalg.norm(acceleration[use].mean(axis=0))) if np.count_nonzero(use) >= ENOUGH else 0.0
+        if size < LEAST:
+            return None
+        a, rotation = acceleration[use] / size, rotation_from_quaternion(quaternion[use])
+        world, inverted = (np.matmul(each, a[..., None])[..., 0] for each in (rotation, rotation.swapaxes(1, 2)))
+        across = [math.sqrt(float((each[:, :2] ** 2).sum(axis=1).mean())) for each in (world, inverted)]
+        return Gravity(size, a.mean(axis=0), world.mean(axis=0), *across)
+
+    def contradicts(self, rotation_body_from_imu: Array, world: str) -> int:
+        """How many of the two, the body's up and the world's, are down if an IMU's data are meant so."""
+        return int(float(rotation_body_from_imu[2] @ self.body) < -CLEARLY) + int(self._up(world) < -CLEARLY)
+
+    def says(self, rotation_body_from_imu: Array, world: str) -> str:
+        """What is wrong with how an IMU's data are taken, in words; else ''."""
+        body_up, up = float(rotation_body_from_imu[2] @ self.body), self._up(world)
+        if body_up < -CLEARLY and up < -CLEARLY:
+            return "the IMU's acceleration at rest points down, as gravity with the other sign: its driver has it wrong"
+        if body_up < -CLEARLY or up < -CLEARLY:
+            which = "body" if body_up < -CLEARLY else "world of its orientation"
+            return (
+                f"gravity is upside down in the {which}: the IMU is turned over, or its axes and its orientation are "
+                "of two conventions (imu_rpy, imu_frame)"
+            )
+        if self.across > TILTED and self.inverted < CLEARLY * self.across:
+            return (
+                "the data fit an IMU with an inverted attitude: only with quaternions inverted gravity points up "
+                f"(to {math.degrees(self.inverted):.1f}°, as they are to {math.degrees(self.across):.1f}°)"
+            )
+        if self.across > math.sin(LEANS) and math.hypot(*self.world[:2].tolist()) > math.sin(LEANS):
+            return f"gravity is {math.degrees(math.acos(min(1.0, up))):.0f}° from up by the IMU's own orientation"
+        if abs(self.size - 1.0) < NEAR:
+            return "the IMU's acceleration at rest is 1 g and not 9.81 m/s²: its driver does not send SI units"
+        if abs(self.size / STANDARD - 1.0) > NEAR:
+            return f"the IMU's acceleration at rest is {self.size:.3g} m/s², which is not gravity"
+        return ""
+
+    def _up(self, world: str) -> float:
+        return float(self.world[2]) * (-1.0 if world == "ned" else 1.0)
