@@ -7,7 +7,8 @@ recordings are compared, hold both; how far a calibration is, and what its data 
 A constant error of the reference is of the day as well, but headings show it, so it is a state, with the prior of a
 good reference, σ_p. Many are worse, and where headings do not show it σ holds that: of a true error o the estimate is
 off by S o, S = P_o / σ_p², beside what it claims. So (F² - 1) σ_p² S Sᵀ is added, of an o of F σ_p; and of a larger one
-where what the data show of it, x_o = (1 - S_o) o, contradicts the prior.
+where what the data show of it, x_o = (1 - S_o) o, contradicts the prior. An error of the same size upwards, of the
+reference or of the DVL, is no state; where an error across is a yaw it is a pitch of that size.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from .parameters import Parameters
 OFTEN_OFF = 4.0
 # Data that see this share of an error, or less, show nothing of it; so many σ contradict the prior.
 SEEN_FROM, SURELY = 0.02, 3.0
+# So large a share of the prior's variance that is left: headings hardly show a constant error.
+HARDLY_SEEN = 0.1
 OFFSETS = "reference_east", "reference_north"
 
 
@@ -38,6 +41,10 @@ def offset_covariance(model: Model, state: Array, claimed: Array, parameters: Pa
     shown = (share > SEEN_FROM) & (np.abs(seen) > SURELY * parameters.reference_offset_std)
     off = float((seen[shown] ** 2 / share[shown]).sum())
     found: Array = (max(OFTEN_OFF**2 * variance, off) - variance) * (sensitivity @ sensitivity.T)
+    if at and np.diag(claimed)[at].min() > HARDLY_SEEN * variance:
+        _, across, up = parameters.rotation_dvl_from_body.T
+        yaw = up @ sensitivity[:3]  # by an error across, for each m/s
+        found[:3, :3] += OFTEN_OFF**2 * variance * float(yaw @ yaw) * np.outer(across, across)
     return found
 
 

@@ -365,7 +365,7 @@ FINDINGS = (
     ),
     Kind(
         "ONE_HEADING",
-        "on one heading an error of reference or DVL that stays is a yaw or a scale: {off:g} m/s would be "
+        "on one heading an error of reference or DVL that stays is a yaw, a pitch or a scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %, and σ holds that of the reference",
         "A constant velocity error turns with the vehicle where it is the DVL's, and does not where it is the "
         "reference's or a current's; on one heading at one speed no data tell either from a mounting.",

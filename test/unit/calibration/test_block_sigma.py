@@ -132,6 +132,12 @@ def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may
     assert abs(trusting.estimate("G1").state[2]) > 2.0 * trusting.estimate("G1").std[2]
 
 
+def test_on_one_heading_pitch_is_no_better_known_than_a_bias_upwards_of_the_same_size_makes_it():
+    """A DVL's bias of 2 cm/s along z was a pitch of 1 degree, ± 0.1, and accepted."""
+    along, around = (on_course((0.0, 0.0), headings).estimate("G1").std for headings in (False, True))
+    assert along[1] == pytest.approx(np.radians(0.76), rel=0.1) and around[1] < np.radians(0.1)
+
+
 @pytest.mark.parametrize("offset", [(0.06, 0.0), (0.0, -0.06), (0.04, 0.04)])
 def test_a_reference_worse_than_its_prior_is_in_sigma_where_headings_hardly_show_it(offset):
     """A heading that wanders by a degree or two shows that the prior is wrong, and not by how much."""
