@@ -59,7 +59,8 @@ def print_answer(out: Console, replayed: Replayed) -> None:
     out.print(_table(replayed), style="dim" if rejected else None)
     if replayed.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
         out.print(
-            "Yaw is against the IMU's heading: a constant error of the heading is in it, and harmless with that IMU."
+            "Angles are against the IMU's own: a constant error of its heading is in the yaw, one of its level in roll "
+            "and pitch, and both are harmless with that IMU."
         )
     _print_navigation(out, replayed)
     for sentence in _not_shown(replayed):

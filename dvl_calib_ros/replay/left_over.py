@@ -42,6 +42,8 @@ QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
 # of how it bends, m/s².
 LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+# Known to no better than this (σ), it may as well be all of it.
+TILT_SHOWN = 0.2
 # A share from here on is no levelled velocity, but a sign.
 WRONG_SIGN_FROM = 1.6
 # An error of a mounting (rad) that is worth a word, and one that no answer is given beside.
@@ -179,6 +181,8 @@ def left_over_advice(found: Followed | None, of_positions: bool = False) -> list
             word = Severity.REJECT if off > WRONG_FROM or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
             found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
             said.append(found_tilt.weighed(word))
+        elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
+            said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     size = np.abs(found.bias)
     shown = (size > SURELY * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():

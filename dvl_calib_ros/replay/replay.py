@@ -148,7 +148,8 @@ def replay(
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived
     of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
-    of_clocks += [each.weighed(Severity.MARGINAL) for each in told] + left
+    of_clocks += [each.weighed(Severity.MARGINAL) for each in told]
+    of_clocks += [each for each in left if each.severity is not Severity.WARNING]
     deviation = navigation.deviation if navigation is not None else None
     if deviation is not None and comes_first(deviation, result.estimate):
         of_clocks += [each.weighed(Severity.REJECT) for each in deviates]

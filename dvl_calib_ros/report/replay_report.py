@@ -167,7 +167,7 @@ def _facts(replayed: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
     missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
     return [
         ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
-        *([("Yaw", "against the IMU's heading")] if replayed.reference_frame in EARTH else []),
+        *([("Angles", "against the IMU's heading and level")] if replayed.reference_frame in EARTH else []),
         ("Recorded", _when(result)),
         ("DVL data", replayed.dvl_data),
         ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),

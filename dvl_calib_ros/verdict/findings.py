@@ -321,6 +321,14 @@ FINDINGS = (
         "have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
     ),
     Kind(
+        "TILT_NOT_SHOWN",
+        "the vehicle hardly tilts, so nothing shows whether the DVL's driver levels its velocity: if it does, the "
+        "vehicle's mean {axis} is in the mounting ({lean:.1f}° of {axis})",
+        "A levelled velocity and one in the DVL's own axes differ by the tilt alone; its mean over a run looks like a "
+        "mounting.",
+        "look into the driver's settings, or record in waves or with dives",
+    ),
+    Kind(
         "DVL_BIAS",
         "the DVL is off by the same velocity at every speed, {axes} mm/s in the body: {degrees:.1f}° at the usual one",
         "A bias of the DVL's electronics, a rounding, or water that moves in its shell. At one speed nothing tells it "

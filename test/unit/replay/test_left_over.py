@@ -60,7 +60,19 @@ def smoothed(values, seconds):
 @pytest.mark.parametrize("wave_deg", [0.0, 0.2, 1.5, 5.0])
 @pytest.mark.parametrize("speeds", [(0.8, 1.2, 1.6), (1.2, 1.2, 1.2)])
 def test_where_all_is_right_nothing_is_said(rng, wave_deg, speeds):
-    assert left_over_advice(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found()) == []
+    found = left_over_advice(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found())
+    assert [each.code for each in found] == ([] if wave_deg > 1.0 else ["TILT_NOT_SHOWN"])
+    assert all(each.severity is Severity.WARNING for each in found)
+
+
+def test_on_a_calm_vehicle_it_is_said_that_its_trim_may_be_in_the_mounting(rng):
+    """Levelled or not, the DVL's velocity is the same where nothing tilts: a trim of 3 degrees was a pitch of 3."""
+    vehicle = Vehicle(rng, trim_deg=3.0, wave_deg=0.1)
+    levelled = np.einsum("nji,nj->ni", vehicle.level, vehicle.earth)
+    for dvl in (levelled, None):
+        (said,) = left_over_advice(vehicle.found(dvl=dvl))
+        assert said.severity is Severity.WARNING and said.code == "TILT_NOT_SHOWN" and "3.0° of pitch" in said.says
+    assert left_over_advice(Vehicle(rng, trim_deg=0.2, wave_deg=0.1).found()) == []
 
 
 @pytest.mark.parametrize(("trim_deg", "word"), [(0.0, Severity.MARGINAL), (3.0, Severity.REJECT)])
