@@ -17,7 +17,7 @@ setup(
     version="0.1.0",  # catkin_prepare_release raises it here and in package.xml; a test holds all equal
     python_requires=">=3.10",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "report/templates/*"]},
+    package_data={NAME: ["py.typed", "present/templates/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -68,7 +68,7 @@ __version__ = _version()
 
 
 # Subpackages that have the name of a public function
-_ALSO_FUNCTIONS = ("export", "replay", "report")
+_ALSO_FUNCTIONS = ("export", "replay")
 
 
 class _Callable(_ModuleType):

@@ -35,9 +35,9 @@ from dvl_calib_ros.evaluation.results import (
     HeldOut,
     Trace,
 )
+from dvl_calib_ros.present.replay_report import write_replay_report
 from dvl_calib_ros.replay.navigation import Drift, Navigation
 from dvl_calib_ros.replay.replay import Replayed, replay
-from dvl_calib_ros.report.replay_report import write_replay_report
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates
 FEW = ("M3", "F1")

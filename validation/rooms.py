@@ -34,16 +34,16 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "export": (*_CORE, "disk", "files", "effects"),
     "simulation": (*_READ, "effects", "export"),
     "evaluation": (*_READ, "parallel", "files", "replay", "simulation"),
-    "report": (*_CORE, "disk", "files", "effects", "replay", "diagnosis", "unpaired", "evaluation"),
+    "present": (*_CORE, "disk", "files", "effects", "replay", "diagnosis", "unpaired", "evaluation"),
     "node": (*_CORE, "streams", "disk", "messages", "files", "discovery", "simulation"),
     "demo": (*_READ, "files", "node"),
     "api": (
         *_READ, "parallel", "disk", "files", "discovery", "examination", "replay", "diagnosis", "unpaired",
-        "export", "simulation", "evaluation", "report",
+        "export", "simulation", "evaluation", "present",
     ),
     "cli": (
         *_READ, "streams", "parallel", "disk", "files", "effects", "discovery", "examination", "replay", "diagnosis",
-        "unpaired", "export", "simulation", "evaluation", "report", "node", "demo",
+        "unpaired", "export", "simulation", "evaluation", "present", "node", "demo",
     ),
     "__init__": ("api",),
 }  # fmt: skip

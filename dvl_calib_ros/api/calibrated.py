@@ -190,7 +190,7 @@ class Calibration:
 
     def plot(self) -> Figure:
         """The mounting over time with its ±1σ, and the velocity error before and after, as a matplotlib Figure."""
-        from ..report.calibration_figure import calibration_figure
+        from ..present.calibration_figure import calibration_figure
 
         if self.replayed.history is None:
             raise InputError("this replay kept no history; replay with history=True")
@@ -207,7 +207,7 @@ class Calibration:
 
     def report(self, path: str | os.PathLike[str]) -> Path:
         """Write the report (HTML) with pictures. Raises InputError."""
-        from ..report import write_replay_report
+        from ..present.reports import write_replay_report
 
         target = Path(path)
         write_replay_report(target, self.replayed, self.bags, list(MODELS))

@@ -26,16 +26,16 @@ def write(result: object, path: Path) -> None:
         result.report(path)
         return
     try:
-        from .. import report
+        from ..present import reports
     except ModuleNotFoundError as error:
         raise InputError(
             f"{path}: a page needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2"
         ) from error
-    getattr(report, page)(path, result)
+    getattr(reports, page)(path, result)
 
 
 def _forms(result: Any) -> tuple[Callable[[], Any], str]:
-    """What makes plain data of a result, and the function of `report` that writes its page, '' for none."""
+    """What makes plain data of a result, and the function of `present.reports` that writes its page, '' for none."""
     if isinstance(result, Calibration):
         return result.document, "write_replay_report"
     if isinstance(result, Examination):

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..calibration.parameters import Parameters
     from ..calibration.results import Estimate, Result
     from ..discovery.discover import Discovery, Given
+    from ..present.document import Document
     from ..recordings.recording import Recording
 
 
@@ -198,6 +199,16 @@ def print_warnings(notes: Sequence[str]) -> None:
     errors = console(stderr=True)
     for note in notes:
         errors.print(f"[yellow]warning:[/] {escape(printable(note))}", soft_wrap=True)
+
+
+def print_document(document: Document) -> None:
+    """A result as it is said, its warnings on standard error."""
+    from ..present.terminal import shown
+
+    print_warnings(document.warnings)
+    out = console()
+    for each in shown(document):
+        out.print(each)
 
 
 @contextmanager

@@ -12,24 +12,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..streams import give_up
 from . import common
-from .answer import VERDICTS
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from ..calibration.comparison import Comparison, Difference
     from ..calibration.extrinsics import Extrinsics
-
-# More pairs than these are in --json; printed are the neighbours in time.
-MOST_PAIRS = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..calibration.comparison import check_distinct, compare
     from ..calibration.comparison_words import comparison_document
     from ..errors import InputError
+    from ..present import comparison as present
 
     paths: list[Path] = arguments.results
     if len(paths) < 2:
@@ -61,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     comparison = compare(calibrations)
     try:
         common.deliver(
-            lambda: _print(comparison),
+            lambda: common.print_document(present.comparison(comparison)),
             (arguments.json, lambda path: common.write_json(path, comparison_document(comparison))),
             (arguments.report, lambda path: write_report(path, comparison)),
         )
@@ -92,118 +85,3 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
         found = calibrated(recording, discovery.parameters, discovery.topics, name, on_progress)
     common.print_warnings(found.notes)
     return found.extrinsics
-
-
-# ------------------------------------------------------------------ tables
-
-
-def _print(comparison: Comparison) -> None:
-    from rich.markup import escape
-
-    from ..calibration.comparison_words import reasons, remarks
-    from ..errors import printable
-
-    common.print_warnings([str(each) for each in remarks(comparison)])
-    out = common.console()
-    _, colour = VERDICTS[comparison.answer.severity.value]
-    first, *others = (each.full_sentence for each in reasons(comparison))
-    out.print(f"[bold {colour}]{comparison.word}[/]: {escape(printable(first))}")
-    for sentence in others:
-        out.print(escape(printable(sentence)))
-    out.print()
-    out.print(_calibrations(comparison))
-    n = len(comparison.calibrations)
-    neighbours = len(comparison.pairs) > MOST_PAIRS
-    pairs = [
-        pair for pair in comparison.pairs
-        if not neighbours or _follow(comparison.calibrations, pair)
-    ]  # fmt: skip
-    title = "Differences, the later less the earlier" + (" (neighbours; all pairs: --json)" if neighbours else "")
-    out.print(_differences(pairs, title, [f"{pair.first.name} → {pair.second.name}" for pair in pairs]))
-    if n > 2:
-        out.print(
-            _differences(
-                comparison.against_rest,
-                "Each less all others together",
-                [each.second.name for each in comparison.against_rest],
-            )
-        )
-
-
-def _follow(ordered: Sequence[Extrinsics], pair: Difference) -> bool:
-    return any(a is pair.first and b is pair.second for a, b in pairwise(ordered))
-
-
-def _calibrations(comparison: Comparison) -> Table:
-    import numpy as np
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    from ..calibration.comparison_words import date
-    from ..calibration.frames import rpy_from_rotation
-    from ..errors import printable
-
-    table = Table(box=box.SIMPLE_HEAD, caption="± 1σ;  -: not shown by its data", caption_justify="left")
-    for column in ("", "from (UTC)", "model"):
-        table.add_column(column, overflow="fold")
-    for column in ("roll °", "pitch °", "yaw °", "x m", "y m", "z m", "scale %", "late s"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for each in comparison.calibrations:
-        values = [
-            *np.degrees(rpy_from_rotation(each.rotation_body_from_dvl)), *each.lever_arm, 100 * each.scale,
-            each.time_offset,
-        ]  # fmt: skip
-        table.add_row(
-            escape(printable(each.name)), date(each.first_ns), each.model, *_cells(values, _in_units(each.std))
-        )
-    return table
-
-
-def _in_units(values: Iterable[float]) -> list[float]:
-    """Components in degrees, m, per cent and s."""
-    import math
-
-    factors = (*[math.degrees(1.0)] * 3, 1.0, 1.0, 1.0, 100.0, 1.0)
-    return [factor * value for factor, value in zip(factors, values, strict=True)]
-
-
-def _of(values: Iterable[float], columns: Sequence[int]) -> list[float]:
-    shown = _in_units(values)
-    return [shown[index] for index in columns]
-
-
-def _cells(values: Sequence[float], stds: Sequence[float], sign: str = "") -> list[str]:
-    return [
-        f"{round(value, 2) + 0.0:{sign}.2f} ± {std:.2f}" if std == std else "-"
-        for value, std in zip(values, stds, strict=True)
-    ]
-
-
-def _differences(differences: Sequence[Difference], title: str, names: Sequence[str]) -> Table:
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    from ..calibration.comparison import MOUNTING
-    from ..errors import printable
-
-    caption = "angles: turn of the mounting about the body's axes; χ² and its chance probability: angles and lever arm"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
-    table.add_column("", overflow="fold")
-    names_of = ("about x °", "y °", "z °", "x m", "y m", "z m", "scale %", "late s")
-    columns = [index for index in range(len(names_of)) if any(each.compared[index] for each in differences)]
-    for column in (*(names_of[index] for index in columns), "mounting's χ², p"):
-        table.add_column(column, justify="right", no_wrap=True)
-    for each, name in zip(differences, names, strict=True):
-        test = each.test(MOUNTING)
-        table.add_row(
-            escape(printable(name)),
-            *_cells(_of(each.value, columns), _of(each.std, columns), "+"),
-            f"{test.value:.1f} of {test.freedom}, {_p(test.p)}" if test.freedom else "-",
-        )  # fmt: skip
-    return table
-
-
-def _p(p: float) -> str:
-    return "-" if p != p else f"{p:.2f}" if p >= 0.01 else f"{p:.0e}"

@@ -10,7 +10,7 @@ import pytest
 from io_fixtures import run
 from report_fixtures import comparison, cross_checked, diagnosis, evaluation, replay_page
 
-from dvl_calib_ros.report import (
+from dvl_calib_ros.present.reports import (
     write_comparison_report,
     write_cross_check_report,
     write_diagnosis_report,

@@ -16,8 +16,9 @@ from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
-from dvl_calib_ros.report import diagnosis_report, write_diagnosis_report
-from dvl_calib_ros.report.twin_section import rms, spectrum
+from dvl_calib_ros.present import diagnosis_report
+from dvl_calib_ros.present.reports import write_diagnosis_report
+from dvl_calib_ros.present.twin_section import rms, spectrum
 
 pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each
 

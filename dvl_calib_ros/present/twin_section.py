@@ -12,7 +12,7 @@ from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
 from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
-from .page import Table
+from .document import Table
 from .style import Picture, picture
 from .time_axis import TimeAxis
 

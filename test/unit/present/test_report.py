@@ -21,14 +21,14 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.present.exploring import Track, explorable
+from dvl_calib_ros.present.replay_figures import Line, estimate_over_time, held_out_errors
+from dvl_calib_ros.present.replay_report import write_replay_report
+from dvl_calib_ros.present.reports import write_evaluation_report
+from dvl_calib_ros.present.style import MODEL_STYLES, new_figure
+from dvl_calib_ros.present.time_axis import TimeAxis
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.replay.replay import replay
-from dvl_calib_ros.report import write_evaluation_report
-from dvl_calib_ros.report.exploring import Track, explorable
-from dvl_calib_ros.report.replay_figures import Line, estimate_over_time, held_out_errors
-from dvl_calib_ros.report.replay_report import write_replay_report
-from dvl_calib_ros.report.style import MODEL_STYLES, new_figure
-from dvl_calib_ros.report.time_axis import TimeAxis
 from dvl_calib_ros.verdict.kinds import Severity
 
 SECOND = 1_000_000_000
@@ -363,11 +363,8 @@ def test_a_bad_bag_leaves_no_report(tmp_path, capsys):
 
 
 def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, capsys, monkeypatch):
-    for name in [name for name in sys.modules if name.startswith("dvl_calib_ros.report")]:
+    for name in [name for name in sys.modules if name.startswith("dvl_calib_ros.present")]:
         monkeypatch.delitem(sys.modules, name)
-    import dvl_calib_ros
-
-    monkeypatch.delattr(dvl_calib_ros, "report")
     monkeypatch.setitem(sys.modules, "jinja2", None)
     bag = write_bag(tmp_path / "bag", run())
     assert "pip install matplotlib jinja2" in fail(capsys, "replay", bag, "--report", tmp_path / "report.html")
@@ -376,7 +373,7 @@ def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, cap
 def test_a_replay_without_report_imports_no_plots(tmp_path):
     bag = write_bag(tmp_path / "bag", run())
     statement = f"from dvl_calib_ros.cli.main import main; main(['replay', {str(bag)!r}])"
-    assert in_fresh_process(statement, ["matplotlib", "jinja2", "dvl_calib_ros.report"]) == []
+    assert in_fresh_process(statement, ["matplotlib", "jinja2", "dvl_calib_ros.present.reports"]) == []
 
 
 # ------------------------------------------------------------------ evaluation

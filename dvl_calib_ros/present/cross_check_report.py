@@ -9,8 +9,9 @@ import numpy as np
 
 from ..evaluation.bags import CrossCheck
 from ..replay.navigation import Navigation
+from .document import Table
 from .navigation_figures import navigation_pictures
-from .page import Table, parameter_texts, write_page
+from .page import parameter_texts, write_page
 from .style import Picture
 
 

@@ -19,7 +19,8 @@ from ..diagnosis.results import Diagnosis, FoundEffect, Verdict
 from ..diagnosis.series import DiagnosisSeries
 from ..effects.registry import EFFECTS
 from . import diagnosis_figures as figures
-from .page import Cell, Table, signed, write_page
+from .document import Cell, Table, signed
+from .page import write_page
 from .series import running_mean
 from .style import Picture, picture
 from .time_axis import CUT_FROM_S, TimeAxis

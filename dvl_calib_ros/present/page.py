@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,47 +19,16 @@ from markupsafe import Markup
 
 from .. import __version__
 from ..disk.atomic import save_text
+from .document import Document, Where
 from .style import MODEL_STYLES
 
 # Class of a cell that holds a verdict
 VERDICT_KINDS = {"accept": "good", "marginal": "off", "reject": "bad"}
 
 
-@dataclass(frozen=True)
-class Cell:
-    """Text of a table. kind: a class of the style sheet, such as good, off, far, bad.
-
-    below: small, on a second line.
-    """
-
-    text: str
-    kind: str = ""
-    below: str = ""
-
-
-@dataclass(frozen=True)
-class Table:
-    """head: names of the columns. rows: cells, each a text or a `Cell`; the first column names the row.
-
-    marked: index of the row that stands out. notes: below the table. dense: of many columns.
-    """
-
-    head: Sequence[str | Cell]
-    rows: Sequence[Sequence[str | Cell]]
-    title: str = ""
-    marked: int | None = None
-    notes: Sequence[str] = ()
-    dense: bool = False
-
-
-def signed(value: float, digits: int = 2) -> str:
-    """A number with its sign, the minus as wide as the plus."""
-    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "−")  # + 0.0: no minus before zero
-
-
-def parameter_texts(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Parameters as they are shown, by name."""
-    return {name: _plain(value) for name, value in parameters.items()}
+def parameter_texts(parameters: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Parameters as they are shown, with their names."""
+    return [(name, _plain(value)) for name, value in parameters.items()]
 
 
 def _plain(value: Any) -> str:
@@ -73,7 +42,7 @@ def _plain(value: Any) -> str:
 @cache
 def _environment() -> jinja2.Environment:
     return jinja2.Environment(
-        loader=jinja2.PackageLoader("dvl_calib_ros.report"),
+        loader=jinja2.PackageLoader("dvl_calib_ros.present"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -94,6 +63,14 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
 
 def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def write_document(path: Path, document: Document) -> None:
+    """Write the page of a document. Raises InputError if it cannot be written."""
+    sections = [each for each in document.sections if each.where is not Where.TERMINAL and each.items]
+    context = {"title": document.title, "subtitle": document.subtitle, "document": document, "sections": sections}
+    written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
+    write_page(path, "document.html", context | {"written": written})
 
 
 def write_page(path: Path, template: str, context: Mapping[str, Any]) -> None:

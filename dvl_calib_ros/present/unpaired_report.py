@@ -15,7 +15,8 @@ from scipy.signal import welch
 from ..calibration.frames import Array
 from ..unpaired.results import ComparedEffect, ComparedNoise, Status, UnpairedComparison, Verdict
 from ..unpaired.shrink import ALL, AS_IT_IS, NOISE, Shrunk
-from .page import Cell, Table, write_page
+from .document import Cell, Table
+from .page import write_page
 from .replay_figures import AFTER, BAD
 from .series import running_mean
 from .style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks

@@ -1,0 +1,145 @@
+"""What a comparison of calibrations says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..calibration.comparison import MOUNTING, Comparison, Difference
+from ..calibration.comparison_words import date, reasons, remarks
+from ..calibration.extrinsics import Extrinsics
+from ..calibration.frames import Array, rpy_from_rotation
+from .document import Answer, Document, Figures, Section, Sentence, Table, Where, with_std
+
+if TYPE_CHECKING:
+    from .style import Picture
+
+# Of more pairs than these a terminal shows the neighbours in time.
+MOST_PAIRS = 10
+_DEGREE = math.degrees(1.0)
+
+
+class Quantity(NamedTuple):
+    """What is compared. component: its index in `COMPONENTS`. turn: what a difference of it is called.
+
+    factor: from SI. changes: of `Comparison`.
+    """
+
+    component: int
+    name: str
+    turn: str
+    unit: str
+    factor: float
+    changes: str
+
+
+QUANTITIES = (
+    Quantity(0, "roll", "about x", "°", _DEGREE, "moved"),
+    Quantity(1, "pitch", "about y", "°", _DEGREE, "moved"),
+    Quantity(2, "yaw", "about z", "°", _DEGREE, "moved"),
+    Quantity(3, "lever arm x", "lever arm x", "m", 1.0, "moved"),
+    Quantity(4, "lever arm y", "lever arm y", "m", 1.0, "moved"),
+    Quantity(5, "lever arm z", "lever arm z", "m", 1.0, "moved"),
+    Quantity(6, "scale", "scale", "%", 100.0, "scale_changed"),
+    Quantity(7, "stamps late", "stamps late", "s", 1.0, "clock_changed"),
+)
+
+
+def comparison(result: Comparison) -> Document:
+    """Whether the mounting moved, by how much, and each calibration and difference with its σ."""
+    pairs, rest, ordered = result.pairs, result.against_rest, result.calibrations
+    by_name = [f"{each.first.name} → {each.second.name}" for each in pairs]
+    neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
+    near = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
+    few = len(pairs) <= MOST_PAIRS
+    return Document(
+        title="DVL calibrations compared",
+        subtitle=", ".join(each.name for each in ordered),
+        answer=Answer(result.word, result.answer.severity, [each.full_sentence for each in reasons(result)]),
+        warnings=[str(each) for each in remarks(result)],
+        sections=[
+            Section(
+                "Over time",
+                [
+                    Sentence("With ±1σ; a dashed line where it is said to have changed.", soft=True),
+                    Figures(lambda: _pictures(result)),
+                ],
+                Where.PAGE,
+            ),
+            Section("Calibrations", [_calibrations(result)]),
+            Section(
+                "Differences, the later less the earlier",
+                [_differences(pairs, by_name)],
+                Where.BOTH if few else Where.PAGE,
+            ),
+            Section(
+                "Differences, the later less the earlier (neighbours; all pairs: --json)",
+                [] if few else [_differences([pairs[k] for k in near], [by_name[k] for k in near])],
+                Where.TERMINAL,
+            ),
+            Section(
+                "Each less all others together",
+                [_differences(rest, [each.second.name for each in rest])] if rest else [],
+            ),
+        ],
+    )
+
+
+def _pictures(result: Comparison) -> list[Picture]:
+    from .comparison_figures import trend
+
+    return trend(result)
+
+
+def shown_quantities(result: Comparison) -> list[Quantity]:
+    """Quantities that two calibrations have shown at least."""
+    return [each for each in QUANTITIES if sum(own.shown[each.component] for own in result.calibrations) > 1]
+
+
+def values_of(each: Extrinsics) -> Array:
+    """(8,) in SI: roll, pitch, yaw, lever arm, scale, delay."""
+    return np.array([*rpy_from_rotation(each.rotation_body_from_dvl), *each.lever_arm, each.scale, each.time_offset])
+
+
+def _calibrations(result: Comparison) -> Table:
+    columns = shown_quantities(result)
+    return Table(
+        ("", "from (UTC)", "model", "samples", *(f"{each.name}, {each.unit}" for each in columns)),
+        [
+            (each.name, date(each.first_ns), each.model, str(each.used), *_cells(values_of(each), each.std, columns))
+            for each in result.calibrations
+        ],
+        dense=True,
+        notes=("± is 1σ as each calibration states it; – was not shown by its data.",),
+        words=3,
+    )
+
+
+def _cells(values: Array, stds: Array, columns: Sequence[Quantity], signed: bool = False) -> list[str]:
+    return [
+        with_std(each.factor * values[each.component], each.factor * stds[each.component], signed=signed)
+        for each in columns
+    ]
+
+
+def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
+    columns = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
+    rows = []
+    for each, name in zip(differences, names, strict=True):
+        test = each.test(MOUNTING)
+        p = f"{test.p:.2f}" if test.p >= 0.01 else f"{test.p:.0e}"
+        last = (f"{test.value:.1f} of {test.freedom}", p) if test.freedom else ("–", "–")
+        rows.append((name, *_cells(each.value, each.std, columns, signed=True), *last))
+    return Table(
+        ("", *(f"{each.turn}, {each.unit}" for each in columns), "mounting: χ²", "p"),
+        rows,
+        dense=True,
+        notes=(
+            "Angles are the turn of the mounting about the body's axes. χ² (of so many components) of angles and lever "
+            "arm together; p: how often chance alone makes it as large.",
+        ),
+    )

@@ -1,0 +1,101 @@
+"""Pictures of a comparison: every quantity over time, with a line where it is said to have changed."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+from matplotlib.figure import Figure
+
+from ..calibration.comparison import Change, Comparison
+from ..calibration.extrinsics import Extrinsics
+from .comparison import Quantity, shown_quantities, values_of
+from .style import INK, Picture, drawing, new_figure, picture
+
+_POINT, _MOVED = "#1f6fb2", "#c0392b"
+PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
+PNG_DPI = 160
+
+
+def trend(comparison: Comparison) -> list[Picture]:
+    """Every quantity that two have shown, a picture each."""
+    return [_picture(comparison, quantity) for quantity in shown_quantities(comparison)]
+
+
+def trend_png(comparison: Comparison) -> bytes:
+    """Every quantity that was shown over time, as one picture."""
+    with drawing():
+        quantities = shown_quantities(comparison)
+        columns = 2 if len(quantities) > 1 else 1
+        rows = -(-len(quantities) // columns)
+        figure = Figure(figsize=(columns * PANEL_WIDTH, rows * PANEL_HEIGHT))
+        grid = figure.subplots(rows, columns, squeeze=False)
+        for axes, quantity in zip(grid.flat, quantities, strict=False):
+            _draw(axes, comparison, quantity)
+        for axes in list(grid.flat)[len(quantities) :]:
+            axes.set_axis_off()
+        target = io.BytesIO()
+        figure.savefig(target, format="png", dpi=PNG_DPI)
+    return target.getvalue()
+
+
+def _picture(comparison: Comparison, quantity: Quantity) -> Picture:
+    def draw() -> Figure:
+        figure, axes = new_figure(height=PANEL_HEIGHT)
+        _draw(axes, comparison, quantity)
+        return figure
+
+    at = quantity.component
+    told = ", ".join(
+        f"{each.name} {quantity.factor * values_of(each)[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
+        for each in comparison.calibrations
+        if each.shown[at]
+    )
+    title = f"{quantity.name.capitalize()}, {quantity.unit}"
+    return picture(title, f"{quantity.name} over time, in {quantity.unit}: {told}", draw)
+
+
+def _draw(axes: Axes, comparison: Comparison, quantity: Quantity) -> None:
+    """One quantity over time with ±1σ; a line where it is said to have changed."""
+    known = [each for each in comparison.calibrations if each.shown[quantity.component]]
+    dated = _dated(comparison.calibrations)
+    order = {id(each): index for index, each in enumerate(comparison.calibrations)}
+    value = quantity.factor * np.array([values_of(each)[quantity.component] for each in known])
+    std = quantity.factor * np.array([each.std[quantity.component] for each in known])
+    at = [_middle(each) if dated else float(order[id(each)]) for each in known]
+    axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)
+    changes: Sequence[Change] = getattr(comparison, quantity.changes)
+    for index, change in enumerate(changes):
+        ends = [_middle(each) if dated else order[id(each)] for each in (change.last_before, change.first_after)]
+        label = "changed" if index == 0 else None
+        axes.axvline(sum(ends) / 2.0, color=_MOVED, linewidth=1.2, linestyle="--", label=label)
+    if dated:
+        locator = AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
+        axes.xaxis.set_major_locator(locator)
+        axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    else:
+        names = [each.name for each in comparison.calibrations]
+        axes.set_xticks(range(len(names)), [_short(name) for name in names], rotation=30, ha="right")
+        axes.set_xlim(-0.5, len(names) - 0.5)
+    axes.margins(y=0.25)
+    axes.set_ylabel(f"{quantity.name}, {quantity.unit}", color=INK)
+    if changes:
+        axes.legend(loc="best")
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}"
+
+
+def _dated(calibrations: Sequence[Extrinsics]) -> bool:
+    """Whether they follow each other; those of simulations, stamped alike, do not."""
+    return all(before.last_ns <= after.first_ns for before, after in pairwise(calibrations))
+
+
+def _middle(each: Extrinsics) -> float:
+    """In days since 1970, as matplotlib counts dates."""
+    return 0.5 * (each.first_ns + each.last_ns) * 1e-9 / 86400.0

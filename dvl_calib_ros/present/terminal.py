@@ -1,0 +1,74 @@
+"""A document on a terminal: an answer in its colour, sentences, tables without lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..errors import printable
+from ..verdict.kinds import Severity
+from .document import Cell, Document, Sentence, Table, Where
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+COLOURS = {
+    Severity.ACCEPT: "green",
+    Severity.MARGINAL: "yellow",
+    Severity.WARNING: "yellow",
+    Severity.REJECT: "red",
+    Severity.ERROR: "red",
+}
+# Of a cell by its class on a page
+_STYLES = {"good": "green", "off": "yellow", "far": "yellow", "bad": "red"}
+
+
+def shown(document: Document) -> Iterator[Any]:
+    """What rich prints of a document, but for its warnings, one after the other."""
+    from rich.text import Text
+
+    answer = document.answer
+    if answer is not None:
+        first, *others = map(printable, answer.sentences)
+        yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", first)
+        yield from map(Text, others)
+    for section in document.sections:
+        if section.where is Where.PAGE or not section.items:
+            continue
+        title = section.title
+        for item in section.items:
+            if isinstance(item, Table):
+                yield ""
+                yield _table(item, title)
+                title = ""
+            elif isinstance(item, Sentence):
+                yield Text(printable(item.text), "dim" if item.soft else "")
+
+
+def _table(table: Table, title: str) -> RichTable:
+    from rich import box
+    from rich.table import Table as RichTable
+
+    made = RichTable(
+        title=table.title or title or None,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        caption=" ".join(table.notes) or None,
+        caption_justify="left",
+    )
+    for index, name in enumerate(table.head):
+        is_word = index < table.words
+        made.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
+    for index, row in enumerate(table.rows):
+        made.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
+    return made
+
+
+def _cell(cell: str | Cell) -> Text:
+    from rich.text import Text
+
+    if isinstance(cell, str):
+        return Text(printable(cell))
+    text = Text(printable(cell.text), _STYLES.get(cell.kind, ""))
+    return text.append(f" {printable(cell.below)}", "dim") if cell.below else text

@@ -1,0 +1,78 @@
+"""A document is laid out once: a terminal, a page and a data frame show the same words and numbers."""
+
+from __future__ import annotations
+
+import io
+import re
+from html import unescape
+
+import pytest
+from report_fixtures import comparison as compared
+from rich.console import Console
+
+from dvl_calib_ros.present.comparison import comparison
+from dvl_calib_ros.present.document import Answer, Cell, Document, Section, Sentence, Table, Where, number, with_std
+from dvl_calib_ros.present.page import write_document
+from dvl_calib_ros.present.terminal import shown
+from dvl_calib_ros.verdict.kinds import Severity
+
+TABLE = Table(("", "n"), [("row", Cell("1.5", "bad", "beside"))])
+MADE = Document(
+    title="A <title>",
+    subtitle="of \x1b[31mtwo",
+    answer=Answer("off", Severity.MARGINAL, ["The [bold]first[/]\x07.", "The second."]),
+    warnings=["a <warning>"],
+    sections=[
+        Section(
+            "Both", [Sentence("Said to both.", soft=True), Table(("", "n"), [("row", Cell("1.5", "bad", "beside"))])]
+        ),
+        Section("Page", [Sentence("For the page.")], Where.PAGE),
+        Section("Terminal", [Sentence("For the terminal.")], Where.TERMINAL),
+        Section("Empty", []),
+    ],
+    parameters=[("min_speed", "0.3")],
+)
+
+
+def at_terminal(document: Document) -> str:
+    out = Console(file=io.StringIO(), width=200)
+    for each in shown(document):
+        out.print(each)
+    return out.file.getvalue()
+
+
+def on_page(document: Document, tmp_path) -> str:
+    write_document(tmp_path / "page.html", document)
+    text = re.sub(r"<(style|script|title).*?</\1>", "", (tmp_path / "page.html").read_text(), flags=re.DOTALL)
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", text)).split())
+
+
+def test_what_both_show_is_the_same_and_what_one_shows_is_not_at_the_other(tmp_path):
+    terminal, page = " ".join(at_terminal(MADE).split()), on_page(MADE, tmp_path)
+    for words in ("The [bold]first[/]", "The second.", "Said to both.", "Both", "row", "1.5", "beside"):
+        assert words in terminal and words in page, words
+    assert "For the page." in page and "For the page." not in terminal
+    assert "For the terminal." in terminal and "For the terminal." not in page
+    assert "Empty" not in terminal and "Empty" not in page
+    assert "\x07" not in terminal and "A <title>" in page and "min_speed" in page
+
+
+def test_a_comparison_has_the_same_numbers_at_a_terminal_and_on_a_page(tmp_path):
+    document = comparison(compared("it"))
+    cells = [cell for table in document.tables for row in table.rows for cell in row]
+    terminal, page = at_terminal(document), on_page(document, tmp_path)
+    assert len(cells) > 50
+    for cell in cells:
+        assert cell in terminal and " ".join(cell.split()) in page, cell
+
+
+def test_a_table_is_a_data_frame():
+    pandas = pytest.importorskip("pandas")
+    frame = MADE.tables[0].frame()
+    assert isinstance(frame, pandas.DataFrame) and frame.loc[0, "n"] == "1.5"
+
+
+@pytest.mark.parametrize(("value", "said"), [(1.005, "1.00"), (-0.001, "0.00"), (-2.5, "−2.50"), (float("nan"), "–")])
+def test_numbers_have_no_minus_before_zero_and_a_dash_where_there_is_none(value, said):
+    assert number(value) == said
+    assert with_std(value, float("nan")) == "–"
