@@ -134,7 +134,8 @@ class Seen:
     """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
     (F, 3) m/s smoothed DVL velocity, its frame. rate_of_change: (F, 3) m/s² of it. error: (F, 3) e, body frame.
     angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
-    dvl_stamps, reference_stamps: (F,) s that these give the same times.
+    dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
+    body frame to the axes that are compared.
     """
 
     motion: EffectInput
@@ -146,6 +147,11 @@ class Seen:
     body_from_measured: Array
     dvl_stamps: Array
     reference_stamps: Array
+    projection: Array
+
+    def compared(self, body: Array) -> Array:
+        """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
+        return self.projection @ body if body.ndim > 2 else (self.projection @ body[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -315,7 +321,15 @@ class Problem:
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
         error = _turned(matrix, raw) - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
-        return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix, dvl, reference)
+        projection = self._kept_projection(stream, rotation, attitude)
+        return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix, dvl, reference, projection)
+
+    def _kept_projection(self, stream: Recording, rotation: Array | None, at: Array) -> Array:
+        """`projection` at times (F,) s of the attitude, of which the last few are kept."""
+        if stream.attitude is None or all(self.measured):
+            return self.projection(stream, rotation)
+        what = f"projection {self.measured}"
+        return np.asarray(stream.attitude.kept.at(what, at, lambda: self.projection(stream, rotation)))
 
     def _oriented(self, stream: Recording, at: Array) -> tuple[Array | None, Array | None]:
         rotation = stream.rotation_enu_from_body(at) if Needs.ATTITUDE in self.available else None
@@ -332,11 +346,8 @@ class Problem:
     def binned(self, bodies: Sequence[Array], seen: Sequence[Seen]) -> Array:
         """(F, 3, ...) of each recording, body frame, -> (M, A, ...) means, in the frame that is compared."""
         parts = []
-        for recording, grid, body, each in zip(self.recordings, self.grids, bodies, seen, strict=True):
-            if not all(self.measured):
-                projection = self.projection(recording, each.motion.rotation_enu_from_body)
-                body = np.einsum("nij,nj...->ni...", np.broadcast_to(projection, (len(body), self.axes, 3)), body)
-            parts.append(grid.averaged(body))
+        for grid, body, each in zip(self.grids, bodies, seen, strict=True):
+            parts.append(grid.averaged(body if all(self.measured) else each.compared(body)))
         return np.concatenate(parts)
 
     @cached_property
@@ -353,14 +364,11 @@ class Problem:
     def errors(self, seen: Sequence[Seen]) -> Array:
         """(F, 3) m/s, e of every sample, not averaged, ahead, to port and up; zero on an axis that is not measured."""
         parts = []
-        for recording, each in zip(self.recordings, seen, strict=True):
+        for each in seen:
             error = each.error
             if not all(self.measured):
-                projection = self.projection(recording, each.motion.rotation_enu_from_body)
                 error = np.zeros_like(error)
-                error[:, list(self.measured)] = np.einsum(
-                    "nij,nj->ni", np.broadcast_to(projection, (len(error), self.axes, 3)), each.error
-                )
+                error[:, list(self.measured)] = each.compared(each.error)
             parts.append(error)
         return np.concatenate(parts)
 
