@@ -34,7 +34,9 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "export": (*_CORE, "disk", "files", "effects"),
     "simulation": (*_READ, "effects", "export"),
     "evaluation": (*_READ, "parallel", "files", "replay", "simulation"),
-    "present": (*_CORE, "disk", "files", "effects", "replay", "diagnosis", "unpaired", "evaluation"),
+    "present": (
+        *_READ, "disk", "files", "effects", "discovery", "examination", "replay", "diagnosis", "unpaired", "evaluation",
+    ),
     "node": (*_CORE, "streams", "disk", "messages", "files", "discovery", "simulation"),
     "demo": (*_READ, "files", "node"),
     "api": (

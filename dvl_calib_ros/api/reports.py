@@ -16,12 +16,10 @@ from .calibrated import Calibration
 
 def write(result: object, path: Path) -> None:
     """Write a result as JSON where the path ends so, else as a page. Raises InputError."""
-    document, page = _forms(result)
+    document = _plain(result)
     if path.suffix.lower() == ".json":
         write_json(path, document())
         return
-    if not page:
-        raise InputError(f"{path}: this result has no page; name a file that ends in .json")
     if isinstance(result, Calibration):
         result.report(path)
         return
@@ -31,34 +29,34 @@ def write(result: object, path: Path) -> None:
         raise InputError(
             f"{path}: a page needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2"
         ) from error
-    getattr(reports, page)(path, result)
+    reports.write_report(path, result)
 
 
-def _forms(result: Any) -> tuple[Callable[[], Any], str]:
-    """What makes plain data of a result, and the function of `present.reports` that writes its page, '' for none."""
+def _plain(result: Any) -> Callable[[], Any]:
+    """What makes plain data of a result. Raises InputError for what is none."""
     if isinstance(result, Calibration):
-        return result.document, "write_replay_report"
+        return result.document
     if isinstance(result, Examination):
-        return result.document, ""
+        return result.document
     if isinstance(result, Comparison):
         from ..calibration.comparison_words import comparison_document
 
-        return lambda: comparison_document(result), "write_comparison_report"
+        return lambda: comparison_document(result)
     if isinstance(result, Diagnosis):
         from ..diagnosis.results import diagnosis_document
 
-        return lambda: diagnosis_document(result), "write_diagnosis_report"
+        return lambda: diagnosis_document(result)
     from ..evaluation.bags import CrossCheck, cross_check_document
     from ..evaluation.documents import evaluation_document
     from ..evaluation.results import Evaluation
     from ..unpaired.results import UnpairedComparison, unpaired_document
 
     if isinstance(result, Evaluation):
-        return lambda: evaluation_document(result), "write_evaluation_report"
+        return lambda: evaluation_document(result)
     if isinstance(result, CrossCheck):
-        return lambda: cross_check_document(result), "write_cross_check_report"
+        return lambda: cross_check_document(result)
     if isinstance(result, UnpairedComparison):
-        return lambda: unpaired_document(result), "write_unpaired_report"
+        return lambda: unpaired_document(result)
     raise InputError(
         f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
     )

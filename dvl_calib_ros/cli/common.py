@@ -203,12 +203,14 @@ def print_warnings(notes: Sequence[str]) -> None:
 
 def print_document(document: Document) -> None:
     """A result as it is said, its warnings on standard error."""
+    from rich.text import Text
+
     from ..present.terminal import shown
 
     print_warnings(document.warnings)
     out = console()
     for each in shown(document):
-        out.print(each)
+        out.print(each, soft_wrap=isinstance(each, Text) and bool(each.no_wrap))
 
 
 @contextmanager

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         twice = next(path for path in paths if paths.count(path) > 1)
         raise InputError(f"{twice}: named twice; a calibration cannot be compared with itself")
     common.check_outputs(arguments, "json", "report")
-    write_report = report_writer(arguments, "write_comparison_report")
+    write_report = report_writer(arguments)
     names = _names(paths)
     calibrations = [_loaded(arguments, path, name) for path, name in zip(paths, names, strict=True)]
     check_distinct(calibrations)

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
         also_written={f"--apply of {name}": path for name, path in of_each.items()},
     )
     _check_twins(arguments.twin, names)
-    write_report = report_writer(arguments, "write_diagnosis_report")
+    write_report = report_writer(arguments)
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
     parameters = discovery.parameters

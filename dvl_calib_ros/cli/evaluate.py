@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
-from .cross_check import print_cross_check
 from .reporting import add_report_option, report_writer
 from .tables import cell, titled
 
@@ -70,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
         _cross_check(arguments, models, workers)
         return
     parameters = common.load(arguments, DEFAULTS)
-    write_report = report_writer(arguments, "write_evaluation_report")
+    write_report = report_writer(arguments)
     with common.progress("evaluating") as on_progress:
         evaluation = evaluate(
             arguments.paths[0] if arguments.paths else None,
@@ -272,16 +271,17 @@ def _noise_table(study: ErrorsInVariables) -> Table:
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     from ..errors import InputError
     from ..evaluation.bags import cross_check, cross_check_document
+    from ..present import cross_check as present
     from ..recordings.topics import Topics
 
     if arguments.csv is not None:
         raise InputError("--csv: only for a folder of trajectories; for bags there is --json")
-    write_report = report_writer(arguments, "write_cross_check_report")
+    write_report = report_writer(arguments)
     topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
         check = cross_check(arguments.paths, common.load(arguments), models, topics, workers, on_progress)
     common.deliver(
-        lambda: print_cross_check(check),
+        lambda: common.print_document(present.cross_check(check)),
         (arguments.json, lambda path: common.write_json(path, cross_check_document(check))),
         (arguments.report, lambda path: write_report(path, check)),
     )

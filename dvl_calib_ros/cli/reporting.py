@@ -12,7 +12,7 @@ def add_report_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
 
 
-def report_writer(arguments: argparse.Namespace, name: str) -> Callable[..., None]:
+def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> Callable[..., None]:
     """A function of present/reports.py, which nobody is to call if no report is asked for.
 
     Raises InputError, before any work is done, if a library is missing that reports are made with.

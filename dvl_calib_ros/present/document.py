@@ -6,12 +6,14 @@ What a result says is laid out once, by the module of this room that is called a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 from ..verdict.kinds import Severity
+from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
     from .style import Picture
@@ -97,11 +99,28 @@ class Figures:
 
 
 @dataclass(frozen=True)
+class Found:
+    """Something that was found, with its remedy."""
+
+    reason: Reason
+
+
+@dataclass(frozen=True)
+class Commands:
+    """What to type, or to paste: a line each, with what it is called."""
+
+    lines: Sequence[tuple[str, str]]
+
+
+Item = Sentence | Table | Figures | Found | Commands
+
+
+@dataclass(frozen=True)
 class Section:
     """What stands under one heading."""
 
     title: str
-    items: Sequence[Sentence | Table | Figures]
+    items: Sequence[Item]
     where: Where = Where.BOTH
 
 
@@ -116,9 +135,10 @@ class Answer:
 
 @dataclass(frozen=True)
 class Document:
-    """A result as it is said. warnings: what to know beside it. sections: in order; those without items are left out.
+    """A result as it is said.
 
-    parameters: what it was made with, by name; for the page.
+    warnings: what to know beside it. sections: in order; those without items are left out. parameters: what it was made
+    with, by name; for the page. lead: what is said before all else.
     """
 
     title: str
@@ -127,6 +147,7 @@ class Document:
     warnings: Sequence[str]
     sections: Sequence[Section]
     parameters: Sequence[tuple[str, str]] = ()
+    lead: str = ""
 
     @property
     def tables(self) -> list[Table]:
@@ -150,3 +171,41 @@ def signed(value: float, digits: int = 2) -> str:
 def with_std(value: float, std: float, digits: int = 2, *, signed: bool = False) -> str:
     """A number with its standard deviation; – where that is not known."""
     return f"{number(value, digits, signed=signed)} ± {std:.{digits}f}" if std == std else "–"
+
+
+def p_value(p: float) -> str:
+    """A probability; – for none."""
+    return "–" if p != p else f"{p:.2g}" if p >= 1e-300 else "below 1e-300"
+
+
+def three(value: float) -> str:
+    """Three significant digits."""
+    if math.isinf(value):
+        return "∞"
+    text = f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:#.3g}".rstrip(".")
+    return text.replace("-", "−")
+
+
+def interval(each: tuple[float, float, float]) -> str:
+    """A value, and from where to where it may be."""
+    value, low, high = map(three, each)
+    return f"{value} ({low} to {high})"
+
+
+def intervals(parameters: Mapping[str, tuple[float, float, float]], units: Mapping[str, str] | None = None) -> str:
+    """Values with their intervals, by name; – where there are none."""
+    said = (f"{name} {interval(each)} {(units or {}).get(name, '')}".strip() for name, each in parameters.items())
+    return "; ".join(said) or "–"
+
+
+def parameter_texts(parameters: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Parameters as they are shown, with their names."""
+    return [(name, _plain(value)) for name, value in parameters.items()]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return " ".join(_plain(each) for each in value)
+    return str(value) if value != "" else "''"

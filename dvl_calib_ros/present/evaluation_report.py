@@ -19,8 +19,8 @@ from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
-from .document import Cell, Table, signed
-from .page import VERDICT_KINDS, parameter_texts, write_page
+from .document import Cell, Table, parameter_texts, signed
+from .page import VERDICT_KINDS, write_page
 from .replay_figures import held_out_errors
 from .style import Picture, picture
 

@@ -26,19 +26,6 @@ from .style import MODEL_STYLES
 VERDICT_KINDS = {"accept": "good", "marginal": "off", "reject": "bad"}
 
 
-def parameter_texts(parameters: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Parameters as they are shown, with their names."""
-    return [(name, _plain(value)) for name, value in parameters.items()]
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, list):
-        return " ".join(_plain(each) for each in value)
-    return str(value) if value != "" else "''"
-
-
 @cache
 def _environment() -> jinja2.Environment:
     return jinja2.Environment(

@@ -27,10 +27,10 @@ from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
 from ..verdict.kinds import Severity
 from . import replay_figures as figures
-from .document import Cell, Table, signed
+from .document import Cell, Table, parameter_texts, signed
 from .mounting_figures import mounting_pictures
 from .navigation_figures import navigation_section
-from .page import VERDICT_KINDS, parameter_texts, write_page
+from .page import VERDICT_KINDS, write_page
 from .style import Picture, picture
 from .time_axis import TimeAxis, fitting_unit
 

@@ -5,32 +5,52 @@ Needs matplotlib and jinja2: nobody imports this but when a report is asked for.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from ..calibration.comparison import Comparison
+from ..diagnosis.results import Diagnosis
 from ..disk.atomic import save_bytes
+from ..evaluation.bags import CrossCheck
+from ..evaluation.results import Evaluation
+from ..examination.examine import Examination
+from ..unpaired.results import UnpairedComparison
 from .comparison import comparison
 from .comparison_figures import trend_png
-from .cross_check_report import write_cross_check_report
+from .cross_check import cross_check
 from .diagnosis_report import write_diagnosis_report
+from .document import Document
 from .evaluation_report import write_evaluation_report
+from .examination import examination
 from .page import write_document
 from .replay_report import write_replay_report
-from .unpaired_report import write_unpaired_report
+from .unpaired import unpaired
 
-__all__ = [
-    "write_comparison_report",
-    "write_cross_check_report",
-    "write_diagnosis_report",
-    "write_evaluation_report",
-    "write_replay_report",
-    "write_unpaired_report",
-]
+__all__ = ["write_replay_report", "write_report"]
+
+# What a result says, by its type.
+_DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
+    Comparison: comparison,
+    CrossCheck: cross_check,
+    Examination: examination,
+    UnpairedComparison: unpaired,
+}
+# Pages that are still laid out by themselves.
+_PAGES: Mapping[type, Callable[[Path, Any], None]] = {
+    Diagnosis: write_diagnosis_report,
+    Evaluation: write_evaluation_report,
+}
 
 
-def write_comparison_report(path: Path, result: Comparison) -> None:
-    """Write the report (HTML), or the picture if `path` ends in .png. Raises InputError if it cannot be written."""
-    if path.suffix.lower() == ".png":
+def write_report(path: Path, result: Any) -> None:
+    """Write the report (HTML); of a comparison the picture alone if `path` ends in .png.
+
+    Raises InputError if it cannot be written.
+    """
+    if isinstance(result, Comparison) and path.suffix.lower() == ".png":
         save_bytes(path, trend_png(result))
+    elif type(result) in _PAGES:
+        _PAGES[type(result)](path, result)
     else:
-        write_document(path, comparison(result))
+        write_document(path, _DOCUMENTS[type(result)](result))

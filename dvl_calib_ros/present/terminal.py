@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import printable
 from ..verdict.kinds import Severity
-from .document import Cell, Document, Sentence, Table, Where
+from ..verdict.reasons import Reason
+from .document import Cell, Commands, Document, Found, Sentence, Table, Where
 
 if TYPE_CHECKING:
+    from rich.padding import Padding
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -28,6 +30,8 @@ def shown(document: Document) -> Iterator[Any]:
     """What rich prints of a document, but for its warnings, one after the other."""
     from rich.text import Text
 
+    if document.lead:
+        yield Text(printable(document.lead), "bold")
     answer = document.answer
     if answer is not None:
         first, *others = map(printable, answer.sentences)
@@ -36,22 +40,35 @@ def shown(document: Document) -> Iterator[Any]:
     for section in document.sections:
         if section.where is Where.PAGE or not section.items:
             continue
-        title = section.title
+        yield ""
+        if section.title:
+            yield Text(printable(section.title), "bold")
         for item in section.items:
             if isinstance(item, Table):
-                yield ""
-                yield _table(item, title)
-                title = ""
+                yield _table(item)
             elif isinstance(item, Sentence):
                 yield Text(printable(item.text), "dim" if item.soft else "")
+            elif isinstance(item, Found):
+                yield from _found(item.reason)
+            elif isinstance(item, Commands):
+                for name, line in item.lines:  # to be copied: never broken
+                    yield Text(f"{name:5} {line}", no_wrap=True)
 
 
-def _table(table: Table, title: str) -> RichTable:
+def _found(reason: Reason) -> Iterator[Padding]:
+    from rich.padding import Padding
+    from rich.text import Text
+
+    yield Padding(Text(printable(reason.says), COLOURS[reason.severity]), (0, 0, 0, 2))
+    yield Padding(Text.assemble(printable(reason.remedy), " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
+
+
+def _table(table: Table) -> RichTable:
     from rich import box
     from rich.table import Table as RichTable
 
     made = RichTable(
-        title=table.title or title or None,
+        title=table.title or None,
         title_justify="left",
         box=box.SIMPLE_HEAD,
         caption=" ".join(table.notes) or None,

@@ -61,8 +61,7 @@ class Reason:
     @property
     def full_sentence(self) -> str:
         """`sentence` with a capital and a full stop."""
-        sentence = self.sentence
-        return f"{sentence[:1].upper()}{sentence[1:]}" + ("" if sentence.endswith((".", "?")) else ".")
+        return full(self.sentence)
 
     def __str__(self) -> str:
         remedy = self.remedy
@@ -110,3 +109,8 @@ def _plain(value: object) -> object:
     """For JSON: a number as one, a truth value as one, all else as its words."""
     value = value.item() if hasattr(value, "item") else value
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def full(sentence: str) -> str:
+    """A sentence with a capital and a full stop."""
+    return f"{sentence[:1].upper()}{sentence[1:]}" + ("" if sentence.endswith((".", "?")) else ".")

@@ -10,12 +10,7 @@ import pytest
 from io_fixtures import run
 from report_fixtures import comparison, cross_checked, diagnosis, evaluation, replay_page
 
-from dvl_calib_ros.present.reports import (
-    write_comparison_report,
-    write_cross_check_report,
-    write_diagnosis_report,
-    write_evaluation_report,
-)
+from dvl_calib_ros.present.reports import write_report
 
 pytestmark = pytest.mark.slow
 
@@ -44,10 +39,10 @@ def reports(tmp_path_factory) -> dict[str, Path]:
     made = {"replay": replay_page(hostile)[0]}
     made |= {name: folder / f"{name}.html" for name in ("evaluation", "diagnosis")}
     made |= {name: folder / f"{name}.html" for name in ("comparison", "cross_check")}
-    write_comparison_report(made["comparison"], comparison(hostile.name))
-    write_cross_check_report(made["cross_check"], cross_checked(hostile.name))
-    write_evaluation_report(made["evaluation"], evaluation())
-    write_diagnosis_report(made["diagnosis"], diagnosis())
+    write_report(made["comparison"], comparison(hostile.name))
+    write_report(made["cross_check"], cross_checked(hostile.name))
+    write_report(made["evaluation"], evaluation())
+    write_report(made["diagnosis"], diagnosis())
     return made
 
 

@@ -37,7 +37,7 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
     assert document["selected"][monday] == "G2"
     navigation = document["navigation"][monday][tuesday]
     assert navigation["drift_m_per_km"]["after"] < navigation["drift_m_per_km"]["before"]
-    assert "Dead reckoning: drift in m per km" in said
+    assert "Dead reckoning on bags that were not calibrated on" in said
     text = page.read_text()
     assert text.count("<img") == 4 and "Track, monday" in text and "Error of position, tuesday" in text
 

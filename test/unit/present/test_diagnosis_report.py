@@ -17,7 +17,7 @@ from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
 from dvl_calib_ros.present import diagnosis_report
-from dvl_calib_ros.present.reports import write_diagnosis_report
+from dvl_calib_ros.present.reports import write_report
 from dvl_calib_ros.present.twin_section import rms, spectrum
 
 pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each
@@ -28,7 +28,7 @@ TWIN_RMS = rms(diagnosis().series.twins[0].without)
 
 def page_of(folder, found: Diagnosis) -> Page:
     path = folder / "diagnosis.html"
-    write_diagnosis_report(path, found)
+    write_report(path, found)
     return Page(path)
 
 
@@ -66,7 +66,7 @@ def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_prefer
 
 def test_sizes_that_this_data_cannot_show_are_marked_against_those_worth_knowing(tmp_path):
     path = tmp_path / "diagnosis.html"
-    write_diagnosis_report(path, diagnosis())
+    write_report(path, diagnosis())
     html = path.read_text()
     assert '<td class="text good">x_m 0.110 m</td>' in html  # 0.3 m would be worth knowing of
     assert '<td class="text far">z_m 0.900 m</td>' in html

@@ -24,7 +24,7 @@ from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.present.exploring import Track, explorable
 from dvl_calib_ros.present.replay_figures import Line, estimate_over_time, held_out_errors
 from dvl_calib_ros.present.replay_report import write_replay_report
-from dvl_calib_ros.present.reports import write_evaluation_report
+from dvl_calib_ros.present.reports import write_report
 from dvl_calib_ros.present.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.time_axis import TimeAxis
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
@@ -46,7 +46,7 @@ def made(tmp_path_factory):
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory) -> Page:
     path = tmp_path_factory.mktemp("evaluation") / "evaluation.html"
-    write_evaluation_report(path, evaluation())
+    write_report(path, evaluation())
     return Page(path)
 
 
@@ -139,7 +139,7 @@ def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypat
     figures = drawn(monkeypatch)
     page = Page(replay_page(tmp_path, models=MODELS)[0])
     path = tmp_path / "evaluation.html"
-    write_evaluation_report(path, evaluation())
+    write_report(path, evaluation())
     images = [*page.images(), *Page(path).images()]
     assert len(figures) > 25
     assert_described(images, figures)
@@ -388,7 +388,7 @@ def test_the_summary_of_an_evaluation_names_the_best_of_each_kind(evaluated):
 @pytest.mark.slow
 def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_path):
     path = tmp_path / "evaluation.html"
-    write_evaluation_report(path, evaluation())
+    write_report(path, evaluation())
     html = path.read_text()
     assert '<td class="good">0.0300<small>0.0301 ×1.00</small></td>' in html
     assert '<td class="bad">' in html  # M2, far from the 0.10 of the made-up publication
@@ -399,7 +399,7 @@ def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_p
 @pytest.mark.slow
 def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
     path = tmp_path / "evaluation.html"
-    write_evaluation_report(path, evaluation(own_generator=True))
+    write_report(path, evaluation(own_generator=True))
     page = Page(path)
     assert "simulated" in page.text and "×" not in page.text and "Rings: published" not in page.text
 
@@ -407,7 +407,7 @@ def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
 def test_an_evaluation_without_studies_has_no_empty_sections(tmp_path):
     path = tmp_path / "evaluation.html"
     bare = evaluation(each=None, errors_in_variables=None, traces=(), held_out=(), coverage=())
-    write_evaluation_report(path, bare)
+    write_report(path, bare)
     text = Page(path).text
     for section in ("Can the uncertainty", "pulls the scale", "each run", "before and after", "Held-out"):
         assert section not in text

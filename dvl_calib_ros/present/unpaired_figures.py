@@ -1,11 +1,8 @@
-"""The report of a comparison with a simulator: `dvl-calib diagnose REAL --simulator SIM --report out.html`."""
+"""Pictures of a simulator's DVL beside that of the vehicle."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import datetime, timezone
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,124 +10,20 @@ from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from ..calibration.frames import Array
-from ..unpaired.results import ComparedEffect, ComparedNoise, Status, UnpairedComparison, Verdict
+from ..unpaired.results import UnpairedComparison
 from ..unpaired.shrink import ALL, AS_IT_IS, NOISE, Shrunk
-from .document import Cell, Table
-from .page import write_page
 from .replay_figures import AFTER, BAD
 from .series import running_mean
 from .style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
 
-KINDS = {
-    Verdict.NO_DIFFERENCE: "accept",
-    Verdict.ONLY_NOISE: "marginal",
-    Verdict.CANNOT_TELL: "marginal",
-    Verdict.DIFFERENT: "reject",
-}
-CELLS = {Status.MISSING: "bad", Status.OTHER_SIZE: "off", Status.ONLY_SIMULATOR: "off"}
 DVL_AXES = ("x", "y", "z")
 # Lines over time are means over this share of the run
 WINDOW_SHARE = 1.0 / 50.0
 MM = 1e3
 
 
-def write_unpaired_report(path: Path, comparison: UnpairedComparison) -> None:
-    """Write the report of a comparison. Raises InputError if that cannot be."""
-    write_page(path, "unpaired.html", _context(comparison))
-
-
-def _context(c: UnpairedComparison) -> dict[str, Any]:
-    names = {side: ", ".join(name for name, _ in d.recordings) for side, d in _sides(c).items()}
-    return {
-        "title": "The DVL of a simulator against that of the vehicle",
-        "subtitle": f"vehicle: {names['vehicle']}; simulator: {names['simulator']}",
-        "written": datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"),
-        "verdict": {"word": c.verdict.value.replace("_", " "), "kind": KINDS[c.verdict], "sentence": c.sentence},
-        "notes": c.notes,
-        "effects": _effects(c.effects) if c.effects else None,
-        "needs": [f"{each.name}: {each.needs}" for each in c.effects if each.needs],
-        "rungs": _rungs(c) if c.rungs else None,
-        "shrinks": list(_shrink_pictures(c)) if c.rungs else [],
-        "noise": _noise(c.noise) if c.noise else None,
-        "noise_pictures": list(_noise_pictures(c)),
-        "not_shown": _not_shown(c),
-        "sides": [{"name": side, "verdict": d.verdict.value, "sentence": d.sentence} for side, d in _sides(c).items()],
-    }
-
-
-def _sides(c: UnpairedComparison) -> dict[str, Any]:
-    return {"vehicle": c.vehicle, "simulator": c.simulator}
-
-
-# ------------------------------------------------------------------ tables
-
-
-def _effects(effects: Sequence[ComparedEffect]) -> Table:
-    rows = [
-        (
-            " or ".join((each.name, *each.equivalent_to)), Cell(each.status.words, CELLS.get(each.status, "")),
-            Cell(_values(each.vehicle), "text"), Cell(_values(each.simulator), "text"), f"{MM * each.adds_mps:.1f}",
-            str(each.lies or "–"), _p(each.p),
-        )
-        for each in effects
-    ]  # fmt: skip
-    head = ("effect", "", "vehicle (95 %)", "simulator (95 %)", "adds, mm/s", "mostly on", "p, adjusted")
-    notes = [
-        "Each effect is fitted to both logs, whichever was found to have it. p: that both have the same size, adjusted "
-        "for all claims of this page. Adds: beyond what misalignment and scale take in."
-    ]
-    return Table(head, rows, notes=notes)
-
-
-def _rungs(c: UnpairedComparison) -> Table:
-    rows = [
-        (r.name, f"{MM * r.error_mps:.1f}", f"{r.distance:.2f}", f"{r.null95:.2f}", _p(r.p)) for r in c.rungs
-    ]  # fmt: skip
-    head = ("simulator", "error, mm/s", "energy distance", "alike: below", "p")
-    notes = [
-        f"On stretches of the vehicle's own motion that were held out; noise of {MM * c.floor_mps:.1f} mm/s stays in "
-        "the error. Energy distance: between windows of recorded and simulated velocity, each less that of an ideal "
-        "DVL, by their means and scatter on the axes."
-    ]
-    return Table(head, rows, notes=notes)
-
-
-def _noise(noise: Sequence[ComparedNoise]) -> Table:
-    rows = [
-        (
-            each.name, Cell(each.status.words, CELLS.get(each.status, "")), _value(each.vehicle),
-            _value(each.simulator), each.unit, _p(each.p), each.note,
-        )
-        for each in noise
-    ]  # fmt: skip
-    return Table(("property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p, adjusted", ""), rows)
-
-
-def _not_shown(c: UnpairedComparison) -> Table | None:
-    names = sorted({name for side in c.not_shown.values() for name in side})
-    if not names:
-        return None
-    rows = [(name, *(c.not_shown[side].get(name, "would have shown") for side in c.not_shown)) for name in names]
-    return Table(("effect", *c.not_shown), rows)
-
-
-def _values(parameters: Mapping[str, tuple[float, float, float]]) -> str:
-    return "; ".join(f"{name} {_value(each)}" for name, each in parameters.items()) or "–"
-
-
-def _value(each: tuple[float, float, float]) -> str:
-    value, low, high = (f"{x:.3g}".replace("-", "−") for x in each)
-    return f"{value} ({low} to {high})"
-
-
-def _p(p: float) -> str:
-    return "–" if math.isnan(p) else f"{p:.2g}"
-
-
-# ------------------------------------------------------------------ pictures
-
-
-def _shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+def shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+    """How the error and the distance shrink from the simulator as it is to one with all effects."""
     names = [rung.name for rung in c.rungs if rung.name != NOISE]
     errors = [MM * rung.error_mps for rung in c.rungs if rung.name != NOISE]
     alt = "; ".join(f"{name}: {error:.1f} mm/s" for name, error in zip(names, errors, strict=True))
@@ -198,7 +91,8 @@ def over_time(shrunk: Shrunk, axis: int, models: Sequence[str]) -> Figure:
     return figure
 
 
-def _noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
+    """Noise of both by regime and by frequency."""
     if c.levels:
         alt = "; ".join(f"{name}: {MM * v:.1f} and {MM * s:.1f} mm/s" for name, (v, s) in c.levels.items())
         yield picture("Noise of the DVL by regime", f"Vehicle and simulator: {alt}", level_bars, c.levels)

@@ -1,0 +1,87 @@
+"""What the doctor says of a recording."""
+
+from __future__ import annotations
+
+import shlex
+
+from ..examination.examine import NO_IMU, Examination, Shown
+from ..verdict.kinds import Severity
+from ..verdict.reasons import full
+from .document import Answer, Cell, Commands, Document, Found, Section, Sentence, Table
+
+BAR = 20
+ANSWERS = {
+    "yes": (Severity.ACCEPT, "This recording can calibrate the DVL."),
+    "partly": (Severity.MARGINAL, "This recording can calibrate a part of the DVL's errors."),
+    "no": (Severity.REJECT, "This recording cannot calibrate the DVL as it is."),
+}
+
+
+def examination(examined: Examination) -> Document:
+    """What is in a recording, what is wrong with it, what its motion shows, and what to type next."""
+    severity, answer = ANSWERS[examined.verdict]
+    names = ", ".join(path.name or str(path) for path in examined.paths)
+    found, discovery = examined.findings, examined.discovery
+    said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *discovery.notes)]
+    motion = f"Motion: {examined.speed_mps:.2f} m/s (median); what it shows of the DVL, ±1σ to expect"
+    nothing = "Without a reference only pitch, and yaw if there are opposite headings."
+    return Document(
+        title="What is in a recording",
+        subtitle=names,
+        answer=Answer(examined.verdict, severity, [f"{answer} {_why(examined)}".rstrip()]),
+        warnings=examined.notes,
+        sections=[
+            Section(f"{names}: {examined.seconds:.0f} s", [_contents(examined), *said]),
+            Section(
+                f"{len(found)} found" if found else "Nothing wrong was found",
+                list(map(Found, found)) or [Sentence("")],
+            ),
+            Section(motion, [_shown(examined.shown)] if examined.shown else [Sentence(nothing)]),
+            Section("", [Commands(next_commands(examined))]),
+        ],
+        lead=full(found[0].says) if found and found[0].code.startswith(NO_IMU) else "",
+    )
+
+
+def _why(examined: Examination) -> str:
+    errors = [each for each in examined.findings if each.severity is Severity.ERROR]
+    if errors:
+        return f"{errors[0].says}."
+    if not examined.has_reference:
+        return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
+    missing = [each.name for each in examined.shown if each.needs]
+    return f"It does not show {' and '.join(missing)}." if missing else ""
+
+
+def _contents(examined: Examination) -> Table:
+    rows = [
+        (
+            each.role, each.topic, each.frame_id, f"{each.rate_hz:.3g}" if each.rate_hz else "–",
+            each.covariance.removesuffix(" always"),
+        )
+        for each in examined.contents
+    ]  # fmt: skip
+    return Table(("", "topic", "frame", "Hz", "claims"), rows, words=5)
+
+
+def _shown(shown: tuple[Shown, ...]) -> Table:
+    rows = []
+    for each in shown:
+        full = round(BAR * each.share)
+        kind = "good" if each.share >= 1.0 else "off" if not each.needs else "bad"
+        bar = Cell("█" * full + "░" * (BAR - full), kind)
+        rows.append((each.name, bar, f"±{each.std:.2f} {each.unit}", each.needs))
+    return Table(("", "shown", "to expect", "needs"), rows, words=4)
+
+
+def next_commands(examined: Examination) -> list[tuple[str, str]]:
+    """What to type next."""
+    bags = " ".join(shlex.quote(str(path)) for path in examined.paths)
+    options = "".join(
+        f" {found.remedy[found.remedy.index('-p ') :].split(' leaves')[0]}"
+        for found in examined.findings
+        if found.code in ("DOCTOR_CLOCKS", "DOCTOR_COVARIANCE") and "-p " in found.remedy
+    )
+    if examined.verdict == "no" and not options:
+        return [("next", "dvl-calib doctor BAG   (once it is recorded again)")]
+    return [("next", f"dvl-calib replay {bags}{options} --save calibration.yaml")]
