@@ -18,11 +18,12 @@ def told_by(rows: DelayedRows, use: Mask) -> Array:
     """What some rows tell each hypothesis (K, n+1, n+1): the sums of HᵀWH, HᵀWz and zᵀWz."""
     some = rows if use.all() else rows.part(use)
     k = len(some.moving)
-    moving, standing = some.moving.reshape(k, len(_MOVING), -1), some.standing.reshape(len(OF_NONE), -1)
     weight = np.concatenate([some.weight] * 3)
+    n = len(weight)
+    moving, standing = some.moving.reshape(k, len(_MOVING), n), some.standing.reshape(len(OF_NONE), n)
     weighted = moving * weight
     told = np.zeros((k, N_STATE + 1, N_STATE + 1))
-    across = (weighted.reshape(-1, len(weight)) @ standing.T).reshape(k, len(_MOVING), len(OF_NONE))
+    across = (weighted.reshape(k * len(_MOVING), n) @ standing.T).reshape(k, len(_MOVING), len(OF_NONE))
     told[:, _MOVING[:, None], _MOVING] = weighted @ moving.swapaxes(1, 2)
     told[:, _MOVING[:, None], OF_NONE], told[:, OF_NONE[:, None], _MOVING] = across, across.swapaxes(1, 2)
     told[:, OF_NONE[:, None], OF_NONE] = (standing * weight) @ standing.T

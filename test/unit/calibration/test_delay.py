@@ -387,6 +387,19 @@ def test_outliers_are_gated_and_a_large_effect_is_not_taken_for_them():
     np.testing.assert_allclose(estimate.state[8:10], LEVER_ARM[:2], atol=0.1)
 
 
+def test_a_block_all_of_whose_samples_are_gated_tells_nothing_and_the_run_goes_on():
+    """References that are 5 m/s off for half a minute, once what is usual is known."""
+    spoilt = [
+        sample._replace(velocity=tuple(np.add(sample.velocity, [5.0, 0.0, 0.0]).tolist()))
+        if isinstance(sample, ReferenceSample) and 80_000_000_000 < sample.stamp_ns - START_NS < 110_000_000_000
+        else sample
+        for sample in late(-1.4)
+    ]
+    estimate = calibrate(spoilt, NOISE).estimate("G2")
+    assert estimate.gated == 150
+    np.testing.assert_allclose(estimate.state[8:10], LEVER_ARM[:2], atol=0.1)
+
+
 def slow(samples, off_every=0):
     """The same with every third DVL sample, 1.7 a second, of which every so many is off by 0.5 to 1.2 m/s."""
     rng = np.random.default_rng(4)
