@@ -21,7 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..verdict.kinds import Severity
+from ..verdict.reasons import Reason, finding
 from . import told_arm
+from .advice import one_heading_advice
 from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
@@ -30,9 +33,11 @@ from .delay.hold_out import Recording, Terms
 from .delay.workers import Worker
 from .estimator import Estimator, Given, LinearEstimator, kind_of
 from .frames import Array, Vector
+from .heading_deviation import comes_first, heading_advice
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
+from .left_over import left_over_advice
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
 from .observability import MEASURES_VERTICAL, convergence, observability
 from .observations import Observations
@@ -625,7 +630,30 @@ class Calibrator:
             suggestion=self.suggestion,
             days=self.days,
             days_of=next((name for name in self._models if self._days_of(name)), ""),
+            doubts=() if self._worker is None else tuple(self.doubts(fresh=True)),
         )
+
+    def doubts(self, *, fresh: bool) -> list[Reason]:
+        """What the data say against the calibration, as bad as that is to a verdict; of one with a worker.
+
+        fresh: by a look at all there is, for which a result waits; else by one that the worker took a little ago.
+        """
+        suggested = self.suggestion if fresh else self.suggestion_so_far
+        found = [finding("IMU_LEVEL")] if fresh and self.is_level else []
+        if not suggested:  # which would be why the arm is another
+            finding_it = {name: self.estimate(name) for name in self._models if told_arm.finds_arm(MODELS[name])}
+            told = told_arm.told_arm_advice(finding_it, self.parameters)
+            found += [each.weighed(Severity.MARGINAL) for each in told]
+        rest = next((rest for each in self._further if (rest := each.rest(fresh=fresh)) is not None), None)
+        if rest is None:
+            return found
+        estimate = self.estimate()
+        if rest.deviation is not None:
+            is_first = comes_first(rest.deviation, estimate)
+            found += [each.weighed(Severity.REJECT) if is_first else each for each in heading_advice(rest.deviation)]
+        if rest.in_earth:
+            found += one_heading_advice(estimate, self.parameters, rest.followed.speed)
+        return found + left_over_advice(rest.followed)
 
     @property
     def is_level(self) -> bool:

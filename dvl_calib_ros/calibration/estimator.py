@@ -15,6 +15,7 @@ import numpy as np
 
 from .alignment import Aligner
 from .bank import Group, ModelCounts
+from .delay.clocks import Rest
 from .delay.hold_out import Recording, Terms
 from .delay.workers import Worker
 from .folds import Moments
@@ -113,6 +114,10 @@ class Estimator(ABC):
     @property
     def registration(self) -> Registration | None:
         """How the instruments stand, by their data alone; None for one that does not look."""
+        return None
+
+    def rest(self, *, fresh: bool) -> Rest | None:
+        """What the calibration leaves, by a look at all there is or, not fresh, by one a little ago; None for none."""
         return None
 
     @property

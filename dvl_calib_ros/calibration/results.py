@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..verdict.reasons import Reason
 from .error_model import correct, corrected_mounting
 from .frames import Array
 from .kalman import GaussianState
@@ -154,6 +155,7 @@ class Result:
     `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values. verifications:
     by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit, where the one
     given is grossly wrong, else ''. days: in order, none where there is one; days_of: the model whose states they are.
+    doubts: live, what the data say against the calibration, as bad as that is to the verdict of a replay.
     """
 
     selected: str
@@ -168,6 +170,7 @@ class Result:
     suggestion: str = ""
     days: tuple[Day, ...] = ()
     days_of: str = ""
+    doubts: tuple[Reason, ...] = ()
 
     @property
     def estimate(self) -> Estimate:

@@ -1,4 +1,7 @@
-"""What a result file says of the mounting, in the forms that others take it in: URDF, TF, robot_localization."""
+"""What a result file says of the mounting, in the forms that others take it in: URDF, TF, robot_localization.
+
+(Long, because what is against a calibration is asked before any of the forms.)
+"""
 
 from __future__ import annotations
 
@@ -123,6 +126,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         objections, doubts = _judged(content.get("verification"), convergence)
         if "verification" not in content:
             objections += _unverified(content, model)
+            doubts += _said(content, Severity.MARGINAL, Severity.WARNING)
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     except ParameterError as error:
@@ -168,11 +172,17 @@ def _judged(
 
 
 def _unverified(content: Mapping[str, Any], model: Model) -> tuple[str, ...]:
-    """Objections to what the node saved, which it cannot verify but knows to be of a wrong configuration."""
+    """Objections to what the node saved, which it cannot verify but may know to be wrong."""
     says = content.get("suggestion")
     objections = [finding("CONFIGURATION_WRONG", says=says)] if says else []
     objections += use_findings((int(content["used"]), int(content["gated"]))) if model.aided else []
-    return tuple(each.sentence for each in objections)
+    return (*(each.sentence for each in objections), *_said(content, Severity.REJECT))
+
+
+def _said(content: Mapping[str, Any], *severities: Severity) -> tuple[str, ...]:
+    """What the node knew against its calibration, of these severities."""
+    wanted = {each.value for each in severities}
+    return tuple(str(each["says"]) for each in content.get("doubts", ()) if each["severity"] in wanted)
 
 
 def _unseen(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:

@@ -50,6 +50,7 @@ from ..files.result_file import (
 from ..messages.decode import heading_variance
 from ..messages.feed import MessageFeed
 from ..streams import say
+from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .answering import AnsweringNode
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
@@ -340,7 +341,9 @@ class CalibrationNode(AnsweringNode):
         if state_of == self._mounting_published or calibrator.last_ns is None:
             return
         # of a wrong configuration none, for somebody would take it; messages wait meanwhile, so no look at all there is
-        if calibrator.suggestion_so_far:
+        if calibrator.suggestion_so_far or any(
+            each.severity is Severity.REJECT for each in calibrator.doubts(fresh=False)
+        ):
             return
         self._mounting_published = state_of
         stamp = Time()

@@ -143,6 +143,11 @@ def diagnose(
     found += reference_advice(estimate)
     if says := calibrator.suggestion_so_far:
         found.append(finding("CONFIGURATION_WRONG", says=says))
+    # what a replay rejects is an error here
+    found += [
+        each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING)
+        for each in calibrator.doubts(fresh=False)
+    ]
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
     status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"

@@ -18,13 +18,13 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.delay.hold_out import NO_TERMS, Recording, Terms
 from ..calibration.folds import folds_of
 from ..calibration.frames import Array
+from ..calibration.heading_deviation import HeadingDeviation, heading_deviation
 from ..calibration.kalman import GaussianState
+from ..calibration.left_over import Followed, left_over
 from ..calibration.parameters import Parameters
 from ..calibration.robust import median
 from ..calibration.samples import Index
 from ..verdict.reasons import Reason, finding
-from .heading_deviation import HeadingDeviation, heading_deviation
-from .left_over import Followed, left_over
 
 # Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)

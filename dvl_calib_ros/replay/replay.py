@@ -17,7 +17,9 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
+from ..calibration.heading_deviation import comes_first, heading_advice
 from ..calibration.kalman import GaussianState
+from ..calibration.left_over import left_over_advice
 from ..calibration.models import MODELS
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
@@ -35,8 +37,6 @@ from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .clocks import StreamClocks
-from .heading_deviation import comes_first, heading_advice
-from .left_over import left_over_advice
 from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 

@@ -14,14 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..frames import Array
+from ..heading_deviation import HeadingDeviation, heading_deviation
+from ..left_over import Followed, left_over
 from ..parameters import Parameters
 from ..register.configuration import fitting_configuration
 from ..register.motion import Motion, make_motion
 from ..register.registration import Registration, register
 from ..samples import FRAMES, Codes, Mask
 from ..tables import Table
-from .hold_out import KEPT_EVERY_S, MEASURED_BELOW, Kept
-from .rows import ImuColumns
+from .hold_out import KEPT_EVERY_S, MEASURED_BELOW, NOT_MEASURED, Kept, Recording, Terms
+from .known import Posterior
+from .rows import DvlColumns, ImuColumns, ReferenceColumns
 
 # Live, what was found stands until so much more is there.
 AGAIN_FROM = 1.5
@@ -101,6 +104,17 @@ class _Seen:
         for stream in self._streams:
             stream.clear()
 
+    def recording(self) -> Recording:
+        """All that is there, as for verification; of noise it says which axes are measured."""
+        dvl, reference, imu = (
+            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
+        )
+        times, velocity, in_body, is_measured = reference
+        noise = np.where(is_measured, 1.0, NOT_MEASURED)[:, :, None] * np.eye(3)
+        claimed = np.zeros(len(times), dtype=bool)
+        of_reference = ReferenceColumns(times, velocity, noise, in_body, claimed)
+        return Recording(DvlColumns(*dvl), np.zeros(len(dvl[0])), of_reference, ImuColumns(*imu))
+
     def motion(self) -> Motion | None:
         """All that is there, without references that are not like most; None where that is too little."""
         dvl, reference, imu = (
@@ -118,12 +132,23 @@ class _Seen:
         )
 
 
+class Rest(NamedTuple):
+    """What a calibration leaves: what the velocity that is left follows, how the heading deviates, and whether the
+    reference is in the earth's frame."""
+
+    followed: Followed
+    deviation: HeadingDeviation | None
+    in_earth: bool
+
+
 class Looked(NamedTuple):
-    """After so many blocks: how the instruments stand, and what configuration fits where the one given does not."""
+    """After so many blocks: how the instruments stand, what configuration fits where the one given does not, and,
+    live, what is left."""
 
     blocks: int = 0
     registration: Registration | None = None
     configuration: str = ""
+    rest: Rest | None = None
 
 
 class KeptClocks:
@@ -134,7 +159,7 @@ class KeptClocks:
     ) -> None:
         """live: they go on for hours. registered: what is known already of the recording that a stamp (ns) is of."""
         self._parameters = parameters
-        self._registered = registered
+        self._registered, self._is_live = registered, live
         self._newest_ns = 0
         self._seen = _Seen()
         if live:
@@ -155,16 +180,16 @@ class KeptClocks:
     def end_day(self) -> None:
         """The blocks from here on are of another day, whose clocks may be others."""
         found = self.looked()
-        self._over = found if found.configuration or self._says(found) else None
+        self._over = found if found.configuration or self.says(found) else None
         self._seen.clear()
         self._blocks, self._latest = 0, Looked()
 
-    def look_again(self) -> None:
-        """Look if there is so much more to see than the last time."""
+    def look_again(self, posterior: Posterior | None) -> None:
+        """Look if there is so much more to see than the last time. posterior: what the blocks have told."""
         if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
-            self._latest = self._look()
+            self._latest = self._look(posterior)
 
-    def looked(self, *, fresh: bool = True) -> Looked:
+    def looked(self, posterior: Posterior | None = None, *, fresh: bool = True) -> Looked:
         """What the blocks so far show, or a day that is over, where something was off.
 
         fresh: all of them, else those there were when `look_again` looked.
@@ -172,17 +197,14 @@ class KeptClocks:
         if self._over is not None:
             return self._over
         if fresh and self._blocks > self._latest.blocks:
-            self._latest = self._look()
+            self._latest = self._look(posterior)
         return self._latest
 
-    def says(self, *, fresh: bool = True) -> str:
-        """What clocks these blocks fit, in words, where one is off; else ''."""
-        return self._says(self.looked(fresh=fresh))
-
-    def _says(self, looked: Looked) -> str:
+    def says(self, looked: Looked) -> str:
+        """What clocks fit what was seen, in words, where one is off; else ''."""
         return "" if looked.registration is None else looked.registration.says(self._parameters)
 
-    def _look(self) -> Looked:
+    def _look(self, posterior: Posterior | None) -> Looked:
         motion = self._seen.motion() if len(self._seen) >= ENOUGH else None
         if motion is None:
             return Looked(self._blocks)
@@ -190,6 +212,24 @@ class KeptClocks:
         declared = FRAMES[int(self._declared.argmax())]
         try:
             found = self._registered(self._newest_ns) or register(motion, nominal, lever_arm)
-            return Looked(self._blocks, found, fitting_configuration(motion, declared, nominal, lever_arm, found))
+            configuration = fitting_configuration(motion, declared, nominal, lever_arm, found)
+            rest = self._rest(posterior) if self._is_live and posterior is not None else None
+            return Looked(self._blocks, found, configuration, rest)
         except np.linalg.LinAlgError:  # numbers that ran away
             return Looked(self._blocks)
+
+    def _rest(self, posterior: Posterior) -> Rest | None:
+        """Of all that is kept, corrected by what the blocks have told; None where some of it has no attitude."""
+        recording = self._seen.recording()
+        every = np.arange(len(recording.dvl.times))
+        seen = recording.compared(every, Terms.of_state(posterior.state.x), self._parameters)
+        use = np.isfinite(seen.error[:, 0])
+        if not (use.any() and seen.oriented[use].all()):
+            return None
+        times, rotation = recording.dvl.times[use], seen.rotation_enu_from_body[use]
+        followed = left_over(times, rotation, seen.body[use], seen.error[use], seen.rates[use])
+        if followed is None:
+            return None
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        deviation = None if posterior.heading is None else heading_deviation(times, yaw, posterior.heading)
+        return Rest(followed, deviation, not recording.reference.in_body.any())

@@ -32,6 +32,7 @@ from ..streams import LONG_AGO_NS, LONGEST_NS
 from ..tables import Table
 from ..verification import HeldOutError
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
+from .clocks import Rest
 from .hold_out import Recording, Terms, held_out_error
 from .known import DayState, Posterior
 from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
@@ -215,6 +216,12 @@ class DelayFilter(Estimator):
     def is_horizontal(self) -> bool:
         """As `Estimator`."""
         return self._idle_solver().is_horizontal
+
+    def rest(self, *, fresh: bool) -> Rest | None:
+        """As `Estimator`."""
+        if fresh:
+            self._newest()
+        return self._solver.rest(fresh=fresh)
 
     @property
     def registration_so_far(self) -> Registration | None:

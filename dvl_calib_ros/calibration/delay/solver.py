@@ -24,7 +24,7 @@ from ..shared_noise import SharedNoise
 from .bank import DelayBank
 from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
-from .clocks import KeptClocks
+from .clocks import KeptClocks, Rest
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, Kept
 from .known import After, BlockRows, Found, Known, Posterior
@@ -121,18 +121,23 @@ class BlockSolver:
         """
         if own := self._dvl_stream.says():
             return own
-        contradiction, found = self._attitude_rates.says(), self._clocks.looked(fresh=fresh).configuration
+        looked = self._clocks.looked(self._posterior, fresh=fresh)
+        contradiction, found = self._attitude_rates.says(), looked.configuration
         if contradiction:  # of what follows from it only what mends it is worth a word
             return f"{contradiction}; {found}" if "imu_frame" in found else contradiction
         if found:
             return found
         if shared := self._shared_noise.says():
             return shared
-        return self._clocks.says(fresh=fresh)
+        return self._clocks.says(looked)
 
     def registration(self, *, fresh: bool = True) -> Registration | None:
         """How the instruments stand; None where the data do not show it. fresh: as of `suggestion`."""
-        return self._clocks.looked(fresh=fresh).registration
+        return self._clocks.looked(self._posterior, fresh=fresh).registration
+
+    def rest(self, *, fresh: bool = True) -> Rest | None:
+        """What the calibration leaves, live; None where that is not looked at. fresh: as of `suggestion`."""
+        return self._clocks.looked(self._posterior, fresh=fresh).rest
 
     @property
     def is_level(self) -> bool:
@@ -156,7 +161,7 @@ class BlockSolver:
             outcomes += self._solve_together(blocks[at:end])
             at = end
         if self._is_live:
-            self._clocks.look_again()
+            self._clocks.look_again(self._posterior)
         return outcomes
 
     def _goes_alone(self, block: Block) -> bool:

@@ -10,10 +10,10 @@ from conftest import few
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.heading_deviation import FIRST, comes_first, heading_advice, heading_deviation
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.replay.heading_deviation import FIRST, comes_first, heading_advice, heading_deviation
 
 START_NS, STEP_S, LEG_S = 1_600_000_000_000_000_000, 0.5, 40.0
 YAW = math.radians(1.0)  # of the DVL in the vehicle

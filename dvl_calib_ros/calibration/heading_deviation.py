@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.kalman import GaussianState
-from ..calibration.results import Estimate
 from ..verdict.reasons import Reason, finding
+from .frames import Array
+from .kalman import GaussianState
+from .results import Estimate
 
 # Its rms (rad) is worth a word from here on, and where it is so many times its σ.
 SAID_FROM, SURELY = math.radians(0.3), 3.0

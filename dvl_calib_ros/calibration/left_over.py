@@ -20,12 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.attitude_rates import LEVEL_BELOW
-from ..calibration.frames import Array, cross, skew
-from ..calibration.robust import median, robust_std
-from ..calibration.samples import Index
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
+from .attitude_rates import LEVEL_BELOW
+from .frames import Array, cross, skew
+from .robust import median, robust_std
+from .samples import Index
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
 TILT_S = 1.0, 15.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.replay.left_over import left_over, left_over_advice
+from dvl_calib_ros.calibration.left_over import left_over, left_over_advice
 from dvl_calib_ros.verdict.kinds import Severity
 
 STEP_S = 0.2
