@@ -256,6 +256,7 @@ class CalibrationNode(AnsweringNode):
 
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
         self._place(message)
+        self._take_off_late_clocks()
         sample = self._feed.dvl(message, received_ns)
         if sample is not None:
             self._publish_corrected(sample)
@@ -360,7 +361,6 @@ class CalibrationNode(AnsweringNode):
             self._begin_anew(parameters)
 
     def _publish_diagnostics(self) -> None:
-        self._take_off_late_clocks()
         self._publish_mounting()
         decoder = self._feed.decoder
         problems = [*decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]

@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from test_node import Publisher, node_here, received, twist
 
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.delay.clocks import KeptClocks
+from dvl_calib_ros.calibration.delay.clocks import KeptClocks, Looked
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.node.transforms import Transforms
@@ -108,7 +108,9 @@ def test_a_model_without_lever_arm_gives_the_one_that_is_set_and_says_that_it_is
 def test_no_message_waits_for_a_look_at_all_that_the_clocks_have_shown(world, monkeypatch):
     """Each block of ten seconds registered everything anew between two messages: a third of a second of CPU by then."""
     asked: list[bool] = []
-    monkeypatch.setattr(KeptClocks, "says", lambda self, *, fresh=True: asked.append(fresh) or "")
+    monkeypatch.setattr(
+        KeptClocks, "looked", lambda self, posterior=None, *, fresh=True: asked.append(fresh) or Looked()
+    )
     with node_here(world, dvl_position="told"):
         poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
         diagnostics = world.received(DiagnosticArray, "/diagnostics")

@@ -180,7 +180,8 @@ class DelayFilter(Estimator):
         In a result by all data, else as clocks were looked at on the way.
         """
         found: Array = np.zeros((N_STATE, N_STATE))
-        posterior, registration = self.posterior, self._solver.registration(fresh=self._is_settled)
+        posterior, told = self.posterior, self._told.looked.registration
+        registration = self._solver.registration() if self._is_settled else told
         if posterior is not None and self.claims and registration is not None:
             shown = posterior.shown[BEYOND]
             found[_OPEN] = registration.left_open * np.outer(shown, shown)
@@ -219,14 +220,12 @@ class DelayFilter(Estimator):
 
     def rest(self, *, fresh: bool) -> Rest | None:
         """As `Estimator`."""
-        if fresh:
-            self._newest()
-        return self._solver.rest(fresh=fresh)
+        return self._idle_solver().rest() if fresh else self._told.looked.rest
 
     @property
     def registration_so_far(self) -> Registration | None:
-        """The same, as it was seen a little ago."""
-        return self._solver.registration(fresh=False)
+        """The same, as it was seen a little ago, which stamps decide."""
+        return self._told.looked.registration
 
     @property
     def suggestion_so_far(self) -> str:

@@ -24,7 +24,7 @@ from ..shared_noise import SharedNoise
 from .bank import DelayBank
 from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
-from .clocks import KeptClocks, Rest
+from .clocks import KeptClocks, Looked, Rest
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, Kept
 from .known import After, BlockRows, Found, Known, Posterior
@@ -48,7 +48,8 @@ class Outcome(NamedTuple):
 
     prior: of G2's states on the day that it is. posterior: None where nothing was ever found. counts: samples used,
     spikes and those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones. claims: references whose
-    messages say how noisy they are, less the others. has_rows: whether the block had any.
+    messages say how noisy they are, less the others. has_rows: whether the block had any. looked: how the instruments
+    stand, as of the newest look on the way.
     """
 
     prior: GaussianState
@@ -56,6 +57,7 @@ class Outcome(NamedTuple):
     counts: ModelCounts
     claims: int
     has_rows: bool
+    looked: Looked = Looked()
 
 
 class _Comparison(NamedTuple):
@@ -131,13 +133,13 @@ class BlockSolver:
             return shared
         return self._clocks.says(looked)
 
-    def registration(self, *, fresh: bool = True) -> Registration | None:
-        """How the instruments stand; None where the data do not show it. fresh: as of `suggestion`."""
-        return self._clocks.looked(self._posterior, fresh=fresh).registration
+    def registration(self) -> Registration | None:
+        """How the instruments stand; None where the data do not show it."""
+        return self._clocks.looked(self._posterior).registration
 
-    def rest(self, *, fresh: bool = True) -> Rest | None:
-        """What the calibration leaves, live; None where that is not looked at. fresh: as of `suggestion`."""
-        return self._clocks.looked(self._posterior, fresh=fresh).rest
+    def rest(self) -> Rest | None:
+        """What the calibration leaves, live; None where that is not looked at."""
+        return self._clocks.looked(self._posterior).rest
 
     @property
     def is_level(self) -> bool:
@@ -162,7 +164,8 @@ class BlockSolver:
             at = end
         if self._is_live:
             self._clocks.look_again(self._posterior)
-        return outcomes
+        looked = self._clocks.looked(fresh=False)
+        return [outcome._replace(looked=looked) for outcome in outcomes]
 
     def _goes_alone(self, block: Block) -> bool:
         """Whether what is left out of blocks before matters to this one, or of this one to those behind it."""
