@@ -132,6 +132,7 @@ class Calibrator:
         self._worker = worker
         self._recordings_ns, self._registrations = recordings_ns, registrations
         self._observer = Observer(parameters)
+        self._day_covariances: dict[str, Array] = {}
         self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
         self.reset()
 
@@ -498,7 +499,12 @@ class Calibrator:
     def next_recording(self, name: str) -> GaussianState:
         """As `of_recording`, with σ worth believing of the next recording, whatever is published."""
         state = self.of_recording(name)
-        return GaussianState(state.x, state.p + day_covariance(MODELS[name], self.parameters))
+        return GaussianState(state.x, state.p + self._day_covariance(name))
+
+    def _day_covariance(self, name: str) -> Array:
+        if name not in self._day_covariances:
+            self._day_covariances[name] = day_covariance(MODELS[name], self.parameters)
+        return self._day_covariances[name]
 
     def of_recording(self, name: str) -> GaussianState:
         """As `state`, with σ as of the same day: the larger of what the filter claims and what blocks of time show."""
@@ -534,7 +540,7 @@ class Calibrator:
         return Estimate(
             model=model.name,
             state=state,
-            covariance=covariance + day_covariance(model, self.parameters),
+            covariance=covariance + self._day_covariance(model.name),
             recording_covariance=covariance,
             filter_covariance=self._estimators[model.name].filter_covariance,
             left_open=self._estimators[model.name].left_open,

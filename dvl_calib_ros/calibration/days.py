@@ -13,6 +13,8 @@ reference or of the DVL, is no state; where an error across is a yaw it is a pit
 
 from __future__ import annotations
 
+from math import atan2, cos, hypot, sin
+
 import numpy as np
 
 from .frames import Array
@@ -34,14 +36,23 @@ def offset_covariance(model: Model, state: Array, claimed: Array, parameters: Pa
     state: (n,). claimed: (n, n) what the filter alone claims.
     """
     at = [model.state_names.index(name) for name in OFFSETS if name in model.state_names]
+    if not at:
+        return np.zeros_like(claimed)
     variance = parameters.reference_offset_std**2
     sensitivity = claimed[:, at] / variance
-    share, axes = np.linalg.eigh(np.eye(len(at)) - sensitivity[at])
-    seen = (axes.T @ state[at]) / np.sqrt(np.maximum(share, SEEN_FROM))  # σ_p each, by the prior
-    shown = (share > SEEN_FROM) & (np.abs(seen) > SURELY * parameters.reference_offset_std)
-    off = float((seen[shown] ** 2 / share[shown]).sum())
+    (east, _), (cross, north) = (np.eye(2) - sensitivity[at]).tolist()
+    # its axes in closed form: with each live message a decomposition by LAPACK would cost as much as all the rest
+    turn = 0.5 * atan2(2.0 * cross, east - north)
+    middle, apart = 0.5 * (east + north), hypot(0.5 * (east - north), cross)
+    x, y = state[at].tolist()
+    first, second = cos(turn) * x + sin(turn) * y, cos(turn) * y - sin(turn) * x
+    off = 0.0
+    for share, along in ((middle + apart, first), (middle - apart, second)):
+        if share > SEEN_FROM:
+            seen = along**2 / share  # σ_p² each, by the prior
+            off += seen / share if seen > (SURELY * parameters.reference_offset_std) ** 2 else 0.0
     found: Array = (max(OFTEN_OFF**2 * variance, off) - variance) * (sensitivity @ sensitivity.T)
-    if at and np.diag(claimed)[at].min() > HARDLY_SEEN * variance:
+    if np.diag(claimed)[at].min() > HARDLY_SEEN * variance:
         _, across, up = parameters.rotation_dvl_from_body.T
         yaw = up @ sensitivity[:3]  # by an error across, for each m/s
         found[:3, :3] += OFTEN_OFF**2 * variance * float(yaw @ yaw) * np.outer(across, across)

@@ -99,6 +99,8 @@ class DelayFilter(Estimator):
         self._coming: deque[tuple[int, Solved, int]] = deque()
         self._gathered_ns: list[int] = []  # the same of those that are not
         self._is_telling = self._is_settled = False
+        # asked for with each message
+        self._of_recording: tuple[Posterior, Registration | None, GaussianState] | None = None
         self._suggested: tuple[Outcome, str] | None = None
         self._suggested_so_far: tuple[Outcome, str] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
@@ -170,18 +172,24 @@ class DelayFilter(Estimator):
         posterior = self.posterior
         if posterior is None or not self.claims:
             return self.extended(self._base.of_recording())
-        x, p = posterior.state
-        return GaussianState(x, p + self.left_open)
+        registration = self._registration_told
+        known = self._of_recording
+        if known is None or known[0] is not posterior or known[1] is not registration:
+            x, p = posterior.state
+            known = self._of_recording = posterior, registration, GaussianState(x, p + self.left_open)
+        return known[2]
+
+    @property
+    def _registration_told(self) -> Registration | None:
+        """In a result by all data, else as clocks were looked at on the way."""
+        told = self._told
+        return self._solver.registration() if self._is_settled else told.looked.registration
 
     @property
     def left_open(self) -> Array:
-        """(n, n) of what is shown of lever arm and delay, what the reference's clock leaves open.
-
-        In a result by all data, else as clocks were looked at on the way.
-        """
+        """(n, n) of what is shown of lever arm and delay, what the reference's clock leaves open."""
         found: Array = np.zeros((N_STATE, N_STATE))
-        posterior, told = self.posterior, self._told.looked.registration
-        registration = self._solver.registration() if self._is_settled else told
+        posterior, registration = self.posterior, self._registration_told
         if posterior is not None and self.claims and registration is not None:
             shown = posterior.shown[BEYOND]
             found[_OPEN] = registration.left_open * np.outer(shown, shown)
