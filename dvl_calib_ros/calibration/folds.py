@@ -70,10 +70,10 @@ class FoldSums:
         self._each[number] = np.zeros_like(sums)
         return sums
 
-    def chosen(self, number: int, source: NDArray[np.intp]) -> None:
-        """Let each of K have one kind of sums (FOLDS, K, ...) from others. source: (K,) from which of the K."""
+    def chosen(self, source: NDArray[np.intp]) -> None:
+        """Let each of K have its sums (FOLDS, K, ...) from others. source: (K,) from which of those there are."""
         self._total = None
-        self._each[number] = self._each[number][:, source].copy()
+        self._each = [each[:, source].copy() if each.ndim > 2 else each for each in self._each]
 
     def clear(self) -> None:
         """Begin anew."""
@@ -90,14 +90,12 @@ class FoldInformation:
 
     def __init__(self, start: GaussianState) -> None:
         """start: x (K, n), P (K, n, n) of the filter."""
-        k, n = start.x.shape
-        self._told = FoldSums((k, n, n), (k, n))
         self.begin([start.information] * FOLDS)
 
     def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
         """Go on from Λ (K, n, n) and Λx (K, n) that are known without each fold."""
         self._begin = known
-        self._told.clear()
+        self._told = FoldSums(known[0][0].shape, known[0][1].shape)
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
         """Add N samples, as far as models used them (K, N)."""
@@ -110,6 +108,11 @@ class FoldInformation:
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
             self.add_told(fold, weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2))
+
+    def narrow(self, kept: NDArray[np.intp]) -> None:
+        """Forget all of the K but some."""
+        self._told.chosen(kept)
+        self._begin = [(information[kept], vector[kept]) for information, vector in self._begin]
 
     def add_told(self, fold: int | slice, told: Array) -> None:
         """Add what rows (H, z) of one fold told (K, n+1, n+1), or of several (F, ...)."""

@@ -172,9 +172,10 @@ class HeaveRows:
         return HeaveSums(*self._folds.total), self._folds.taken(_TOLD)
 
     def learn_from(self, source: Index) -> None:
-        """Take what rows so far scatter by from others. source: (K,) from which of the K each takes it."""
+        """Let each of K take what was told from others. source: (K,) from which of those there are."""
         self._sums.clear()
-        self._folds.chosen(_SCATTER, source)
+        self._folds.chosen(source)
+        self._sum = self._sum[source]
 
 
 def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tuple[GaussianState, Array]:

@@ -91,9 +91,14 @@ class TimeBlocks:
         found = (within @ vector[:, of_day, None])[..., 0]
         for told, y in zip(*self.kept, strict=True):
             rest = y - (told[:, :, of_day] @ found[..., None])[..., 0]
-            told[:] = (onto @ told @ onto.swapaxes(1, 2))[source]
-            y[:] = (onto @ rest[..., None])[source, :, 0]
+            told[:] = onto @ told @ onto.swapaxes(1, 2)
+            y[:] = (onto @ rest[..., None])[..., 0]
+        self.choose(source)
+
+    def choose(self, source: NDArray[np.intp]) -> None:
+        """Let each of K have its past from others. source: (K,) from which of those there are."""
         if self.count:
+            self._information, self._vector = self._information[:, source], self._vector[:, source]
             self.total = self.kept[0].sum(axis=0), self.kept[1].sum(axis=0)
 
     def of(self, index: int) -> BlocksOfOne:

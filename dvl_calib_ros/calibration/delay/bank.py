@@ -29,7 +29,7 @@ from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
 from .known import After, BlockRows, DayState, Ended, Found, Hypotheses, Known, Posterior, Sums, Told, parts
-from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, DelayedRows
+from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, STEP_S, STEPS, DelayedRows
 from .told import innovation_squared, told_by
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
@@ -40,6 +40,8 @@ RECENT, ENOUGH = 256, 20
 MEDIAN_NIS = 2.366
 # Hypotheses with a smaller share of the best one's probability are left out of the mixture.
 SMALLEST_SHARE = 1e-9
+# Hypotheses that are less likely by so much more, in logarithms, have lost for the rest of the day.
+LOST = 100.0
 # A state is shown by the data if these alone, with priors of all else wider by this, have halved its prior σ.
 WIDER, SHOWN_SHARE = 100.0, 0.5
 
@@ -88,11 +90,40 @@ class DelayBank:
     def _begin_day(self) -> None:
         """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
         prior = self.prior
+        self.compared: Index = STEPS
         self._start = _around_each_delay(to_correction(prior))
         self._prior_on_errors = PriorOnErrors(self._start, _around_each_delay(prior))
         # of a delay's deviation from the prior's mean
         variance = prior.p[DELAY, DELAY] + CELL_STD_S**2
         self._log_prior = -0.5 * (DELAYS_S - prior.x[DELAY]) ** 2 / variance
+
+    @property
+    def delays_s(self) -> Array:
+        """(K,) of the hypotheses that there are, by `compared`, their `STEPS`."""
+        return self.compared * STEP_S
+
+    def narrow(self) -> None:
+        """Leave out hypotheses that have lost, but for those next to others.
+
+        They are far from any part in the mixture (`SMALLEST_SHARE`), and samples that only they explain are outliers.
+        What would bring one back on the same day is a clock that leaps, which registration looks for.
+        """
+        _, log_share = self._shares()
+        left = np.flatnonzero(log_share > log_share.max() - LOST)
+        kept = np.arange(max(left[0] - 1, 0), min(left[-1] + 2, len(log_share)))
+        if len(kept) == len(log_share):
+            return
+        self.compared = self.compared[kept]
+        self._start = GaussianState(self._start.x[kept], self._start.p[kept])
+        self._prior_on_errors = self._prior_on_errors.part(kept)
+        self._log_prior, self._log_det = self._log_prior[kept], self._log_det[kept]
+        told, vector, square = (each[kept] for each in self._sums[:3])
+        self._sums = self._sums._replace(information=told, vector=vector, square=square)
+        self._heave.learn_from(kept)
+        self.blocks.choose(kept)
+        if self._folds is not None:
+            self._folds.narrow(kept)
+        self._solved = None
 
     def end_day(self) -> None:
         """Go on with what belongs to the vehicle; delay and constant error of the reference are to be found anew.
@@ -413,7 +444,7 @@ class DelayBank:
         ]
 
     def _posterior(self, found: Found, errors: GaussianState) -> Posterior:
-        state = _one(errors, found.kept, found.share)
+        state = _one(errors, self.delays_s[found.kept], found.share)
         raised = state.raised(found.inflation).turned(self._up, found.drifted)
         p = state.p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
@@ -497,12 +528,12 @@ class DelayBank:
         """All hypotheses as one, in the errors."""
         kept, share = _likely(log_share)
         errors = self._prior_on_errors.part(kept).to_errors(GaussianState(found.x[kept], found.p[kept]))
-        return _one(errors, kept, share)
+        return _one(errors, self.delays_s[kept], share)
 
     def _held(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """`_mixture` as the filter has the states."""
         kept, share = _likely(log_share)
-        return _one(GaussianState(found.x[kept], found.p[kept]), kept, share)
+        return _one(GaussianState(found.x[kept], found.p[kept]), self.delays_s[kept], share)
 
     def _shown_now(self, best: int, found: Hypotheses) -> tuple[Array, Mask]:
         """By how much blocks of time raise σ of each state (n,), and which (n,) the data show."""
@@ -597,10 +628,10 @@ def _likely(log_share: Array) -> tuple[Index, Array]:
     return kept, share[kept] / share[kept].sum()
 
 
-def _one(states: GaussianState, kept: Index, share: Array) -> GaussianState:
-    """Hypotheses x (M, n), P (M, n, n), by the numbers kept (M,) of their delays, as one; its delay is the whole."""
+def _one(states: GaussianState, delays_s: Array, share: Array) -> GaussianState:
+    """Hypotheses x (M, n), P (M, n, n) with their delays (M,) as one; its delay is the whole."""
     x = states.x.copy()
-    x[:, DELAY] += DELAYS_S[kept]
+    x[:, DELAY] += delays_s
     mean = share @ x
     apart = x - mean
     p = np.einsum("k,kij->ij", share, states.p) + np.einsum("k,ki,kj->ij", share, apart, apart)

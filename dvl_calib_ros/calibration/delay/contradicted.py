@@ -15,7 +15,7 @@ from ..frames import Array
 from ..robust import robust_std
 from ..samples import Index, Mask
 from ..spikes import beside, off_neighbours
-from .rows import DELAYS_S, DelayedRows, DvlColumns
+from .rows import DelayedRows, DvlColumns
 
 # Scatter about what neighbours tell, from which on a sample is suspicious; less than so much is noise, m/s.
 SUSPICIOUS, LEAST_SCATTER_MPS = 6.0, 0.03
@@ -34,11 +34,12 @@ def without_contradicted(
     reference_times: Array,
     rows_of: Callable[[DvlColumns], DelayedRows],
     misfits: Callable[[DelayedRows], tuple[Array, Array]],
+    delays_s: Array,
 ) -> tuple[Mask, DelayedRows]:
     """Which DVL samples (N,) are not contradicted, and the references' rows by these.
 
     reference_times: (J,) s. rows_of: what references are beside some of the DVL's samples. misfits: as
-    `DelayBank.misfits`.
+    `DelayBank.misfits`; delays_s: (K,) of its hypotheses.
     """
     kept = np.arange(len(dvl.times))
     rows = rows_of(dvl)
@@ -47,7 +48,7 @@ def without_contradicted(
         for at in _suspicious(dvl.velocity[kept]).tolist():
             without = np.delete(kept, at)
             fewer = rows_of(DvlColumns(*(column[without] for column in dvl)))
-            share = _share_left(dvl.times[kept[at]], reference_times, rows, fewer, misfits)
+            share = _share_left(dvl.times[kept[at]], reference_times, rows, fewer, misfits, delays_s)
             tried.append((share, without, fewer))
         share, without, fewer = min(tried, key=lambda each: each[0], default=(1.0, kept, rows))
         if share > SHARE_LEFT:
@@ -64,6 +65,7 @@ def _share_left(
     rows: DelayedRows,
     fewer: DelayedRows,
     misfits: Callable[[DelayedRows], tuple[Array, Array]],
+    delays_s: Array,
 ) -> float:
     """What is left of the misfit without a sample, by the delay to which that matters least; 1 if it gains too little.
 
@@ -74,7 +76,7 @@ def _share_left(
         return 1.0
     before, _ = misfits(rows.part(np.isin(rows.index, both)))
     after, log_share = misfits(fewer.part(np.isin(fewer.index, both)))
-    distance = np.abs(reference_times[both][:, None] + DELAYS_S - sample_s).min(axis=0)
+    distance = np.abs(reference_times[both][:, None] + delays_s - sample_s).min(axis=0)
     has_say = (log_share > log_share.max() - UNLIKELY) & (distance < BESIDE_S)
     if not has_say.any():
         return 1.0

@@ -154,7 +154,7 @@ class DelayedRows:
         velocity, slope, _, turning, lever, _ = self.motion
         k, n = velocity.shape[1:]
         share = used.astype(float)
-        row = np.zeros((len(STEPS), N_STATE + 1))
+        row = np.zeros((k, N_STATE + 1))
         of_errors = g1_heave_errors(self.body_from_dvl, velocity.reshape(3, k * n)).reshape(5, k, n)
         row[:, :5] = (of_errors @ share).T
         row[:, 5] = -share.sum()
@@ -236,13 +236,14 @@ def matched(
     min_speed: float,
     max_turn_rate: float,
     imu_gap_s: float,
+    steps: Index = STEPS,
 ) -> Matched:
     """References of some blocks that lie within what these know of the other streams.
 
     dvl_parts, reference_parts: of which block samples are. seen: the references as in the body. noise_dvl: (B, 3, 3)
     (m/s)², DVL frame. body_from_dvl: (3, 3), nominal mounting. lever_arm: (3,) m, body, as far as it is known already.
     min_speed (m/s), max_turn_rate (rad/s, 0 for none): as the parameters. imu_gap_s: longest gap that is interpolated
-    across.
+    across. steps: (K,) of `STEPS`, the delays that are compared; which references are is decided by all.
     """
     times, block = reference.times, reference_parts.number
     turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s, reference_parts)
@@ -250,7 +251,7 @@ def matched(
     moving = (body**2).sum(axis=1) >= min_speed**2
     if max_turn_rate > 0.0:
         moving &= (turning**2).sum(axis=1) <= max_turn_rate**2
-    read = _read(dvl, dvl_parts, times, reference_parts)
+    read = _read(dvl, dvl_parts, times, reference_parts, steps)
     use = seen.known & ~np.isnan(turning[:, 0]) & moving & read.known
     white = whitening(noise + np.where(reference.claimed[:, None, None], noise_dvl[block], 0.0))
     use &= np.isfinite(white).all(axis=(1, 2))
@@ -298,10 +299,10 @@ class _Reading(NamedTuple):
     slope_gain: Array
 
 
-def _read(dvl: DvlColumns, dvl_parts: Parts, times: Array, parts: Parts) -> _Reading:
+def _read(dvl: DvlColumns, dvl_parts: Parts, times: Array, parts: Parts, compared: Index) -> _Reading:
     """Fits are made every STEP_S, and cubics read between them: on so short a step no worse, a tenth of the work.
 
-    times: (J,) s. parts: of which block they are.
+    times: (J,) s. parts: of which block they are. compared: (K,) of `STEPS`.
     """
     steps = times / STEP_S
     middle = np.floor(steps).astype(np.intp)
@@ -323,7 +324,7 @@ def _read(dvl: DvlColumns, dvl_parts: Parts, times: Array, parts: Parts) -> _Rea
     both = local_fit(dvl.times, dvl.velocity, np.concatenate([grid, grid]), reaches, place.twice())
     fit, wide = both.part(slice(len(grid))), both.part(slice(len(grid), None))
     middle += shift
-    before = middle + STEPS[:, None]
+    before = middle + compared[:, None]
     after = before + 1
     rest = 1.0 - part
     (v0, b0, s0), (v1, b1, s1) = (
@@ -336,7 +337,8 @@ def _read(dvl: DvlColumns, dvl_parts: Parts, times: Array, parts: Parts) -> _Rea
     )
     slope = s0 * rest + s1 * part
     found = fit.found & wide.found
-    known: Mask = (found.take(before) & found.take(after)).all(axis=0)
+    # by all delays, whichever are compared: none is judged by other samples than another was
+    known: Mask = np.logical_and.reduce([found.take(middle + step) for step in range(STEPS[0], STEPS[-1] + 2)])
     return _Reading(velocity, slope, known, spacing[middle], wide.slope_gain[middle])
 
 

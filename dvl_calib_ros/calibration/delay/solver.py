@@ -1,12 +1,14 @@
 """G2's blocks of time, solved one after the other: rows, outliers, the bank of delays, and what comes of it.
 
 A block is a copy of what the aligner held, and nobody else touches what is in here meanwhile: so a block can be solved
-beside the thread that feeds the aligner (`filter.DelayFilter` says when its outcome takes effect).
+beside the thread that feeds the aligner (`filter.DelayFilter` says when its outcome takes effect). (Long, because what
+blocks come to must be the same however many are gathered, so all that decides it is here.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -41,6 +43,9 @@ from .rows import (
     joined,
     matched,
 )
+
+# After every so many blocks of a day, hypotheses of the delay that have lost are left out.
+NARROWED = 16
 
 
 class Outcome(NamedTuple):
@@ -104,6 +109,7 @@ class BlockSolver:
         self._lever_arm = (x, y, z)
         self._claims = 0  # references
         self._spikes = 0  # samples of DVL and reference
+        self._n_of_day = 0  # blocks
         self._contradicted: Stamps = np.zeros(0, dtype=np.int64)  # DVL samples, by the references of an earlier block
         self._posterior: Posterior | None = None
         self.epoch_ns = 0
@@ -158,14 +164,30 @@ class BlockSolver:
         while at < len(blocks):
             end = at + 1
             if not self._goes_alone(blocks[at]):
-                while end < len(blocks) and not (blocks[end].new_days or self._goes_alone(blocks[end])):
+                while end < len(blocks) and not (
+                    blocks[end].new_days
+                    or self._goes_alone(blocks[end])
+                    or self._of_day(blocks[at:end]) % NARROWED == 0
+                ):
                     end += 1
+            of_day = self._of_day(blocks[at:end])
             outcomes += self._solve_together(blocks[at:end])
+            self._n_of_day = of_day
+            if of_day % NARROWED == 0:
+                self._narrow()
             at = end
         if self._is_live:
             self._clocks.look_again(self._posterior)
         looked = self._clocks.looked(fresh=False)
         return [outcome._replace(looked=looked) for outcome in outcomes]
+
+    def _of_day(self, blocks: Sequence[Block]) -> int:
+        """How many blocks the day of some has, with these."""
+        return len(blocks) + (0 if blocks[0].new_days else self._n_of_day)
+
+    def _narrow(self) -> None:
+        with suppress(np.linalg.LinAlgError):  # numbers that ran away
+            self.bank.narrow()
 
     def _goes_alone(self, block: Block) -> bool:
         """Whether what is left out of blocks before matters to this one, or of this one to those behind it."""
@@ -289,6 +311,7 @@ class BlockSolver:
             min_speed=p.min_speed,
             max_turn_rate=p.max_turn_rate,
             imu_gap_s=p.imu_timeout,
+            steps=self.bank.compared,
         )
 
     def _take(self, streams: Cleaned, compared: Mapping[int, _Comparison]) -> BlockRows | None:
@@ -308,7 +331,7 @@ class BlockSolver:
         if streams.has_rows and streams.is_slow:
             good, rows = without_contradicted(
                 dvl, reference.times, lambda some: self._compare([streams], [some], seen, turns).rows(0),
-                self.bank.misfits,
+                self.bank.misfits, self.bank.delays_s,
             )  # fmt: skip
             self._leave_out(streams.dvl_ns[~good], block.from_ns)
             dvl = DvlColumns(*(column[good] for column in dvl))

@@ -274,6 +274,23 @@ def test_blocks_that_are_gathered_gate_and_learn_the_heave_as_each_by_itself():
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
 
 
+def test_delays_that_have_lost_are_left_out_after_the_same_blocks_however_these_are_gathered(monkeypatch):
+    samples = late(-1.4, duration=200.0)
+    alone, together, with_all = (Calibrator(NOISE, block_size=size, models=AUTO) for size in (128, 4096, 4096))
+    feed_columns(alone, samples), feed_columns(together, samples)
+    banks = [each._estimators["G2"]._solver.bank for each in (alone, together)]
+    one, other = (each.result().estimates["G2"] for each in (alone, together))
+    assert all(3 <= len(bank.compared) < 12 and -7 in bank.compared for bank in banks)
+    np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
+    monkeypatch.setattr(delay_solver.DelayBank, "narrow", lambda bank: None)
+    expected = feed_columns(with_all, samples).result().estimates["G2"]
+    assert (np.abs(one.state - expected.state) < 0.05 * expected.std).all() and one.mean_nis >= expected.mean_nis
+    for bank in banks:  # another day may have another delay
+        bank.end_day()
+        assert len(bank.compared) == len(bank.hypotheses.x) == 33
+
+
 def test_a_block_whose_numbers_run_away_costs_those_gathered_with_it_nothing(monkeypatch):
     samples, broken = late(-1.4), []
     real = delay_solver.DelayBank.told_by
