@@ -35,7 +35,7 @@ from dvl_calib_ros.evaluation.results import (
     HeldOut,
     Trace,
 )
-from dvl_calib_ros.present.replay_report import write_replay_report
+from dvl_calib_ros.present.reports import write_replay_report
 from dvl_calib_ros.replay.navigation import Drift, Navigation
 from dvl_calib_ros.replay.replay import Replayed, replay
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,10 +14,8 @@ from ..streams import give_up
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from ..calibration.parameters import Parameters
-    from ..calibration.results import Estimate, Result
     from ..discovery.discover import Discovery, Given
     from ..present.document import Document
     from ..recordings.recording import Recording
@@ -209,7 +206,7 @@ def print_document(document: Document) -> None:
 
     print_warnings(document.warnings)
     out = console()
-    for each in shown(document):
+    for each in shown(document, out.width if out.is_terminal else None):
         out.print(each, soft_wrap=isinstance(each, Text) and bool(each.no_wrap))
 
 
@@ -256,49 +253,6 @@ def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Pa
         give_up(sys.stdout)
     if failed:
         raise InputError("; ".join(failed))
-
-
-def estimate_cells(estimate: Estimate) -> list[str]:
-    """φ in degrees and δk in per cent with their ±1σ, '-' where the model has none; '?' marks what is unobserved."""
-    cells = []
-    names = list(estimate.state_names)
-    for name in ("phi_x", "phi_y", "phi_z", "delta_k"):
-        index = next((i for i, own in enumerate(names) if own.startswith(name)), None)
-        if index is None:
-            cells.append("-")
-            continue
-        factor, digits = (math.degrees(1.0), 2) if name.startswith("phi") else (100.0, 2)
-        mark = "" if estimate.observability[index].observed else " ?"
-        axis = " (x)" if names[index] == "delta_k_x" else ""
-        cells.append(
-            f"{factor * estimate.state[index]:+.{digits}f} ± {factor * estimate.std[index]:.{digits}f}{axis}{mark}"
-        )
-    return cells
-
-
-ESTIMATE_COLUMNS = ("φx °", "φy °", "φz °", "δk %")
-
-
-def result_table(result: Result, models: Sequence[str], title: str) -> Table:
-    """One line per model, the selected one marked."""
-    from ..calibration.models import MODELS
-    from .tables import titled
-
-    caption = "± 1σ;  ? not shown by this data"
-    table = titled(title, ("model",), (*ESTIMATE_COLUMNS, "used", "gated", "NIS/m"), caption)
-    table.add_column("convergence")
-    for name in models:
-        estimate = result.estimates[name]
-        dof = MODELS[name].n_measurement
-        table.add_row(
-            f"[bold]{name} ◄[/]" if name == result.selected else name,
-            *estimate_cells(estimate),
-            str(estimate.used),
-            str(estimate.gated),
-            f"{estimate.mean_nis / dof:.2f}" if estimate.used else "-",
-            estimate.convergence.value,
-        )
-    return table
 
 
 def share_folder() -> Path:

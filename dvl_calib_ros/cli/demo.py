@@ -126,10 +126,11 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
     from ..disk.yaml_files import load_yaml
     from ..files.result_file import load_result
+    from ..present.terms import ESTIMATE_COLUMNS, estimate_cells
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     _, live = load_result(saved)
-    numbers = ("model", *common.ESTIMATE_COLUMNS, "max |live - replay|")
+    numbers = ("model", *ESTIMATE_COLUMNS, "max |live - replay|")
     table = titled("Live node against replay and truth", (), numbers)
     table.add_row("[bold]truth[/]", *(f"{value:+.2f}" for value in _truth().values()), "")
     worst = 0.0
@@ -139,7 +140,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
         )
         worst = max(worst, difference)
         selected = f"[bold]{name} ◄[/]" if name == offline.selected else name
-        table.add_row(selected, *common.estimate_cells(estimate), f"{difference:.1e}")
+        table.add_row(selected, *estimate_cells(estimate), f"{difference:.1e}")
     out.print(table)
     model = load_yaml(saved, "result file")["model"]
     start_ns = offline.first_ns or 0

@@ -15,10 +15,9 @@ from . import common
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from ..discovery.discover import Discovery
     from ..replay.replay import Replayed
+    from ..verdict.reasons import Reason
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,25 +76,27 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
-    from rich.markup import escape
+    from ..present import replay as present
 
-    from .answer import next_commands, print_answer, shown_findings
-
-    result, out = replayed.result, common.console()
     common.print_found(discovery, arguments.bags)
-    findings = shown_findings(replayed, discovery, [result.selected, *models])
+    findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])
     known = {str(found) for found in replayed.findings}
-    common.print_warnings(
-        [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
+    warnings = [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
+    commands = present.next_commands(replayed, arguments.bags, arguments.save, _options(arguments), bool(findings))
+    common.print_document(
+        present.replayed(replayed, arguments.bags, models, details=bool(models), warnings=warnings, commands=commands)
     )
-    out.print()
-    print_answer(out, replayed)
-    commands = next_commands(replayed, arguments.bags, arguments.save, _options(arguments), bool(findings))
-    for word, command in zip(("next", *[""] * len(commands)), commands, strict=False):
-        out.print(f"{word:5} {escape(command)}", soft_wrap=True)
-    if models:
-        out.print()
-        _print_details(out, replayed, models)
+
+
+def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Reason]:
+    """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
+    other = [f"{name}: " for name in replayed.result.estimates if name not in models]
+    settled = {"BAG_NO_GNSS", "BAG_NO_IMU"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
+    return [
+        found
+        for found in replayed.findings
+        if found.code not in settled and not any(found.says.startswith(prefix) for prefix in other)
+    ]
 
 
 def _options(arguments: argparse.Namespace) -> list[str]:
@@ -107,17 +108,3 @@ def _options(arguments: argparse.Namespace) -> list[str]:
         topic = getattr(arguments, f"{role}_topic")
         options += [] if topic is None else [f"--{role}-topic", topic]
     return options
-
-
-def _print_details(out: Console, replayed: Replayed, models: Sequence[str]) -> None:
-    """Models in figures, and what became of every message."""
-    result = replayed.result
-    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
-    title = f"{dvl['accepted']} DVL samples, {pairing['paired']} with a reference velocity at their time"
-    out.print(common.result_table(result, models, title))
-    out.print(f"selected: {result.selected} ({result.selected_because})")
-    out.print(f"dvl data: {replayed.dvl_data}")
-    for name in ("dvl", "reference", "imu"):
-        counts = result.counts[name]
-        lost = ", ".join(f"{value} {key}" for key, value in counts.items() if value and key != "received")
-        out.print(f"{name}: {counts['received']} received" + (f": {lost}" if lost else ""))

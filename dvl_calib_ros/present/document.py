@@ -16,6 +16,7 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
+    from ..replay.navigation import Navigation
     from .style import Picture
 
 
@@ -107,12 +108,72 @@ class Found:
 
 @dataclass(frozen=True)
 class Commands:
-    """What to type, or to paste: a line each, with what it is called."""
+    """What to type, or to paste: a line each, with what it is called. on_page: further ones, for a page alone."""
 
     lines: Sequence[tuple[str, str]]
+    on_page: Sequence[tuple[str, str]] = ()
 
 
-Item = Sentence | Table | Figures | Found | Commands
+@dataclass(frozen=True)
+class Facts:
+    """Short texts by name."""
+
+    facts: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Number:
+    """A quantity that was found, in its unit. nominal: as configured. note: what is to be known of it."""
+
+    name: str
+    nominal: str
+    value: str
+    std: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The quantities that a result is about: large on a page, a table on a terminal.
+
+    is_valid: whether they are to be used; a page does not show them otherwise.
+    """
+
+    numbers: Sequence[Number]
+    is_valid: bool = True
+
+
+@dataclass(frozen=True)
+class Worth:
+    """Drift of dead reckoning, m per km, without and with what was found: the largest on a page."""
+
+    before: str
+    after: str
+
+
+@dataclass(frozen=True)
+class Legend:
+    """Lines of models in the figures that follow."""
+
+    models: Sequence[str]
+    selected: str
+
+
+@dataclass(frozen=True)
+class Map:
+    """A track, for a terminal that people look at."""
+
+    navigation: Navigation
+
+
+@dataclass(frozen=True)
+class Warned:
+    """Where a page has the document's warnings: before all sections, where none says so."""
+
+    warned: bool = True
+
+
+Item = Warned | Sentence | Table | Figures | Found | Commands | Facts | Numbers | Worth | Legend | Map
 
 
 @dataclass(frozen=True)
@@ -126,11 +187,12 @@ class Section:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a result says first: a word, how good or bad that is, and sentences."""
+    """What a result says first: a word, how good or bad that is, and sentences. advice: what to do."""
 
     word: str
     severity: Severity
     sentences: Sequence[str]
+    advice: str = ""
 
 
 @dataclass(frozen=True)
@@ -138,7 +200,7 @@ class Document:
     """A result as it is said.
 
     warnings: what to know beside it. sections: in order; those without items are left out. parameters: what it was made
-    with, by name; for the page. lead: what is said before all else.
+    with, by name; for the page. lead: what is said before all else. folded: warnings that a page folds away.
     """
 
     title: str
@@ -148,6 +210,7 @@ class Document:
     sections: Sequence[Section]
     parameters: Sequence[tuple[str, str]] = ()
     lead: str = ""
+    folded: Sequence[str] = ()
 
     @property
     def tables(self) -> list[Table]:
@@ -209,3 +272,8 @@ def _plain(value: Any) -> str:
     if isinstance(value, list):
         return " ".join(_plain(each) for each in value)
     return str(value) if value != "" else "''"
+
+
+def fitting_unit(seconds: float) -> tuple[float, str]:
+    """Length in s and name of the unit in which people tell such a time."""
+    return (1.0, "s") if seconds <= 600.0 else (60.0, "min") if seconds <= 10_800.0 else (3600.0, "h")

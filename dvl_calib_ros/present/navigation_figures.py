@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
-from ..replay.navigation import Navigation, in_words
+from ..replay.navigation import Navigation
 from .exploring import Track
 from .replay_figures import AFTER, BAD
 from .style import INK, WIDTH, Picture, legend_above, new_figure, picture
@@ -20,13 +19,6 @@ from .time_axis import TimeAxis
 # A map is as high as it is wide at most, and never a strip, inches
 HIGHEST, LOWEST = WIDTH, 2.2
 _OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
-
-
-def navigation_section(navigation: Navigation | None, time: TimeAxis) -> dict[str, Any] | None:
-    """What a page shows of it, time: of its other figures; None without."""
-    if navigation is None:
-        return None
-    return {"sentences": in_words(navigation), "pictures": navigation_pictures(navigation, {"": navigation}, time=time)}
 
 
 def navigation_pictures(

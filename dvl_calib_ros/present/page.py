@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from .. import __version__
 from ..disk.atomic import save_text
-from .document import Document, Where
+from .document import Document, Section, Warned, Where
 from .style import MODEL_STYLES
 
 # Class of a cell that holds a verdict
@@ -55,6 +55,8 @@ def _digest(script: str) -> str:
 def write_document(path: Path, document: Document) -> None:
     """Write the page of a document. Raises InputError if it cannot be written."""
     sections = [each for each in document.sections if each.where is not Where.TERMINAL and each.items]
+    if not any(isinstance(item, Warned) for section in sections for item in section.items):
+        sections.insert(0, Section("", [Warned()]))
     context = {"title": document.title, "subtitle": document.subtitle, "document": document, "sections": sections}
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
     write_page(path, "document.html", context | {"written": written})

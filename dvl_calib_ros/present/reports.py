@@ -5,7 +5,7 @@ Needs matplotlib and jinja2: nobody imports this but when a report is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from ..disk.atomic import save_bytes
 from ..evaluation.bags import CrossCheck
 from ..evaluation.results import Evaluation
 from ..examination.examine import Examination
+from ..replay.replay import Replayed
 from ..unpaired.results import UnpairedComparison
 from .comparison import comparison
 from .comparison_figures import trend_png
@@ -24,7 +25,7 @@ from .document import Document
 from .evaluation_report import write_evaluation_report
 from .examination import examination
 from .page import write_document
-from .replay_report import write_replay_report
+from .replay import replayed
 from .unpaired import unpaired
 
 __all__ = ["write_replay_report", "write_report"]
@@ -54,3 +55,8 @@ def write_report(path: Path, result: Any) -> None:
         _PAGES[type(result)](path, result)
     else:
         write_document(path, _DOCUMENTS[type(result)](result))
+
+
+def write_replay_report(path: Path, run: Replayed, bags: Sequence[Path], models: Sequence[str]) -> None:
+    """Write the report of a replay that was run with a history. models: names to show. Raises InputError."""
+    write_document(path, replayed(run, bags, models))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from .document import Cell, Commands, Document, Found, Sentence, Table, Where
+from .document import Cell, Commands, Document, Facts, Found, Map, Numbers, Sentence, Table, Where
 
 if TYPE_CHECKING:
     from rich.padding import Padding
@@ -26,21 +26,29 @@ COLOURS = {
 _STYLES = {"good": "green", "off": "yellow", "far": "yellow", "bad": "red"}
 
 
-def shown(document: Document) -> Iterator[Any]:
-    """What rich prints of a document, but for its warnings, one after the other."""
+def shown(document: Document, width: int | None = None) -> Iterator[Any]:
+    """What rich prints of a document, but for its warnings, one after the other.
+
+    width: of a terminal that people look at, characters.
+    """
     from rich.text import Text
+
+    from .terminal_map import terminal_map
 
     if document.lead:
         yield Text(printable(document.lead), "bold")
     answer = document.answer
     if answer is not None:
-        first, *others = map(printable, answer.sentences)
-        yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", first)
-        yield from map(Text, others)
+        sentences = list(map(printable, answer.sentences))
+        if answer.advice:  # what to do and why, as one
+            sentences = [" ".join([answer.advice, *sentences])]
+        yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", sentences[0])
+        yield from map(Text, sentences[1:])
     for section in document.sections:
         if section.where is Where.PAGE or not section.items:
             continue
-        yield ""
+        if section.title or not isinstance(section.items[0], Sentence):
+            yield ""
         if section.title:
             yield Text(printable(section.title), "bold")
         for item in section.items:
@@ -53,6 +61,12 @@ def shown(document: Document) -> Iterator[Any]:
             elif isinstance(item, Commands):
                 for name, line in item.lines:  # to be copied: never broken
                     yield Text(f"{name:5} {line}", no_wrap=True)
+            elif isinstance(item, Facts):
+                yield from (Text(printable(f"{name}: {value}")) for name, value in item.facts)
+            elif isinstance(item, Numbers):
+                yield _numbers(item)
+            elif isinstance(item, Map) and width is not None:
+                yield terminal_map(item.navigation, width)
 
 
 def _found(reason: Reason) -> Iterator[Padding]:
@@ -61,6 +75,13 @@ def _found(reason: Reason) -> Iterator[Padding]:
 
     yield Padding(Text(printable(reason.says), COLOURS[reason.severity]), (0, 0, 0, 2))
     yield Padding(Text.assemble(printable(reason.remedy), " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
+
+
+def _numbers(item: Numbers) -> RichTable:
+    rows = [(each.name, each.nominal, each.value, f"{each.std} ?" if each.note else each.std) for each in item.numbers]
+    made = _table(Table(("", "nominal", "corrected", "±1σ"), rows))
+    made.style = "none" if item.is_valid else "dim"
+    return made
 
 
 def _table(table: Table) -> RichTable:

@@ -7,17 +7,13 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from ..calibration.frames import Array
+from .document import fitting_unit
 from .exploring import BREAK_MARK, mark_time
 
 # A gap is cut out if it is longer than this (s) and than this share of what was recorded in all ...
 CUT_FROM_S, CUT_SHARE = 60.0, 0.2
 # ... and this share of it is left.
 LEFT_SHARE = 0.02
-
-
-def fitting_unit(seconds: float) -> tuple[float, str]:
-    """Length in s and name of the unit in which people tell such a time."""
-    return (1.0, "s") if seconds <= 600.0 else (60.0, "min") if seconds <= 10_800.0 else (3600.0, "h")
 
 
 class TimeAxis:

@@ -57,7 +57,7 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     bags = [place / "wednesday", place / "monday", place / "tuesday"]  # in any order
     out, _ = succeed(capsys, "replay", *bags, "--json", tmp_path / "r.json", "--save", tmp_path / "r.yaml")
     said = " ".join(out.split())
-    assert re.search(r"reject: Do not use this calibration: the mounting differs by 2\.[0-3]\d° ± 0", said)
+    assert re.search(r"reject: Do not use this calibration. The mounting differs by 2\.[0-3]\d° ± 0", said)
     assert "5 Hz" in said and "of 360 s" in said  # the nights are not counted
     assert "(tuesday) and" in said and "(wednesday): all together are averaged" in said
     document = json.loads((tmp_path / "r.json").read_text())

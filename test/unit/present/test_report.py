@@ -23,8 +23,7 @@ from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.present.exploring import Track, explorable
 from dvl_calib_ros.present.replay_figures import Line, estimate_over_time, held_out_errors
-from dvl_calib_ros.present.replay_report import write_replay_report
-from dvl_calib_ros.present.reports import write_report
+from dvl_calib_ros.present.reports import write_replay_report, write_report
 from dvl_calib_ros.present.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.time_axis import TimeAxis
 from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
@@ -57,7 +56,7 @@ def test_the_verdict_on_the_selected_model_comes_first_with_its_reasons(made):
     page, replayed = made
     verification = replayed.result.verifications[replayed.result.selected]
     start = page.text.index(verification.verdict.value)
-    assert start < page.text.index(verification.reasons[0].sentence) < page.text.index("Estimates")
+    assert start < page.text.index(verification.reasons[0].full_sentence) < page.text.index("Estimates")
 
 
 def test_the_held_out_errors_of_every_model_are_shown(made):

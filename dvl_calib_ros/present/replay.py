@@ -1,0 +1,398 @@
+"""What a replay says: what to do with the calibration, the mounting found, what it is worth, and what to type next.
+
+(Long, because it is the order of one page.)
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..calibration.frames import FLU_FROM_FRD, rpy_from_rotation
+from ..calibration.models import MODELS
+from ..calibration.parameters import Parameters
+from ..calibration.quantities import quantities
+from ..calibration.results import Result
+from ..calibration.samples import VelocityFrame
+from ..calibration.verification import HeldOutError, Verification
+from ..files.result_file import result_document
+from ..files.urdf import origin_tag
+from ..replay.navigation import in_words, metres
+from ..replay.recorder import RunHistory
+from ..replay.replay import Replayed
+from ..verdict.kinds import Severity
+from ..verdict.reasons import full
+from .document import (
+    Answer,
+    Cell,
+    Commands,
+    Document,
+    Facts,
+    Figures,
+    Item,
+    Legend,
+    Map,
+    Number,
+    Numbers,
+    Section,
+    Sentence,
+    Table,
+    Warned,
+    Where,
+    Worth,
+    fitting_unit,
+    parameter_texts,
+)
+from .terms import estimate_table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .style import Picture
+
+# What the verdict's word asks of the reader.
+ADVICE = {
+    Severity.ACCEPT: "Use this calibration.",
+    Severity.MARGINAL: "Use this calibration with care.",
+    Severity.REJECT: "Do not use this calibration.",
+}
+EARTH = (VelocityFrame.ENU, VelocityFrame.NED)
+FAMILIES = ((True, "Models with GNSS"), (False, "Models without GNSS"))
+# Which way is plus, for who mounts it
+_AXES = {
+    "scale": "scale of motion ahead",
+    "lever arm x": "lever arm, ahead",
+    "lever arm y": "lever arm, to port",
+    "lever arm z": "lever arm, up",
+}
+
+
+def replayed(
+    run: Replayed,
+    bags: Sequence[Path],
+    models: Sequence[str],
+    *,
+    details: bool = False,
+    warnings: Sequence[str] | None = None,
+    commands: Sequence[str] = (),
+) -> Document:
+    """The answer of a replay.
+
+    Parameters
+    ----------
+    run
+        The replay; a page has its pictures if it was run with a history.
+    bags
+        What was replayed.
+    models
+        Names to show; the selected one is always among them.
+    details
+        Whether a terminal shows the models and the counts as well.
+    warnings
+        What to warn of; None for all notes, those of models that were not chosen folded away.
+    commands
+        What to type next.
+
+    """
+    result = run.result
+    shown = [name for name in MODELS if name in models or name == result.selected]
+    verification = result.verifications.get(result.selected)
+    rejected = verification is not None and verification.verdict is Severity.REJECT
+    others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
+    own = [note for note in run.notes if not note.startswith(others)] if warnings is None else warnings
+    first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
+    where = Where.BOTH if details else Where.PAGE
+    return Document(
+        title="DVL calibration",
+        subtitle=", ".join(bag.name or str(bag) for bag in bags),
+        answer=_answer(verification),
+        warnings=own,
+        sections=[
+            Section("", _worth(run) if not rejected else [], Where.PAGE),
+            Section(_headline(run) if not rejected else f"Not to be used. {_headline(run)}", _mounting(run, rejected)),
+            Section("", [] if rejected else [_figures(lambda _: _mounted(result))], Where.PAGE),
+            Section("", [Facts(_facts(run, bags))], Where.PAGE),
+            Section("", [] if rejected else [Sentence("Corrected mounting, ready to paste:", soft=True)], Where.PAGE),
+            Section("", [] if rejected else [_paste(run)]),
+            Section("", [Warned()], Where.PAGE),
+            Section("What it means for navigation", _navigation(run)),
+            Section("", _not_shown(run), Where.TERMINAL),
+            Section(
+                "",
+                [Commands([("next" if not k else "", each) for k, each in enumerate(commands)])] if commands else [],
+                Where.TERMINAL,
+            ),
+            Section("Held-out verification", _held_out(result, shown), Where.PAGE),
+            Section("Estimates", [estimate_table(result, shown)], where),
+            *(_families(run, shown)),
+            Section("Velocity before and after correction", _velocities(run), Where.PAGE),
+            Section("Data", [Facts(_selected(run))] if details else [], Where.TERMINAL),
+            Section("" if details else "Data", [_stream_table(result)], where),
+            Section("", _data(run, shown), Where.PAGE),
+        ],
+        parameters=parameter_texts(result.parameters),
+        lead=full(first.says) if first is not None else "",
+        folded=[note for note in run.notes if note.startswith(others)] if warnings is None else (),
+    )
+
+
+def _answer(verification: Verification | None) -> Answer:
+    if verification is None:
+        return Answer("not verified", Severity.MARGINAL, ["Nothing was held back to verify the calibration on."])
+    reasons = [*verification.reasons, *([verification.mounting] if verification.mounting is not None else [])]
+    said = [each.full_sentence for each in reasons]
+    return Answer(verification.verdict.value, verification.verdict, said, ADVICE[verification.verdict])
+
+
+def _headline(run: Replayed) -> str:
+    """By how much the mounting is off, by which model, from how much data."""
+    result = run.result
+    parameters = Parameters.from_mapping(result.parameters)
+    turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
+    angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
+    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - run.pause_s
+    return (
+        f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} (model "
+        f"{result.selected}, {result.estimate.used} samples used of {seconds:.0f} s)"
+    )
+
+
+def _worth(run: Replayed) -> list[Item]:
+    if run.navigation is None:
+        return []
+    return [Worth(metres(run.navigation.before.per_km), metres(run.navigation.after.per_km))]
+
+
+def _mounting(run: Replayed, rejected: bool) -> list[Item]:
+    numbers = Numbers(
+        [
+            Number(
+                _AXES.get(each.name, each.name),
+                each.in_unit(each.nominal),
+                each.in_unit(each.value, signed=True),
+                each.in_unit(each.std),
+                "" if each.shown else "not shown by this data",
+            )
+            for each in quantities(run.result)
+        ],
+        is_valid=not rejected,
+    )
+    heading = "Yaw is against the IMU's heading: a constant error of the heading is in it, and harmless with that IMU."
+    return [numbers, *([Sentence(heading)] if run.reference_frame in EARTH and not rejected else [])]
+
+
+def _paste(run: Replayed) -> Commands:
+    """The corrected mounting as a URDF joint's origin, of forward-right-down data with both axes, and for tf2."""
+    result = run.result
+    parameters = Parameters.from_mapping(result.parameters)
+    rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
+    arm = result.position_in_body
+    tag = origin_tag(arm, rpy_from_rotation(rotation))
+    lines = [("URDF", tag)]
+    if run.turned:
+        own = origin_tag(arm, rpy_from_rotation(rotation @ FLU_FROM_FRD))
+        lines = [
+            ("URDF", f"{tag}  (forward-left-up axes)"),
+            ("", f"{own}  ({run.dvl_frame} of the driver: forward-right-down)"),
+        ]
+    static = result_document(result, run.dvl_frame, run.turned)["mounting"]["static_transform_publisher"]
+    return Commands(lines, on_page=[("tf", static)] if static else [])
+
+
+def _navigation(run: Replayed) -> list[Item]:
+    navigation = run.navigation
+    if navigation is None:
+        return []
+
+    def draw(history: RunHistory) -> Sequence[Picture]:
+        from .navigation_figures import navigation_pictures
+        from .time_axis import TimeAxis
+
+        return navigation_pictures(navigation, {"": navigation}, time=TimeAxis(history.stamps_ns))
+
+    pictures = _of_history(run, draw)
+    return [*map(Sentence, in_words(navigation)), *([Map(navigation)] if navigation.on_a_map else []), *pictures]
+
+
+def _not_shown(run: Replayed) -> list[Item]:
+    """What the recording does not show, and the manoeuvre that would; one sentence per cause."""
+    causes: dict[str, list[str]] = {}
+    for entry in run.result.estimate.observability:
+        if entry.missing:
+            causes.setdefault(entry.missing, []).append(entry.axis)
+    return [
+        Sentence(f"? {' and '.join(dict.fromkeys(axes))}: not shown by this recording; it needs {missing}")
+        for missing, axes in causes.items()
+    ]
+
+
+def _figures(draw: Callable[[None], Sequence[Picture]]) -> Figures:
+    return Figures(lambda: draw(None))
+
+
+def _of_history(run: Replayed, draw: Callable[[RunHistory], Sequence[Picture]]) -> list[Item]:
+    """Figures of a run that kept its history."""
+    history = run.history
+    return [] if history is None else [Figures(lambda: draw(history))]
+
+
+def _mounted(result: Result) -> Sequence[Picture]:
+    from .mounting_figures import mounting_pictures
+
+    return mounting_pictures(result)
+
+
+def _facts(run: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
+    result = run.result
+    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+    estimate = result.estimate
+    missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
+    return [
+        ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
+        *([("Angles", "against the IMU's heading and level")] if run.reference_frame in EARTH else []),
+        ("Recorded", _when(result)),
+        ("DVL data", run.dvl_data),
+        ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
+        ("Used by " + result.selected, f"{estimate.used}, {estimate.gated} gated"),
+        *([("Not shown yet", "; ".join(dict.fromkeys(missing)))] if missing else []),
+        ("Bags", ", ".join(map(str, bags))),
+    ]
+
+
+def _when(result: Result) -> str:
+    if result.first_ns is None or result.last_ns is None:
+        return "nothing"
+    seconds = (result.last_ns - result.first_ns) * 1e-9
+    unit_s, unit = fitting_unit(seconds)
+    duration = f"{seconds / unit_s:.1f} {unit}"
+    return f"{_utc(result.first_ns)} to {_utc(result.last_ns)} UTC, {duration}"
+
+
+def _utc(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _selected(run: Replayed) -> list[tuple[str, str]]:
+    """For who asks for details."""
+    dvl, pairing = run.result.counts["dvl"], run.result.counts["pairing"]
+    return [
+        ("selected", f"{run.result.selected} ({run.result.selected_because})"),
+        ("dvl data", run.dvl_data),
+        ("samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} with a reference velocity at their time"),
+    ]
+
+
+def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
+    """What each model's correction did to data that it had not seen."""
+    verifications = {name: result.verifications[name] for name in shown if name in result.verifications}
+    judged = {name: each.held_out for name, each in verifications.items() if each.held_out is not None}
+    if not judged:
+        return []
+
+    def draw(_: None) -> Sequence[Picture]:
+        from .replay_pictures import held_out_picture
+
+        return [held_out_picture(judged)]
+
+    kinds = {Severity.ACCEPT: "good", Severity.MARGINAL: "off", Severity.REJECT: "bad"}
+    rows: list[tuple[str | Cell, ...]] = [
+        (name, *_held_out_cells(judged.get(name)), Cell(each.verdict.value, kinds[each.verdict]))
+        for name, each in verifications.items()
+    ]
+    head = ("model", "uncorrected", "corrected", "predicted", "samples", "verdict")
+    return [
+        Sentence(
+            "Each block of the run was held back in turn and corrected with a calibration that had not seen it. "
+            "Velocity error against the reference, m/s rms, with the noise of the reference in all of them; predicted "
+            "is what that noise and the uncertainty of the calibration lead one to expect."
+        ),
+        Table(head, rows, marked=list(verifications).index(result.selected)),
+        _figures(draw),
+    ]
+
+
+def _held_out_cells(error: HeldOutError | None) -> tuple[str, ...]:
+    if error is None:
+        return ("–", "–", "–", "0")
+    return (f"{error.uncorrected:.4f}", f"{error.corrected:.4f}", f"{error.predicted:.4f}", str(error.samples))
+
+
+def _families(run: Replayed, shown: Sequence[str]) -> list[Section]:
+    """Estimates over time and innovations, for the models with GNSS and for those without."""
+    result, sections = run.result, []
+    for aided, title in FAMILIES:
+        models = [name for name in shown if MODELS[name].aided == aided and result.estimates[name].used]
+
+        def draw(history: RunHistory, models: Sequence[str] = models) -> Sequence[Picture]:
+            from .replay_pictures import estimate_pictures
+
+            return list(estimate_pictures(result, history, models))
+
+        pictures = _of_history(run, draw) if models else []
+        sections.append(Section(title, [Legend(models, result.selected), *pictures] if pictures else [], Where.PAGE))
+    return sections
+
+
+def _velocities(run: Replayed) -> list[Item]:
+    def draw(history: RunHistory) -> Sequence[Picture]:
+        from .replay_pictures import velocity_pictures
+
+        return velocity_pictures(run, history)
+
+    pictures = _of_history(run, draw)
+    return [Sentence(_velocity_note(run), soft=True), *pictures] if pictures else []
+
+
+def _velocity_note(run: Replayed) -> str:
+    estimate = run.result.estimate
+    turned = f"Body frame. Velocities are of the DVL's own place, corrected with the final estimate of {estimate.model}"
+    if run.navigation is None:
+        return f"{turned}. No reference is beside enough of them for residuals."
+    return (
+        f"{turned}; residuals are at the reference point, corrected by estimates that had not seen the data, with all "
+        "that was found, lever arm and delay too. The noise of the reference is in them. Lines are running means."
+    )
+
+
+_STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pairing", "pairing of DVL and GNSS"))
+
+
+def _stream_table(result: Result) -> Table:
+    rows = []
+    for key, name in _STREAMS:
+        counts = result.counts[key]
+        rest = [f"{value} {what.replace('_', ' ')}" for what, value in counts.items() if value and what != "received"]
+        rows.append((name, str(counts.get("received", "–")), Cell(", ".join(rest) or "–", "text")))
+    return Table(("", "received", Cell("of which", "text")), rows)
+
+
+def _data(run: Replayed, shown: Sequence[str]) -> list[Item]:
+    def draw(history: RunHistory) -> Sequence[Picture]:
+        from .replay_pictures import data_pictures
+
+        return data_pictures(run.result, history, shown)
+
+    return _of_history(run, draw)
+
+
+def next_commands(
+    run: Replayed, bags: Sequence[Path], saved: Path | None, options: Sequence[str], doubts: bool
+) -> list[str]:
+    """What to type next, in order. options: of this run, which the next needs as well."""
+    named = " ".join(shlex.quote(str(bag)) for bag in bags)
+    given = "".join(f" {shlex.quote(option)}" for option in options)
+    verdict = run.result.verifications[run.result.selected].verdict
+    if verdict is Severity.REJECT and run.recordings is not None and run.recordings.moved:
+        return [f"dvl-calib compare {named}{given}", f"dvl-calib doctor {named}"]
+    if verdict is Severity.REJECT:
+        return [f"dvl-calib doctor {named}", f"dvl-calib diagnose {named}{given}"]
+    if saved is None:
+        return [f"dvl-calib replay {named}{given} --save calibration.yaml"]
+    commands = [f"dvl-calib apply {shlex.quote(str(saved))} --urdf robot.urdf"]
+    return commands + ([f"dvl-calib doctor {named}"] if doubts else [])

@@ -1,0 +1,124 @@
+"""Pictures of a replay: estimates over time, velocities, what became of the samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ..calibration.models import MODELS
+from ..calibration.parameters import Parameters
+from ..calibration.results import Result
+from ..calibration.verification import HeldOutError
+from ..replay.recorder import ModelHistory, RunHistory
+from ..replay.replay import Replayed
+from . import replay_figures as figures
+from .style import Picture, picture
+from .terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
+from .time_axis import TimeAxis
+
+BODY_AXES = ("ahead", "to port", "up")
+HELD_OUT_KINDS = ("uncorrected", "corrected", "predicted")
+
+
+def held_out_picture(judged: dict[str, HeldOutError]) -> Picture:
+    """Errors on held-out data, model by model."""
+    errors = [np.array([getattr(error, kind) for error in judged.values()]) for kind in HELD_OUT_KINDS]
+    alt = "; ".join(f"{name}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for name, e in judged.items())
+    return picture("Velocity error on held-out data", alt, figures.held_out_errors, list(judged), *errors)
+
+
+def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]) -> Iterable[Picture]:
+    """What some models estimate over time, and their innovations."""
+    time = TimeAxis(history.stamps_ns)
+    for term in (*ANGLES, *_scales_shown(models)):
+        lines = [
+            _line(name, history.models[name], term)
+            for name in models
+            if MODELS[name].error_terms_from_state[term.row].any()
+        ]
+        if lines:
+            final = ", ".join(f"{line.model} {line.value[-1]:+.2f} ± {line.std[-1]:.2f}" for line in lines)
+            yield picture(
+                f"{term.in_words} ± 1σ", f"{term.name} over time; at the end, in {term.unit.strip()}: {final}",
+                figures.estimate_over_time, time, history.stamps_ns, lines, result.selected,
+                f"{term.name}, {term.unit.strip()}",
+            )  # fmt: skip
+    nis = {name: history.models[name].nis for name in models}
+    yield picture(
+        "Innovations (NIS)", "Mean normalised innovation squared over time; 1 is expected",
+        figures.innovations_over_time, time, history.stamps_ns, nis, result.selected,
+        caption="Running mean. The line at 1 is what the model expects: above it the σ is too small, below too large.",
+    )  # fmt: skip
+
+
+def _scales_shown(models: Sequence[str]) -> list[Term]:
+    """One figure for the scale; one for each axis if a model has more than one scale error."""
+    if any(len(scale_terms(MODELS[name])) > 1 for name in models):
+        return list(SCALES)
+    return [ANY_SCALE]
+
+
+def _line(name: str, history: ModelHistory, term: Term) -> figures.Line:
+    index = state_of(MODELS[name], term)
+    return figures.Line(name, term.factor * history.state[:, index], term.factor * history.std[:, index])
+
+
+def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
+    """Velocity and, with a reference, residual, per body axis."""
+    time = TimeAxis(history.stamps_ns)
+    t = Parameters.from_mapping(replayed.result.parameters).rotation_dvl_from_body
+    correction = replayed.result.estimate
+    before, after = history.dvl_velocity @ t, correction.corrected_velocity(history.dvl_velocity, t)
+    pictures = [
+        picture(
+            f"Velocity {where}", f"DVL velocity {where} before and after correction, and the reference, m/s",
+            figures.velocity_over_time, time, history.dvl_ns, before[:, axis], after[:, axis], history.paired_ns,
+            history.reference_velocity[:, axis], f"velocity {where}, m/s",
+        )
+        for axis, where in enumerate(BODY_AXES)
+    ]  # fmt: skip
+    navigation = replayed.navigation
+    if navigation is not None:
+        pictures += [
+            picture(
+                f"Residual {where}", f"DVL minus GNSS {where}, before and after correction, m/s",
+                figures.residual_over_time, time, navigation.stamps_ns, -navigation.error_before[:, axis],
+                -navigation.error_after[:, axis], f"DVL − GNSS {where}, m/s",
+            )
+            for axis, where in enumerate(BODY_AXES)
+        ]  # fmt: skip
+    return pictures
+
+
+def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> list[Picture]:
+    """What became of the samples, and which model was selected when."""
+    time = TimeAxis(history.stamps_ns)
+    fates = _fates(result, shown)
+    ends = [*(segment.from_ns for segment in result.segments[1:]), result.last_ns]
+    segments = [(each.model, each.from_ns, end) for each, end in zip(result.segments, ends, strict=False)]
+    switches = ", ".join(dict.fromkeys(name for name, _, _ in segments)) or "none"
+    return [
+        picture(
+            "Samples by model", "How many DVL samples each model used, gated or was not given",
+            figures.samples_by_fate, list(shown), fates,
+            caption="Not given: without the GNSS velocity or attitude it needs, or in the window of its prior.",
+        ),
+        picture(
+            "Selected model and GNSS", f"Which model was selected over time: {switches}; and when GNSS was there",
+            figures.selection_over_time, time, segments, history.stamps_ns, history.paired_share,
+            caption="GNSS: dark where DVL samples had a GNSS velocity beside them.",
+        ),
+    ]  # fmt: skip
+
+
+def _fates(result: Result, shown: Sequence[str]) -> dict[str, list[int]]:
+    dvl = result.counts["dvl"]
+    fates: dict[str, list[int]] = {"used": [], "gated": [], "not given": [], "slow or turning": []}
+    for name in shown:
+        estimate = result.estimates[name]
+        fates["used"].append(estimate.used)
+        fates["gated"].append(estimate.gated)
+        fates["not given"].append(max(0, dvl["usable"] - estimate.used - estimate.gated))
+        fates["slow or turning"].append(dvl["slow"] + dvl["turning"] + dvl["no_turn_rate"])
+    return fates
