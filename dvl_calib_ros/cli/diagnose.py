@@ -12,14 +12,10 @@ from typing import TYPE_CHECKING
 
 from . import common, unpaired
 from .reporting import add_report_option, report_writer
-from .tables import intervals, titled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rich.table import Table
-
-    from ..diagnosis.results import Diagnosis
 
 COLOURS = {"no_gap": "green", "known": "green", "ambiguous": "yellow", "unknown": "red"}
 # At rest a bias shows that looks like scale at speed
@@ -56,6 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.results import diagnosis_document
     from ..diagnosis.twin_bags import write_twins
     from ..disk.atomic import save_all
+    from ..present import diagnosis as present
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
@@ -84,7 +81,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
 
     def answer() -> None:
-        _print(diagnosis)
+        common.print_document(present.diagnosis(diagnosis))
         common.print_found(discovery, arguments.bags)
 
     def apply(path: Path) -> None:
@@ -128,69 +125,3 @@ def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
     for path in (path for name in names for path in twin_paths(folder, name)):
         if os.path.lexists(path):
             raise InputError(f"{path}: exists already; give another folder, or remove it first")
-
-
-def _print(diagnosis: Diagnosis) -> None:
-    from rich.markup import escape
-
-    common.print_warnings(diagnosis.notes)
-    out = common.console()
-    verdict = diagnosis.verdict.value
-    out.print(f"[bold {COLOURS.get(verdict, 'yellow')}]{verdict}[/]: {escape(diagnosis.sentence)}", soft_wrap=True)
-    if diagnosis.effects:
-        out.print(_effects(diagnosis))
-    if diagnosis.where:
-        out.print(_where(diagnosis))
-    if diagnosis.noise:
-        out.print(_noise(diagnosis))
-    if diagnosis.minimum_detectable:
-        out.print(_detectable(diagnosis))
-    for name, needs in diagnosis.untestable.items():
-        out.print(f"not testable: {name}, which needs {needs}")
-    out.print(f"next: {escape(diagnosis.next_manoeuvre)}", soft_wrap=True)
-
-
-def _effects(diagnosis: Diagnosis) -> Table:
-    gap = diagnosis.gap
-    title = (
-        f"error {1e3 * gap.before:.1f} mm/s before, {1e3 * gap.after:.1f} after, held out, over noise of "
-        f"{1e3 * gap.noise_floor:.1f}; not explained {1e3 * gap.not_explained:.1f}; closure {_share(gap.closure)} "
-        f"({_share(gap.interval[0])} to {_share(gap.interval[1])})"
-    )
-    table = titled(title, ("effect", "or else", "parameters (95 %)", "closure", "p"))
-    for effect in diagnosis.effects:
-        table.add_row(
-            effect.name, ", ".join(effect.equivalent_to) or "-", intervals(effect.parameters), _share(effect.closure),
-            f"{effect.p:.1g}",
-        )  # fmt: skip
-        for recording, parameters in effect.by_recording.items():
-            table.add_row(f"  {recording}", "", intervals(parameters), "", "")
-    return table
-
-
-def _where(diagnosis: Diagnosis) -> Table:
-    table = titled("where the gap lies", ("axis", "when", "time s", "band Hz", "share", "p"))
-    for place in diagnosis.where[:MAX_PLACES]:
-        table.add_row(
-            place.axis, place.regime, "{:.0f} .. {:.0f}".format(*place.segment_s),
-            "{:.2g} .. {:.2g}".format(*place.band_hz), _share(place.share), f"{place.p:.1g}",
-        )  # fmt: skip
-    return table
-
-
-def _noise(diagnosis: Diagnosis) -> Table:
-    table = titled("the noise is not what it should be", ("finding", "parameters (95 %)", "p"))
-    for finding in diagnosis.noise:
-        table.add_row(finding.name, intervals(finding.parameters), f"{finding.p:.1g}")
-    return table
-
-
-def _detectable(diagnosis: Diagnosis) -> Table:
-    table = titled("smallest sizes that would be found (4 times in 5)", ("effect", "sizes"))
-    for name, sizes in diagnosis.minimum_detectable.items():
-        table.add_row(name, ", ".join(f"{key} {size:.2g}" for key, size in sizes.items()))
-    return table
-
-
-def _share(value: float) -> str:
-    return f"{100.0 * value:.0f} %"

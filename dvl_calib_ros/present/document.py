@@ -123,13 +123,17 @@ class Facts:
 
 @dataclass(frozen=True)
 class Number:
-    """A quantity that was found, in its unit. nominal: as configured. note: what is to be known of it."""
+    """A quantity that was found, in its unit. std: its σ. nominal: as configured. note: what is to be known of it.
+
+    is_shown: whether the data show it.
+    """
 
     name: str
-    nominal: str
     value: str
-    std: str
+    std: str = ""
+    nominal: str = ""
     note: str = ""
+    is_shown: bool = True
 
 
 @dataclass(frozen=True)
@@ -239,6 +243,11 @@ def with_std(value: float, std: float, digits: int = 2, *, signed: bool = False)
 def p_value(p: float) -> str:
     """A probability; – for none."""
     return "–" if p != p else f"{p:.2g}" if p >= 1e-300 else "below 1e-300"
+
+
+def share(value: float) -> str:
+    """A share in per cent; – for none."""
+    return f"{100.0 * value:.0f} %".replace("-", "−") if math.isfinite(value) else "–"
 
 
 def three(value: float) -> str:

@@ -174,10 +174,11 @@ def _mounting(run: Replayed, rejected: bool) -> list[Item]:
         [
             Number(
                 _AXES.get(each.name, each.name),
-                each.in_unit(each.nominal),
                 each.in_unit(each.value, signed=True),
                 each.in_unit(each.std),
+                each.in_unit(each.nominal),
                 "" if each.shown else "not shown by this data",
+                each.shown,
             )
             for each in quantities(run.result)
         ],

@@ -20,7 +20,7 @@ from ..unpaired.results import UnpairedComparison
 from .comparison import comparison
 from .comparison_figures import trend_png
 from .cross_check import cross_check
-from .diagnosis_report import write_diagnosis_report
+from .diagnosis import diagnosis
 from .document import Document
 from .evaluation_report import write_evaluation_report
 from .examination import examination
@@ -34,12 +34,12 @@ __all__ = ["write_replay_report", "write_report"]
 _DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
     Comparison: comparison,
     CrossCheck: cross_check,
+    Diagnosis: diagnosis,
     Examination: examination,
     UnpairedComparison: unpaired,
 }
 # Pages that are still laid out by themselves.
 _PAGES: Mapping[type, Callable[[Path, Any], None]] = {
-    Diagnosis: write_diagnosis_report,
     Evaluation: write_evaluation_report,
 }
 

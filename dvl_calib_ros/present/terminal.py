@@ -78,8 +78,14 @@ def _found(reason: Reason) -> Iterator[Padding]:
 
 
 def _numbers(item: Numbers) -> RichTable:
-    rows = [(each.name, each.nominal, each.value, f"{each.std} ?" if each.note else each.std) for each in item.numbers]
-    made = _table(Table(("", "nominal", "corrected", "±1σ"), rows))
+    if any(each.std for each in item.numbers):
+        rows = [
+            (each.name, each.nominal, each.value, each.std if each.is_shown else f"{each.std} ?")
+            for each in item.numbers
+        ]
+        made = _table(Table(("", "nominal", "corrected", "±1σ"), rows))
+    else:
+        made = _table(Table(("", "", ""), [(each.name, each.value, each.note) for each in item.numbers]))
     made.style = "none" if item.is_valid else "dim"
     return made
 
@@ -89,6 +95,7 @@ def _table(table: Table) -> RichTable:
     from rich.table import Table as RichTable
 
     made = RichTable(
+        show_header=any(_cell(name).plain for name in table.head),
         title=table.title or None,
         title_justify="left",
         box=box.SIMPLE_HEAD,

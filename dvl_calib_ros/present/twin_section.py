@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.signal import welch
@@ -29,23 +28,13 @@ def differences(twin: HeldOutTwin, has_effects: bool) -> dict[str, Array]:
     return {WITHOUT: twin.without, WITH: twin.with_effects} if has_effects else {ALONE: twin.without}
 
 
-def twin_context(twins: Sequence[HeldOutTwin], axes: Mapping[str, str], has_effects: bool) -> dict[str, Any]:
-    """What the template needs. axes: those that are measured, x, y, z, with what they are called."""
-    return {
-        "twin_table": twin_table(twins, has_effects),
-        "twins": [{"name": t.name, "pictures": list(twin_pictures(t, axes, has_effects))} for t in twins],
-    }
-
-
 def rms(values: Array) -> float:
     """m/s of the vector, of values (N, 3)."""
     return float(np.sqrt((values**2).sum(axis=1).mean())) if len(values) else float("nan")
 
 
-def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table | None:
+def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
     """Error of every recording in every regime of motion, m/s."""
-    if not twins:
-        return None
     rows = []
     for twin in twins:
         noise = float(np.sqrt((twin.noise**2).sum()))

@@ -16,7 +16,7 @@ from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
-from dvl_calib_ros.present import diagnosis_report
+from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.reports import write_report
 from dvl_calib_ros.present.twin_section import rms, spectrum
 
@@ -139,9 +139,9 @@ def test_the_gap_of_a_regime_is_what_lies_there_beyond_the_noise():
     turning = series.regimes["turning"]
     held = series.held_out
     expected = np.sqrt((held.before**2 - held.floor)[turning].sum(axis=1).mean())
-    value, low, high = diagnosis_report._gap(held.before, held.floor, held.block, turning)
+    value, low, high = diagnosis_pictures._gap(held.before, held.floor, held.block, turning)
     assert value == pytest.approx(expected) and low < expected < high
-    assert diagnosis_report._gap(held.after, held.floor, held.block, turning) == (0.0, 0.0, 0.0)
+    assert diagnosis_pictures._gap(held.after, held.floor, held.block, turning) == (0.0, 0.0, 0.0)
 
 
 def test_the_spectrum_of_white_noise_is_flat_at_its_density():
