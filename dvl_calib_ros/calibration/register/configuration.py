@@ -39,6 +39,8 @@ OUTLYING = 4.0
 ALIKE_S = 0.1
 # ... and no more than so many times what is left with whichever clocks.
 AS_WELL = 1.1
+# ... by few rows, whose median is good to 4 %: what leaves more is not fitted to all.
+FAR_WORSE = 1.5 * AS_WELL
 # A registration explains the motion with a misalignment (rad) and a scale below these.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
@@ -130,11 +132,11 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, s
     """
     fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
 
-    def fitted(rotation: Array, held: Sequence[Array]) -> Fitted | None:
+    def fitted(rotation: Array, held: Sequence[Array], most: float = math.inf) -> Fitted | None:
         near = nearest(quick, rotation, held)
-        return None if near is None else fit(0.0, near.dvl_late, rotation, held)
+        return None if near is None or near.level > most else fit(0.0, near.dvl_late, rotation, held)
 
-    turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM)
+    turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM, FAR_WORSE * spread)
     if turned is None or turned.level > AS_WELL * spread:
         return ""
     given = fitted(nominal, (REFERENCE,))
