@@ -98,6 +98,18 @@ def screened_covariances(covariance: Array) -> tuple[Mask, Mask, Array, Codes]:
     return valid, given, found, (unmeasured * _BITS).sum(axis=1).astype(np.uint8)
 
 
+def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[bool, bool, bool]:
+    """Which axes a reference measures: most of its messages say so, the parameter does, and one is not 0 throughout.
+
+    velocity: (N, 3) m/s. unmeasured: (N,) as of `Screened`. gnss_axes: as the parameter.
+    """
+    measured = [2 * np.count_nonzero(unmeasured & bit) < len(unmeasured) for bit in _BITS]
+    if gnss_axes != "auto":
+        measured[2] = gnss_axes == "xyz"
+    x, y, z = map(bool, measured)
+    return x, y, z and bool(velocity[:, 2].any())
+
+
 class CovarianceScreen:
     """`screened_covariance` that recognises the covariance of the sample before: most streams repeat it."""
 

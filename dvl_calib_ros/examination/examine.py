@@ -15,7 +15,7 @@ from ..calibration.observability import MEASURES_VERTICAL
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
-from ..calibration.screening import NOT_MEASURED_VARIANCE
+from ..calibration.screening import measured_axes
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look
@@ -265,7 +265,8 @@ def _shown(velocity: Array, streams: dict[str, Recorded], parameters: Parameters
     prior, fine = parameters.initial_std_misalignment, parameters.fine_std_misalignment
     needs = _NEEDS
     about = {"roll": y + z, "pitch": x + z, "yaw": x + y}
-    if _is_horizontal(reference, parameters):  # as a calibration claims nothing of them
+    if not measured_axes(reference.values, reference.unmeasured, parameters.gnss_axes)[2]:
+        # as a calibration claims nothing of them
         about, z = about | {"roll": 0.0, "pitch": 0.0}, 0.0
         needs = _NEEDS | dict.fromkeys(("roll", "pitch"), MEASURES_VERTICAL)
     rows = [
@@ -273,17 +274,6 @@ def _shown(velocity: Array, streams: dict[str, Recorded], parameters: Parameters
     ]
     scale = parameters.initial_std_scale, parameters.fine_std_scale
     return [*rows, _row("scale", "%", x + y + z, scale, 100.0, needs)]
-
-
-def _is_horizontal(reference: Recorded, parameters: Parameters) -> bool:
-    """Whether a reference does not measure the vertical."""
-    variance = reference.variances[:, 2]
-    claimed = variance[np.isfinite(variance)]
-    return (
-        parameters.gnss_axes == "xy"
-        or not reference.values[:, 2].any()
-        or bool(len(claimed) and np.median(claimed) >= NOT_MEASURED_VARIANCE)
-    )
 
 
 def _row(

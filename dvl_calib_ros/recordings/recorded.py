@@ -11,15 +11,16 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
-from ..calibration.samples import Stamps
+from ..calibration.samples import Codes, Stamps
+from ..calibration.screening import NOT_MEASURED_VARIANCE, screen_columns
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
-from .columns import TopicColumns, stamped
+from .columns import Laid, TopicColumns, stamped
 from .look import FASTEST
 
 # Of an IMU
-NO_VARIANCES = np.zeros((0, 3))
+NOTHING = np.zeros((0, 3)), np.zeros(0, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class Recorded:
     """A topic's messages, N of them, in order of log time.
 
     stamps_ns: (N,) of the header, 0 where it has none. log_ns: (N,). values: (N, 3) m/s; of an IMU (N, 4) its
-    quaternion. variances: (N, 3) (m/s)², nan where not given; (0, 3) of an IMU. refused: by counter of the driver's
+    quaternion. variances: (N, 3) (m/s)², nan where not given; (0, 3) of an IMU. unmeasured: (N,) axes that a
+    message says not to measure, as of `screening.Screened`; (0,) of an IMU. refused: by counter of the driver's
     rules, of how many. unreadable: messages that could not be read.
     """
 
@@ -37,6 +39,7 @@ class Recorded:
     log_ns: Stamps
     values: Array
     variances: Array
+    unmeasured: Codes
     refused: Mapping[str, int]
     unreadable: int
 
@@ -78,14 +81,19 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     is_imu = msgtype == IMU_TYPE
     width = 4 if is_imu else 3
     columns = [
-        (each.arrival, each.log_ns, each.stamps_ns, each.values[:, :width], NO_VARIANCES if is_imu else each.variances)
+        (each.arrival, each.log_ns, each.stamps_ns, each.values[:, :width], *(NOTHING if is_imu else _claimed(each)))
         for each in (part.laid for part in parts)
     ]
     if rows or len(columns) > 1:
         columns.append(_of_rows(rows, width, is_imu))
-    _, log_ns, stamps_ns, values, variances = columns[0] if len(columns) == 1 else _in_order(columns)
+    _, log_ns, stamps_ns, values, variances, unmeasured = columns[0] if len(columns) == 1 else _in_order(columns)
     values, variances = _plausible(values, FASTEST), _plausible(variances, FASTEST**2)
-    return Recorded(topic, msgtype, stamps_ns, log_ns, values, variances, refused, unreadable)
+    return Recorded(topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, unreadable)
+
+
+def _claimed(laid: Laid) -> tuple[Array, Codes]:
+    """Variances (N, 3), and axes that are said not to be measured (N,)."""
+    return laid.variances, screen_columns(laid.covariances).unmeasured
 
 
 def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
@@ -143,5 +151,8 @@ def _differences(singly: Sequence[tuple[int, int, Any, str]], parameters: Parame
 def _of_rows(rows: Sequence[_Row], width: int, is_imu: bool) -> tuple[Any, ...]:
     times = (np.array([row[place] for row in rows], dtype=np.int64) for place in range(3))
     values = np.array([row.values for row in rows], dtype=float).reshape(-1, width)
-    variances = NO_VARIANCES if is_imu else np.array([row.variances for row in rows]).reshape(-1, 3)
-    return (*times, values, variances)
+    if is_imu:
+        return (*times, values, *NOTHING)
+    variances = np.array([row.variances for row in rows]).reshape(-1, 3)
+    unmeasured = (variances >= NOT_MEASURED_VARIANCE) @ np.array([1, 2, 4])
+    return (*times, values, variances, unmeasured.astype(np.uint8))

@@ -131,6 +131,11 @@ def no_vertical(log: int, message: Any, _: int) -> int:
     return log
 
 
+def vertical_not_measured(log: int, message: Any, _: int) -> int:
+    message.twist.covariance[14] = -1.0
+    return log
+
+
 def millimetres(log: int, message: Any, _: int) -> int:
     linear = message.twist.twist.linear
     linear.x, linear.y, linear.z = 1000.0 * linear.x, 1000.0 * linear.y, 1000.0 * linear.z
@@ -218,8 +223,9 @@ def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
     assert codes(examined) <= {code, *also}
 
 
-def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claimed(tmp_path):
-    bag = faulty(tmp_path / "bag", reference_only(no_vertical))
+@pytest.mark.parametrize("change", [no_vertical, vertical_not_measured])
+def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claimed(tmp_path, change):
+    bag = faulty(tmp_path / "bag", reference_only(change))
     examined = examine([bag], Parameters())
     needs = {each.name: each.needs for each in examined.shown}
     assert needs["roll"] == needs["pitch"] == MEASURES_VERTICAL and needs["yaw"] == ""

@@ -12,7 +12,7 @@ from ..frames import ENU_FROM_NED, Array
 from ..imu_alignment import ImuAlignment
 from ..parameters import Parameters
 from ..samples import FRAME_CODES, Index, SampleBlock, Streams, VelocityFrame
-from ..screening import screen_columns, unit_quaternions
+from ..screening import measured_axes, screen_columns, unit_quaternions
 from ..spikes import without_spikes
 
 
@@ -70,7 +70,7 @@ def motion_of(streams: Streams, parameters: Parameters) -> Motion | None:
     )
     if code == FRAME_CODES[VelocityFrame.NED]:
         seen = seen @ ENU_FROM_NED.T
-    measured = _measured(reference, parameters)
+    measured = measured_axes(reference.values, screen_columns(reference.covariances).unmeasured, parameters.gnss_axes)
     if code == FRAME_CODES[VelocityFrame.NED]:
         measured = measured[1], measured[0], measured[2]
     made = make_motion(
@@ -119,14 +119,3 @@ def in_order(times: Array, values: Array) -> tuple[Array, Array]:
 def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
     speed = np.sqrt((block.values[:, :3] ** 2).sum(axis=1))
     return block.part((block.refused == 0) & (speed <= parameters.max_speed) & (speed > 0.0))
-
-
-def _measured(reference: SampleBlock, parameters: Parameters) -> tuple[bool, bool, bool]:
-    """Which axes a reference measures, by its claims, by parameter, and by what is zero throughout."""
-    bits = screen_columns(reference.covariances).unmeasured
-    measured = np.array([2 * np.count_nonzero(bits & bit) < len(bits) for bit in (1, 2, 4)])
-    if parameters.gnss_axes != "auto":
-        measured[2] = parameters.gnss_axes == "xyz"
-    measured[2] &= bool(reference.values[:, 2].any())
-    x, y, z = measured.tolist()
-    return x, y, z
