@@ -625,7 +625,7 @@ class Calibrator:
     def _result(self) -> Result:
         return Result(
             selected=self.selected,
-            selected_because=self.selection.reason(self.parameters),
+            selected_because=self.selection.reason(self.parameters, self._estimators[self.selected].evidence),
             estimates={name: self._without_tilt(self.estimate(name)) for name in self._models},
             segments=tuple(self.selection.segments),
             counts=self.counts,

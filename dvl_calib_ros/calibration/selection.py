@@ -170,8 +170,8 @@ class Selection:
             return EXTENDED_BY.get(aided, aided)
         return aided
 
-    def reason(self, parameters: Parameters) -> str:
-        """Why it is that model."""
+    def reason(self, parameters: Parameters, evidence: Evidence | None = None) -> str:
+        """Why it is that model. evidence: as it is now, for a model that extends another; None: as it was noted."""
         if parameters.model not in (AUTO, IAC):
             return "set by parameter model"
         reason = f"{parameters.model}: {self.gnss.reason}"
@@ -182,7 +182,7 @@ class Selection:
             return f"{reason}; {told} a current from the mounting"
         if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
             return reason
-        return f"{reason}; {parameters.gnss_model} {self._evidence.found}"
+        return f"{reason}; {parameters.gnss_model} {(evidence or self._evidence).found}"
 
 
 def published_models(parameters: Parameters) -> tuple[str, str]:
