@@ -623,9 +623,10 @@ class Calibrator:
             return self._result()
 
     def _result(self) -> Result:
+        chosen = self._estimators.get(self.selected)  # None where it is not among the models wanted
         return Result(
             selected=self.selected,
-            selected_because=self.selection.reason(self.parameters, self._estimators[self.selected].evidence),
+            selected_because=self.selection.reason(self.parameters, None if chosen is None else chosen.evidence),
             estimates={name: self._without_tilt(self.estimate(name)) for name in self._models},
             segments=tuple(self.selection.segments),
             counts=self.counts,
