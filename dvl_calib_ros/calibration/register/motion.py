@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -34,17 +35,19 @@ class Motion:
     turns: TurnRates
     epoch_ns: int = 0
 
-    @property
+    @cached_property
     def has_attitude(self) -> bool:
         """Whether there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
 
     def part(self, at: Index, margin_s: float) -> Motion:
-        """Some of the references, one after the other, and of the DVL what is so near to them."""
+        """Some of the references, one after the other, and of the others what is so near to them."""
         times = self.reference_times[at]
         near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
         dvl = DvlColumns(self.dvl.times[near], self.dvl.velocity[near])
-        return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl)
+        first, end = np.searchsorted(self.imu.times, (times[0] - margin_s, times[-1] + margin_s)).tolist()
+        imu = ImuColumns(*(column[first:end] for column in self.imu))
+        return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl, imu=imu)
 
     def in_the_body(self) -> Motion:
         """The same as if the reference were in the body."""
@@ -78,7 +81,8 @@ def motion_of(streams: Streams, parameters: Parameters) -> Motion | None:
         (reference_times, seen),
         code != FRAME_CODES[VelocityFrame.BODY],
         measured,
-        ImuColumns(imu_times, numbers[:, :4], numbers[:, 4:]),
+        # what is taken from columns of wider rows costs a copy of all of them each time
+        ImuColumns(imu_times, *map(np.ascontiguousarray, np.split(numbers, [4], axis=1))),
     )
     return None if made is None else replace(made, epoch_ns=first_ns)
 
