@@ -511,16 +511,21 @@ class Calibrator:
         estimator = self._estimators[name]
         state, covariance = estimator.of_recording()
         worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
-        return GaussianState(state, covariance + worse + self._by_unknown_arm(name, covariance))
+        return GaussianState(state, covariance + worse + self._by_unknown_arm(name, state, covariance))
 
-    def _by_unknown_arm(self, name: str, covariance: Array) -> Array:
-        """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known."""
+    def _by_unknown_arm(self, name: str, state: Array, covariance: Array) -> Array:
+        """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known.
+
+        Its angles are off by what the model that finds the arm has otherwise, and by what that one is off.
+        """
         found = np.zeros_like(covariance)
         estimator = self._estimators.get(EXTENDED_BY.get(name, ""))
         if estimator is None or not estimator.claims or any(self.parameters.lever_arm):
             return found
-        own, open_arm = np.diag(covariance)[:3], np.diag(estimator.of_recording().p)[:3]
-        np.fill_diagonal(found[:3, :3], np.where(open_arm > OPEN_FROM * own, open_arm - own, 0.0))
+        other = estimator.of_recording()
+        own, open_arm = np.diag(covariance)[:3], np.diag(other.p)[:3]
+        away = (state - other.x[: len(state)])[:3] ** 2
+        np.fill_diagonal(found[:3, :3], np.where(open_arm > OPEN_FROM * own, open_arm - own + away, 0.0))
         return found
 
     def states_at(
