@@ -65,12 +65,10 @@ class FoundClocks:
         for name, late in r.offsets.items():
             if name in self.offsets:
                 done = f"taken off ({name} {late:.2f})"
-            elif abs(late) < LEFT_TO_CALIBRATION_S:
+            elif name == "dvl_time_offset" and abs(late) < LEFT_TO_CALIBRATION_S:
                 done = "left to the calibration, which finds it"
             else:
                 done = "not taken off"
-                if not r.are_known:
-                    done += ", for the other clocks may be off as well: drive turns at two speeds"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
             yield f"{r.told(name)}{which}: {done}"
         if r.apart.is_shown and not r.offsets:
@@ -127,9 +125,7 @@ def _found(
     if best is None or best[0].left >= REGISTERED:
         return None
     registration, hypothesis = best
-    # a whole recording that does not show how all clocks stand is no reason to move one
-    is_kept = bool(given.intersection(OFFSETS)) or not registration.are_known
-    offsets = {} if is_kept else registration.taken_off
+    offsets = {} if given.intersection(OFFSETS) else registration.taken_off
     if registration.unsteady is not None and not given & MOVING:
         offsets |= registration.unsteady.taken_off(epoch_ns)
     return FoundClocks(registration, offsets, hypothesis)

@@ -133,6 +133,16 @@ def test_positions_that_claim_metres_and_show_centimetres_are_no_filter_of_the_d
     assert run.verdict != "reject", run.reasons
 
 
+@pytest.mark.slow
+def test_a_late_reference_that_only_the_usual_tells_from_a_late_dvl_is_calibrated_with(tmp_path):
+    """Survey 32036: 1.3 s late was found, left alone, and then the reason to reject."""
+    truth = write_survey(draw(32036), tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    late = run.discovery.parameters.reference_time_offset
+    assert late == pytest.approx(truth["drawn"]["reference_late"], abs=0.15) and run.verdict != "reject", run.reasons
+    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+
+
 def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_path):
     """Survey 23032: 73 degrees of roll were found where there are none, and the pitch came out 2.6 degrees off."""
     write_survey(draw(23032), tmp_path / "bag")
