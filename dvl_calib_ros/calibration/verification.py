@@ -48,7 +48,8 @@ class HeldOutError:
 
     uncorrected: with the nominal mounting. corrected: with the estimate. predicted: what R of the reference and the
     covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference. calibration: the
-    part of predicted that is the estimate's.
+    part of predicted that is the estimate's. interpolated: so much more of a white reference's noise may be in corrected
+    than in uncorrected: between its samples it is quieter than at them, and a delay changes where it is asked.
     """
 
     samples: int
@@ -56,6 +57,7 @@ class HeldOutError:
     corrected: float
     predicted: float
     calibration: float
+    interpolated: float = 0.0
 
 
 def held_out_error(
@@ -254,7 +256,7 @@ def _error_finding(
     if is_large and typical_error is not None and typical_error < SEVERAL * predicted:
         # nor do they say which is the worse
         return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
-    if worse > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
+    if worse - held_out.interpolated**2 > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
         return finding("HELD_OUT_WORSE", **said)
     if is_large:
         return finding("HELD_OUT_SEVERAL_TIMES", **said)

@@ -143,6 +143,15 @@ def test_a_late_reference_that_only_the_usual_tells_from_a_late_dvl_is_calibrate
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
 
 
+@pytest.mark.slow
+def test_a_delay_that_moves_from_between_the_samples_of_a_noisy_reference_to_them_makes_nothing_worse(tmp_path):
+    """Survey 32087: an interpolated reference is quieter between its samples, so 0.130 became 0.164 m/s: rejected."""
+    truth = write_survey(draw(32087), tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    assert run.verdict != "reject", run.reasons
+    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+
+
 def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_path):
     """Survey 23032: 73 degrees of roll were found where there are none, and the pitch came out 2.6 degrees off."""
     write_survey(draw(23032), tmp_path / "bag")

@@ -62,7 +62,7 @@ def held_out_error(
     """
     folds = folds_of(stamps_ns, p)
     nominal = np.zeros(len(bank.prior.x))
-    sums = np.zeros(4)
+    sums = np.zeros(5)
     samples = 0
     try:
         without_folds = bank.without_folds()
@@ -78,18 +78,21 @@ def held_out_error(
             calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
             noise = after.noise[both].sum()
             squares = [(each.error[both] ** 2).sum() for each in (before, after)]
-            sums += [*squares, noise + calibration, calibration]
+            interpolated = (after.interpolated - before.interpolated)[both].sum()
+            sums += [*squares, noise + calibration, calibration, interpolated]
             samples += int(np.count_nonzero(both))
     return held_out_from_sums(samples, sums)
 
 
 class _Errors(NamedTuple):
     """Of N DVL samples: reference less what the DVL says it is (N, 3) m/s, nan where there is none; its derivative by
-    the state (N, 3, n); and the variance that noise gives it (N,), summed over the axes."""
+    the state (N, 3, n); the variance that noise gives it (N,), summed over the axes; and what interpolating leaves of
+    the reference's if that is white (N,)."""
 
     error: Array
     jacobian: Array
     noise: Array
+    interpolated: Array
 
 
 class Terms(NamedTuple):
@@ -114,7 +117,8 @@ class Compared(NamedTuple):
     error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
     does not measure. measured (N, 3, 3): onto what it does measure, body. body (N, 3): the reference velocity.
     rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. variance (N,): of the reference, over the
-    axes that it measures; claimed (N,): its message says so, and the DVL's is to be added. acceleration (N, 3): of the
+    axes that it measures; interpolated (N,): what is left of that between two samples if their noise is white;
+    claimed (N,): its message says so, and the DVL's is to be added. acceleration (N, 3): of the
     reference, body. rates (N, 3): rad/s.
     """
 
@@ -124,6 +128,7 @@ class Compared(NamedTuple):
     rotation_enu_from_body: Array
     oriented: Mask
     variance: Array
+    interpolated: Array
     claimed: Mask
     acceleration: Array
     rates: Array
@@ -158,7 +163,8 @@ class Recording(NamedTuple):
         jacobian[:, :, LEVER_ARM] = skew(seen.rates)
         jacobian[:, :, DELAY] = -seen.acceleration
         share = np.where(seen.claimed, np.trace(seen.measured, axis1=1, axis2=2) / 3.0, 0.0)
-        return _Errors(seen.error, seen.measured @ jacobian, seen.variance + self.noise_dvl[at] * share)
+        noise = seen.variance + self.noise_dvl[at] * share
+        return _Errors(seen.error, seen.measured @ jacobian, noise, seen.interpolated)
 
     def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
         """Some DVL samples beside the reference, corrected, interpolated as pairing does."""
@@ -189,8 +195,9 @@ class Recording(NamedTuple):
         error[~found] = np.nan
         acceleration = np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
         total = (variance[after] * axes).sum(axis=1)
+        blended = (((1.0 - part) ** 2 * variance[after - 1] + part**2 * variance[after]) * axes).sum(axis=1)
         claimed = self.reference.claimed[after]
-        return Compared(error, measured, body, rotation, oriented, total, claimed, acceleration, rates)
+        return Compared(error, measured, body, rotation, oriented, total, blended, claimed, acceleration, rates)
 
 
 def thinned(stamps_ns: Stamps) -> Index:

@@ -154,6 +154,17 @@ def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_t
             Severity.REJECT,
             "HELD_OUT_WORSE",
         ),
+        # between its samples a noisy reference is quieter than at them, so a delay alone may make it noisier
+        (
+            {"held_out": HeldOutError(1000, 0.10, 0.12, 0.2, 0.002, interpolated=0.07)},
+            Severity.MARGINAL,
+            "HELD_OUT_NO_BETTER",
+        ),
+        (
+            {"held_out": HeldOutError(1000, 0.10, 0.12, 0.2, 0.002, interpolated=0.06)},
+            Severity.REJECT,
+            "HELD_OUT_WORSE",
+        ),
         ({"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002)}, Severity.MARGINAL, "HELD_OUT_NOISIER"),
         (
             {"held_out": HeldOutError(1000, 0.10, 0.06, 0.05, 0.002), "max_error_ratio": 1.3},
