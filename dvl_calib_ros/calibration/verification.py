@@ -48,7 +48,7 @@ class HeldOutError:
 
     uncorrected: with the nominal mounting. corrected: with the estimate. predicted: what R of the reference and the
     covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference. calibration: the
-    part of predicted that is the estimate's. interpolated: so much more of a white reference's noise may be in corrected
+    part of predicted that is the estimate's. interpolated: so much more of a white reference's noise corrected may hold
     than in uncorrected: between its samples it is quieter than at them, and a delay changes where it is asked.
     """
 
