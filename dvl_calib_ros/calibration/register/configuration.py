@@ -45,6 +45,8 @@ FAR_WORSE = 1.5 * AS_WELL
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
 LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
+# A clock that was held in time is so to this, s.
+HELD_TO_S = 1e-3
 # Whatever else is tried than what is configured is tried without another lever arm.
 WITHOUT_ARM: Sequence[Array] = (REFERENCE, *np.eye(N)[ARM])
 _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
@@ -73,7 +75,7 @@ def fitting_configuration(
     as_given = _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given is not None else 1.0
     if as_given < WRONG_FROM:
         assert given is not None
-        return _flipped(motion, curves, nominal, lever_arm, given.spread)
+        return _flipped(motion, curves, nominal, lever_arm, given)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -123,12 +125,12 @@ def _as_if(motion: Motion, declared: VelocityFrame, frame: VelocityFrame) -> Mot
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, spread: float) -> str:
+def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration) -> str:
     """Whether y and z turned round explain more without a lever arm than the axes given do with any.
 
     A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
-    its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm. spread: what
-    the axes given leave with whichever clocks, m/s: where a clock is off, neither fits with clocks in time.
+    its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm. registered: the axes
+    given with whichever clocks; where a clock is off, neither fits with clocks in time.
     """
     fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
 
@@ -136,10 +138,13 @@ def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, s
         near = nearest(quick, rotation, held)
         return None if near is None or near.level > most else fit(0.0, near.dvl_late, rotation, held)
 
-    turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM, FAR_WORSE * spread)
-    if turned is None or turned.level > AS_WELL * spread:
+    turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM, FAR_WORSE * registered.spread)
+    if turned is None or turned.level > AS_WELL * registered.spread:
         return ""
-    given = fitted(nominal, (REFERENCE,))
+    if abs(registered.reference.late) < HELD_TO_S and abs(registered.dvl.late) < LATE_S[-1]:  # found already
+        given = fit(0.0, registered.dvl.late, nominal, (REFERENCE,))
+    else:
+        given = fitted(nominal, (REFERENCE,))
     if given is None:
         return ""
     # of the same samples but for those at the ends; outliers, and a level that is told by the middle one, judge nothing
