@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from .style import Picture
 
 
+# Class of a cell that holds a verdict
+CELL_KINDS = {Severity.ACCEPT: "good", Severity.MARGINAL: "off", Severity.REJECT: "bad"}
+
+
 class Where(Enum):
     """Which of the two shows a section."""
 

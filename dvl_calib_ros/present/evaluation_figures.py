@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
+from .evaluation import CLAIMED
 from .exploring import mark_time
 from .series import running_mean
 from .style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
@@ -15,7 +16,6 @@ from .style import plain_log_ticks as log_ticks
 
 # Seconds beyond the longest window at which "all" of a run stands
 ALL_STANDS_S = 40.0
-CLAIMED = ((0.68, (0.60, 0.76)), (0.95, (0.91, 0.98)))
 
 
 def improvement_bars(models: Sequence[str], improvement: Array, published: Array) -> Figure:

@@ -22,9 +22,6 @@ from ..disk.atomic import save_text
 from .document import Document, Section, Warned, Where
 from .style import MODEL_STYLES
 
-# Class of a cell that holds a verdict
-VERDICT_KINDS = {"accept": "good", "marginal": "off", "reject": "bad"}
-
 
 @cache
 def _environment() -> jinja2.Environment:

@@ -29,6 +29,7 @@ from ..replay.replay import Replayed
 from ..verdict.kinds import Severity
 from ..verdict.reasons import full
 from .document import (
+    CELL_KINDS,
     Answer,
     Cell,
     Commands,
@@ -301,9 +302,8 @@ def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
 
         return [held_out_picture(judged)]
 
-    kinds = {Severity.ACCEPT: "good", Severity.MARGINAL: "off", Severity.REJECT: "bad"}
     rows: list[tuple[str | Cell, ...]] = [
-        (name, *_held_out_cells(judged.get(name)), Cell(each.verdict.value, kinds[each.verdict]))
+        (name, *_held_out_cells(judged.get(name)), Cell(each.verdict.value, CELL_KINDS[each.verdict]))
         for name, each in verifications.items()
     ]
     head = ("model", "uncorrected", "corrected", "predicted", "samples", "verdict")

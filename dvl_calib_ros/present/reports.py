@@ -22,7 +22,7 @@ from .comparison_figures import trend_png
 from .cross_check import cross_check
 from .diagnosis import diagnosis
 from .document import Document
-from .evaluation_report import write_evaluation_report
+from .evaluation import evaluation
 from .examination import examination
 from .page import write_document
 from .replay import replayed
@@ -35,12 +35,9 @@ _DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
     Comparison: comparison,
     CrossCheck: cross_check,
     Diagnosis: diagnosis,
+    Evaluation: evaluation,
     Examination: examination,
     UnpairedComparison: unpaired,
-}
-# Pages that are still laid out by themselves.
-_PAGES: Mapping[type, Callable[[Path, Any], None]] = {
-    Evaluation: write_evaluation_report,
 }
 
 
@@ -51,8 +48,6 @@ def write_report(path: Path, result: Any) -> None:
     """
     if isinstance(result, Comparison) and path.suffix.lower() == ".png":
         save_bytes(path, trend_png(result))
-    elif type(result) in _PAGES:
-        _PAGES[type(result)](path, result)
     else:
         write_document(path, _DOCUMENTS[type(result)](result))
 

@@ -377,8 +377,8 @@ def test_the_command_writes_json_and_csv_and_says_what_it_ran_on(folder, tmp_pat
         "mounting_rpy:=[0.0,0.0,1.0]",
     ]
     assert main(["evaluate", str(folder), *options, "--json", str(target[0]), "--csv", str(target[1])]) == 0
-    output = capsys.readouterr().out
-    assert f"folder {folder}" in output and "mounting_rpy is not used by the procedure" in output
+    output = capsys.readouterr()
+    assert f"folder {folder}" in output.out and "mounting_rpy is not used by the procedure" in output.err
     document = json.loads(target[0].read_text())
     assert set(document["avg_vrmse"]) == {"E1", "E3"}
     assert set(document["avg_vrmse"]["E1"]) == set(document["mean"]) == {UNCALIBRATED, "M3", "M7"}
@@ -392,8 +392,8 @@ def test_the_command_writes_json_and_csv_and_says_what_it_ran_on(folder, tmp_pat
 
 def test_without_a_folder_the_command_says_that_the_trajectories_are_its_own(capsys):
     assert main(["evaluate", "--models", "M7", "--sets", "E1"]) == 0
-    output = capsys.readouterr().out
-    assert output.startswith("own generator") and "no ratio" in output
+    output = capsys.readouterr()
+    assert output.out.startswith("own generator") and "no ratio" in output.err
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,7 @@ def test_the_command_counts_what_raised_says_which_and_why_and_goes_on(monkeypat
     ]
     assert main([*COMMAND, *outputs]) == 0
     why = "G1, T15, seed 0, combination 7: LinAlgError: Singular matrix"
-    assert f"1 failed and is in none of the figures: {why}" in " ".join(capsys.readouterr().out.split())
+    assert f"1 failed and is in none of the figures: {why}" in " ".join(capsys.readouterr().err.split())
     assert "combination 7: LinAlgError" in (tmp_path / "e.html").read_text()
     whole, found = (json.loads((tmp_path / name).read_text()) for name in ("whole.json", "e.json"))
     assert whole["failures"] == []
