@@ -566,7 +566,9 @@ class Calibrator:
         self._update(judge)
         estimator = self._estimators[name]
         held_out = estimator.held_out_error(judge.moments, self.parameters.rotation_dvl_from_body)
-        is_large = held_out is not None and held_out.corrected > SEVERAL * held_out.predicted
+        is_suspect = held_out is not None and held_out.corrected > min(
+            SEVERAL * held_out.predicted, held_out.uncorrected
+        )
         return verify(
             model,
             state,
@@ -578,7 +580,7 @@ class Calibrator:
             any(each.reference_claims for each in self._further),
             next((each.doubt for each in self._further if each.doubt), "") if model.aided else "",
             bool(model.estimator) and estimator.claims,
-            self._typical_error(model, state) if is_large else None,
+            self._typical_error(model, state) if is_suspect else None,
             calibration_error(model, self.of_recording(name).p, judge.moments, self.parameters.rotation_dvl_from_body),
         )
 

@@ -38,6 +38,8 @@ IMPLAUSIBLE = 0.2
 MOST_GATED = 0.5
 # An error of so many σ is one, however little the data show of it.
 SURELY = 3.0
+# Without outliers an error is as predicted up to so many times; one of so many times that without is made by them.
+AS_PREDICTED, MADE_BY_OUTLIERS = 1.25, 1.5
 # Share of runs whose held-out error may by chance exceed what a true covariance predicts.
 CHANCE = 0.01
 
@@ -253,10 +255,13 @@ def _error_finding(
     # that is more than the filter says, and being worse is no contradiction
     worse = corrected**2 - uncorrected**2
     is_large = corrected > SEVERAL * predicted
-    if is_large and typical_error is not None and typical_error < SEVERAL * predicted:
+    is_worse = worse - held_out.interpolated**2 > WORSE_FROM * max(held_out.calibration, own_error) ** 2
+    if typical_error is not None and (is_large or is_worse):
         # nor do they say which is the worse
-        return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
-    if worse - held_out.interpolated**2 > WORSE_FROM * max(held_out.calibration, own_error) ** 2:
+        as_usual = typical_error < (SEVERAL if is_large else AS_PREDICTED) * predicted
+        if as_usual and corrected > MADE_BY_OUTLIERS * typical_error:
+            return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
+    if is_worse:
         return finding("HELD_OUT_WORSE", **said)
     if is_large:
         return finding("HELD_OUT_SEVERAL_TIMES", **said)

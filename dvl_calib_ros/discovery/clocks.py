@@ -6,6 +6,7 @@ are registered with the frames found; where these leave much, with the others th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
@@ -14,6 +15,7 @@ import numpy as np
 
 from ..calibration.parameters import Parameters
 from ..calibration.register.far import Far, far_clocks
+from ..calibration.register.fine import white_noise
 from ..calibration.register.motion import Motion, motion_of
 from ..calibration.register.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
 from ..calibration.samples import SampleBlock, Stream, Streams
@@ -105,7 +107,7 @@ def _found(
     recording: Recording, topics: Topics, parameters: Parameters, knows_mounting: bool, given: frozenset[str]
 ) -> FoundClocks | None:
     best: tuple[Registration, Parameters] | None = None
-    epoch_ns = 0
+    epoch_ns, left = 0, math.inf
     for hypothesis in _hypotheses(parameters, given):
         motion = _motion(recording, topics, hypothesis)
         if motion is None:
@@ -118,17 +120,23 @@ def _found(
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
         if found is not None and (best is None or found.left < CLEARLY * best[0].left):
-            best, epoch_ns = (found, hypothesis), motion.epoch_ns
-        if is_first and found is not None and found.left < REGISTERED:
+            best, epoch_ns, left = (found, hypothesis), motion.epoch_ns, _beside_noise(found, motion)
+        if is_first and found is not None and _beside_noise(found, motion) < REGISTERED:
             recording.register_as(found, topics, parameters)
             break
-    if best is None or best[0].left >= REGISTERED:
+    if best is None or left >= REGISTERED:
         return None
     registration, hypothesis = best
     offsets = {} if given.intersection(OFFSETS) else registration.taken_off
     if registration.unsteady is not None and not given & MOVING:
         offsets |= registration.unsteady.taken_off(epoch_ns)
     return FoundClocks(registration, offsets, hypothesis)
+
+
+def _beside_noise(found: Registration, motion: Motion) -> float:
+    """What a registration leaves beside the reference's own noise, as a share of the speed."""
+    noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
+    return math.sqrt(max(found.left**2 - noise, 0.0))
 
 
 def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:

@@ -202,3 +202,12 @@ def test_a_mounting_that_was_found_and_is_off_is_found_better_and_not_called_mis
     assert nominal == pytest.approx(truth[2], abs=1.0) and f"mounting 0° 0° {nominal:g}°" in " ".join(
         run.discovery.notes
     )
+
+
+@pytest.mark.slow
+def test_clocks_are_taken_off_where_it_is_noise_that_leaves_much_of_a_low_speed(tmp_path):
+    """Survey 31216: at 0.5 m/s noise of 0.1 m/s leaves a third of it, and a reference late by 0.8 s was rejected."""
+    write_survey(draw(31216), tmp_path / "bag")
+    found = discover([tmp_path / "bag"], Parameters())
+    assert found.clocks is not None and found.clocks.registration.offsets
+    assert dc.replay(tmp_path / "bag", history=False).verdict != "reject"

@@ -129,7 +129,7 @@ class Fit:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self.times, self._velocity = m.reference_times[moving], m.reference[moving]
         # of the DVL, (m/s)²: where hardly anything changes, what seems to is its noise
-        self._noise = float(_noise(m.dvl.velocity))
+        self._noise = float(white_noise(m.dvl.velocity))
 
     def __call__(
         self,
@@ -285,7 +285,7 @@ def _robust(squares: Array, axes: int, level: float) -> Array:
     return np.asarray(scale * np.log1p(squares / (scale * level**2)))
 
 
-def _noise(velocity: Array) -> float:
+def white_noise(velocity: Array) -> float:
     """Variance (m/s)² of white noise on a stream (N, 3), by its second differences."""
     if len(velocity) < 3:
         return 0.0

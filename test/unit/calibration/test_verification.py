@@ -219,6 +219,17 @@ def test_a_large_held_out_error_that_outliers_alone_make_does_not_reject(typical
     assert said.verdict is word and said.reasons[0].code == code
 
 
+@pytest.mark.parametrize(
+    ("typical", "code"), [(0.185, "HELD_OUT_OUTLIERS"), (0.30, "HELD_OUT_WORSE"), (None, "HELD_OUT_WORSE")]
+)
+def test_outliers_that_make_an_error_larger_do_not_say_that_a_calibration_makes_it_worse_by_a_hair(typical, code):
+    """Survey 31206: 0.334 m/s without it, 0.335 with it, 0.174 predicted; a few samples of metres per second."""
+    hair = HeldOutError(2376, 0.3340, 0.3354, 0.174, 0.004)
+    state = GaussianState(np.array([0.0, 0.02, 0.0, 0.0]), 1e-6 * np.eye(4))
+    said = verify(MODELS["M3"], state, Convergence.FINE, hair, Parameters(), typical_error=typical)
+    assert said.reasons[0].code == code
+
+
 def test_what_outliers_typically_are_is_no_part_of_the_typical_error(rng):
     samples = make_samples(MatchedRun("box", 120.0, phi=(0.0, 0.03, 0.02), gnss_std=0.03, dvl_std=0.01))
     jumps = rng.normal(0.0, 1.0, (1000, 3)) * (rng.random((1000, 1)) < 0.1)  # of four seconds each
