@@ -481,7 +481,10 @@ def _form(storage: str, compression: str) -> tuple[Storage, Compression]:
 
 
 def _paths(bags: Bags) -> list[Path]:
-    return [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
+    found = [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
+    if not found:
+        raise InputError("no bag is named; name one at least")
+    return found
 
 
 def _parameters(params: StrPath | None, given: Mapping[str, Any]) -> tuple[Parameters, frozenset[str]]:

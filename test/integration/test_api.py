@@ -103,6 +103,9 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
         dc.evaluate(models=["M9"])
     with pytest.raises(dc.ParameterError, match="did you mean"):
         dc.replay(bag, min_spede=1.0)
+    for nothing in (lambda: dc.replay([]), lambda: dc.salvage([], tmp_path / "none"), lambda: dc.doctor([])):
+        with pytest.raises(dc.InputError, match="name one at least"):
+            nothing()
 
 
 def test_bags_are_compared_as_result_files_are(calibration, bag, tmp_path):
