@@ -26,7 +26,9 @@ from ..errors import InputError
 from ..examination.examine import Examination
 from ..recordings.recording import Recording, open_recording
 from ..simulation.scenario import Scenario
+from ..verdict.answering import Answering
 from .calibrated import Calibration, Mounting
+from .printed import printed
 
 if TYPE_CHECKING:
     from ..bags.recover import Recovered
@@ -58,6 +60,7 @@ __all__ = [
     "salvage",
     "simulate",
 ]
+Answering.laid_out = printed
 StrPath = str | os.PathLike[str]
 Bags = StrPath | Sequence[StrPath]
 

@@ -102,6 +102,12 @@ class Calibration:
     def __repr__(self) -> str:
         return f"{self.verdict} ({self.model}): {self.mounting}"
 
+    def _repr_html_(self) -> str:
+        from ..present.replay import replayed
+        from .printed import text_of
+
+        return text_of(replayed(self.replayed, self.bags, ()), as_html=True)
+
     @property
     def model(self) -> str:
         """Name of the model that was selected."""

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from .chi_square import chi2_sf
 from .extrinsics import (
@@ -130,8 +131,8 @@ ANSWERS = {
 }
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Answering):
     """Several calibrations of one DVL.
 
     calibrations: in order of time. pairs: every two. against_rest: each against all others taken together; empty for

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from ..verdict.answering import Answering
 from .closure import Gap
 from .dvl import DvlSeen
 from .noise_findings import NoiseFinding
@@ -41,8 +42,8 @@ class FoundEffect:
     by_recording: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Answering):
     """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any.
     calibration: value, low, high of φ (rad) and δk, three of each, beside the effects. compared_axes: in words.
     recordings: names and first stamps (ns). twins: of the recordings. dvl: as another simulator has to be told of it.

@@ -29,12 +29,13 @@ from ..recordings.same import hold_the_same
 from ..recordings.topics import Topics
 from ..replay.navigation import Navigation, dead_reckoned, navigation_document
 from ..replay.replay import replay
+from ..verdict.answering import Answering
 from .metrics import RunMoments, vrmse
 from .results import Failure
 
 
-@dataclass(frozen=True)
-class CrossCheck:
+@dataclass(frozen=True, repr=False)
+class CrossCheck(Answering):
     """Difference (vector RMSE, m/s) of the DVL to GNSS, whose noise is part of it, on bags that were not calibrated on.
 
     bags: (L,). models: (M,). n_paired: (L,) samples that had a reference. uncorrected: (L,) verified on. corrected:

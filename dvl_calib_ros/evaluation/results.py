@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.frames import Array
+from ..verdict.answering import Answering
 
 UNCALIBRATED = "uncalibrated"
 
@@ -200,8 +201,8 @@ class Curve:
         return f"{self.name}, no reference" if self.gnss_std is None else f"{self.name}, {self.gnss_std:g} m/s"
 
 
-@dataclass(frozen=True)
-class Evaluation:
+@dataclass(frozen=True, repr=False)
+class Evaluation(Answering):
     """The published procedure and the studies around it.
 
     source: folder or generator, in words. own_generator: True if the trajectories are not recorded ones, so that the

@@ -21,6 +21,7 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look
 from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording, open_recording
+from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from . import checks
@@ -64,8 +65,8 @@ class Shown:
     needs: str
 
 
-@dataclass(frozen=True)
-class Examination:
+@dataclass(frozen=True, repr=False)
+class Examination(Answering):
     """What the doctor says of a recording."""
 
     paths: tuple[Path, ...]

@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Any
 
 from ..diagnosis.results import Diagnosis, diagnosis_document
+from ..verdict.answering import Answering
 
 Triple = tuple[float, float, float]
 """A value and its 95 per cent interval."""
@@ -111,8 +112,8 @@ class Rung:
     p: float
 
 
-@dataclass(frozen=True)
-class UnpairedComparison:
+@dataclass(frozen=True, repr=False)
+class UnpairedComparison(Answering):
     """The whole answer. effects and noise: claims first, the strongest first. levels: per regime, m/s rms over the
     axes: vehicle and simulator. floor_mps: noise that no simulator can take off, of `rungs`. not_shown: for each side
     the effects that its motions could not have shown at sizes that matter, with the smallest size that they would.

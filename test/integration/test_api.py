@@ -116,6 +116,16 @@ def test_bags_are_compared_as_result_files_are(calibration, bag, tmp_path):
     assert found.word in ("same", "suspicious", "moved")
 
 
+def test_results_print_as_their_answer_and_in_a_notebook_with_tables(bag, calibration, tmp_path):
+    examined = dc.doctor(bag)
+    assert str(examined).startswith(f"{examined.verdict}: ") and "yaw" in str(examined)
+    later = dc.simulate(tmp_path / "later", seconds=90.0, seed=7)
+    compared = dc.compare(bag, later)
+    assert str(compared).startswith(f"{compared.word}: ") and len(str(compared)) < 5000
+    for each in (examined, compared, calibration):
+        assert each._repr_html_().startswith("<pre") and "yaw" in each._repr_html_()
+
+
 def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
     made = dc.simulate(tmp_path / "ahead", seconds=240.0, effects={"lever_arm": {"x_m": 0.5}})
     assert dc.replay(made, model="G2", history=False).mounting.xyz_m[0] == pytest.approx(0.5, abs=0.1)

@@ -1,0 +1,30 @@
+"""Results as text and as HTML of a notebook: what the commands print of them."""
+
+from __future__ import annotations
+
+import io
+
+from ..present.document import Document
+from ..present.terminal import shown
+
+# Columns of what is printed, as of the commands into a pipe
+WIDTH = 160
+
+
+def printed(result: object, as_html: bool) -> str:
+    """The answer of a result, with its tables."""
+    from ..present.documents import document_of
+
+    return text_of(document_of(result), as_html)
+
+
+def text_of(document: Document, as_html: bool) -> str:
+    """A document as it would be on a terminal, as text or as HTML."""
+    from rich.console import Console
+
+    console = Console(file=io.StringIO(), record=True, width=WIDTH, highlight=False, emoji=False)
+    for each in shown(document):
+        console.print(each)
+    if as_html:
+        return console.export_html(inline_styles=True, code_format='<pre style="line-height: 1.3">{code}</pre>')
+    return "\n".join(line.rstrip() for line in console.export_text().splitlines())

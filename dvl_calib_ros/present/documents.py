@@ -1,0 +1,34 @@
+"""What a result says, by its type."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ..calibration.comparison import Comparison
+from ..diagnosis.results import Diagnosis
+from ..evaluation.bags import CrossCheck
+from ..evaluation.results import Evaluation
+from ..examination.examine import Examination
+from ..unpaired.results import UnpairedComparison
+from .comparison import comparison
+from .cross_check import cross_check
+from .diagnosis import diagnosis
+from .document import Document
+from .evaluation import evaluation
+from .examination import examination
+from .unpaired import unpaired
+
+_DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
+    Comparison: comparison,
+    CrossCheck: cross_check,
+    Diagnosis: diagnosis,
+    Evaluation: evaluation,
+    Examination: examination,
+    UnpairedComparison: unpaired,
+}
+
+
+def document_of(result: Any) -> Document:
+    """What a result of any of these types says."""
+    return _DOCUMENTS[type(result)](result)
