@@ -133,7 +133,7 @@ def compare(
     Returns
     -------
     Comparison
-        ``word``: same, suspicious or moved, and all that is behind it; `calibration.comparison` has its `sentences`.
+        ``word``: same, suspicious or moved, and all that is behind it; `calibration.comparison_words` has its `reasons`.
 
     Raises
     ------

@@ -1,11 +1,11 @@
-"""Tables of the terminal, and numbers in them, as every command shows them."""
+"""Tables of the terminal that are of no result."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
     from rich.table import Table
 
@@ -20,19 +20,3 @@ def titled(title: str, words: Iterable[str], numbers: Iterable[str] = (), captio
     for name in numbers:
         table.add_column(name, justify="right", no_wrap=True)
     return table
-
-
-def cell(value: float, digits: int = 4) -> str:
-    """A number; - where there is none."""
-    return f"{value:.{digits}f}" if value == value else "-"
-
-
-def interval(each: tuple[float, float, float]) -> str:
-    """A value and its interval."""
-    value, low, high = each
-    return f"{value:.3g} ({low:.3g} .. {high:.3g})"
-
-
-def intervals(parameters: Mapping[str, tuple[float, float, float]]) -> str:
-    """Values and their intervals, by name; - where there are none."""
-    return ", ".join(f"{name} {interval(each)}" for name, each in parameters.items()) or "-"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,7 @@ from ..calibration.comparison import MOUNTING, Comparison, Difference
 from ..calibration.comparison_words import date, reasons, remarks
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.frames import Array, rpy_from_rotation
-from .document import Answer, Document, Figures, Section, Sentence, Table, Where, with_std
-
-if TYPE_CHECKING:
-    from .style import Picture
+from .document import Answer, Document, Section, Sentence, Table, Where, figures, with_std
 
 # Of more pairs than these a terminal shows the neighbours in time.
 MOST_PAIRS = 10
@@ -66,7 +63,7 @@ def comparison(result: Comparison) -> Document:
                 "Over time",
                 [
                     Sentence("With ±1σ; a dashed line where it is said to have changed.", soft=True),
-                    Figures(lambda: _pictures(result)),
+                    figures("comparison_figures.trend", result),
                 ],
                 Where.PAGE,
             ),
@@ -87,12 +84,6 @@ def comparison(result: Comparison) -> Document:
             ),
         ],
     )
-
-
-def _pictures(result: Comparison) -> list[Picture]:
-    from .comparison_figures import trend
-
-    return trend(result)
 
 
 def shown_quantities(result: Comparison) -> list[Quantity]:

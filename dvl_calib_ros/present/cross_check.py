@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..evaluation.bags import CrossCheck
 from ..replay.navigation import Drift, Navigation
-from .document import Document, Figures, Section, Sentence, Table, Where, number, parameter_texts
-
-if TYPE_CHECKING:
-    from .style import Picture
+from .document import Document, Item, Section, Sentence, Table, Where, figures, number, parameter_texts
 
 
 def cross_check(check: CrossCheck) -> Document:
@@ -27,7 +23,7 @@ def cross_check(check: CrossCheck) -> Document:
                 Where.PAGE,
             ),
             Section("Dead reckoning on bags that were not calibrated on", [_drift(check)] if check.navigation else []),
-            Section("", [Figures(lambda: [each for bag in check.bags for each in _pictures(check, bag)])], Where.PAGE),
+            Section("", [each for bag in check.bags for each in _pictures(check, bag)], Where.PAGE),
             Section("Difference of DVL and GNSS on bags that were not calibrated on", [_errors(check)]),
         ],
         parameters=parameter_texts(check.parameters),
@@ -85,11 +81,9 @@ def _before(check: CrossCheck, bag: str) -> str:
     return "–" if found is None else _drifts(found.before)
 
 
-def _pictures(check: CrossCheck, bag: str) -> list[Picture]:
-    from .navigation_figures import navigation_pictures
-
+def _pictures(check: CrossCheck, bag: str) -> list[Item]:
     found = _of(check, bag)
     if not found:
         return []
     named = {f"by {_name(calibrated)}": each for calibrated, each in found.items()}
-    return list(navigation_pictures(next(iter(found.values())), named, f", {_name(bag)}"))
+    return [figures("navigation_figures.navigation_pictures", next(iter(found.values())), named, f", {_name(bag)}")]

@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +19,6 @@ from .document import (
     Cell,
     Document,
     Facts,
-    Figures,
     Item,
     Number,
     Numbers,
@@ -30,15 +27,14 @@ from .document import (
     Table,
     Warned,
     Where,
+    figures,
     intervals,
     p_value,
     share,
     signed,
     three,
 )
-
-if TYPE_CHECKING:
-    from .style import Picture
+from .twin_table import twin_table
 
 BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
 SEVERITIES = {
@@ -66,6 +62,10 @@ def diagnosis(d: Diagnosis) -> Document:
     untestable = [_untestable_table(d)] if d.untestable else []
     detectable = [_detectable_table(d)] if d.minimum_detectable else []
     following = Sentence(f"Next: {d.next_manoeuvre}.")
+    series = d.series
+    followed = (
+        [figures("twin_section.followed_picture", series.followed, _axes(series))] if series and series.followed else []
+    )
     has_closure = bool(d.effects) and math.isfinite(d.gap.closure)
     return Document(
         title="Sim-to-real gap of the DVL",
@@ -74,16 +74,19 @@ def diagnosis(d: Diagnosis) -> Document:
         warnings=d.notes,
         sections=[
             Section("", [Numbers(_numbers(d))] if math.isfinite(d.gap.before) else []),
-            Section("", [Facts(_facts(d.series))] if d.series is not None else [], Where.PAGE),
+            Section("", [Facts(_facts(series))] if series else [], Where.PAGE),
             Section("", [Warned()], Where.PAGE),
             Section("Where the gap lies", [_where_table(d)] if d.where else []),
-            Section("" if d.where else "Regimes of motion", _drawn(d, _regimes), Where.PAGE),
+            Section(
+                "" if d.where else "Regimes of motion",
+                [figures("diagnosis_pictures.regime_picture", series, bool(d.effects))] if series else [],
+                Where.PAGE,
+            ),
             Section("Which effects make it", [_effect_table(d)] if d.effects else []),
             Section("", [_by_recording(d)] if any(e.by_recording for e in d.effects) else []),
-            Section("", [Figures(lambda: _closures(d))] if has_closure else [], Where.PAGE),
-            *_traces(d),
-            *_twins(d),
-            Section("What is left", [Sentence(_left(d)), *_drawn(d, _followed)], Where.PAGE),
+            Section("", [figures("diagnosis_pictures.closure_picture", d)] if has_closure else [], Where.PAGE),
+            *(_traces(d, series) + _twins(d, series) if series else []),
+            Section("What is left", [Sentence(_left(d)), *followed], Where.PAGE),
             Section("What this data cannot tell", [*_alternatives(d), following, *untestable, *detectable]),
             Section("The noise", [_noise_table(d)] if d.noise else []),
         ],
@@ -93,80 +96,34 @@ def diagnosis(d: Diagnosis) -> Document:
 # ------------------------------------------------------------------ figures
 
 
-def _drawn(d: Diagnosis, draw: Callable[[Diagnosis, DiagnosisSeries], Sequence[Picture]]) -> list[Item]:
-    """Figures of a diagnosis that has its series."""
-    series = d.series
-    return [] if series is None else [Figures(lambda: draw(d, series))]
-
-
-def _regimes(d: Diagnosis, series: DiagnosisSeries) -> Sequence[Picture]:
-    from .diagnosis_pictures import regime_picture
-
-    return [regime_picture(series, bool(d.effects))]
-
-
-def _closures(d: Diagnosis) -> Sequence[Picture]:
-    from .diagnosis_pictures import closure_picture
-
-    return [closure_picture(d)]
-
-
-def _followed(_: Diagnosis, series: DiagnosisSeries) -> Sequence[Picture]:
-    from .twin_section import followed_picture
-
-    return [] if series.followed is None else [followed_picture(series.followed, _axes(series))]
-
-
-def _traces(d: Diagnosis) -> list[Section]:
-    series = d.series
-    if series is None:
-        return []
-
-    def draw(name: str) -> Sequence[Picture]:
-        from .diagnosis_pictures import trace_pictures
-
-        return list(trace_pictures(name, series, _axes(series)))
-
+def _traces(d: Diagnosis, series: DiagnosisSeries) -> list[Section]:
     note = (
         "Measured: the residual without the other effects. From both, what misalignment and scale take in has been "
         "left out, so only that is shown which speaks for the effect."
     )
     return [
         Section(
-            f"{effect.name}: measured and as the effect says",
-            [Figures(lambda name=effect.name: draw(name)), Sentence(note, soft=True)],  # type: ignore[misc]
+            f"{each.name}: measured and as the effect says",
+            [figures("diagnosis_pictures.trace_pictures", each.name, series, _axes(series)), Sentence(note, soft=True)],
             Where.PAGE,
         )
-        for effect in d.effects
-        if series.traces[effect.name].any()
+        for each in d.effects
+        if series.traces[each.name].any()
     ]
 
 
-def _twins(d: Diagnosis) -> list[Section]:
-    series = d.series
-    if series is None or not series.twins:
-        return []
-    axes, has_effects, made = _axes(series), bool(d.effects), series.twins
-
-    def draw(index: int) -> Sequence[Picture]:
-        from .twin_section import twin_pictures
-
-        return list(twin_pictures(made[index], axes, has_effects))
-
-    def table() -> Table:
-        from .twin_section import twin_table
-
-        return twin_table(made, has_effects)
-
+def _twins(d: Diagnosis, series: DiagnosisSeries) -> list[Section]:
+    axes, has_effects = _axes(series), bool(d.effects)
     note = (
         "The twin is a simulated DVL on the recorded motion, without and with what was found. What is shown is what "
         "was recorded less what the twin measured, on stretches that its parameters had not seen."
     )
+    first: list[Item] = [Sentence(note, soft=True), twin_table(series.twins, has_effects)]
     return [
-        Section("Recorded against the simulated twin", [Sentence(note, soft=True), table()], Where.PAGE),
+        Section("Recorded against the simulated twin", first, Where.PAGE),
         *(
-            Section(each.name, [Figures(lambda k=k: draw(k))], Where.PAGE)  # type: ignore[misc]
-            for k, each in enumerate(made)
+            Section(each.name, [figures("twin_section.twin_pictures", each, axes, has_effects)], Where.PAGE)
+            for each in series.twins
         ),
     ]
 

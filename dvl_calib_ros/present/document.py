@@ -7,9 +7,10 @@ What a result says is laid out once, by the module of this room that is called a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ..verdict.kinds import Severity
@@ -98,9 +99,22 @@ class Sentence:
 
 @dataclass(frozen=True)
 class Figures:
-    """Pictures, which only a page has drawn: ``draw()`` makes them."""
+    """Pictures, which only a page has drawn: by a function of a module of this room, from what it is given."""
 
-    draw: Callable[[], Sequence[Picture]]
+    module: str
+    name: str
+    given: tuple[Any, ...]
+
+    def draw(self) -> Sequence[Picture]:
+        """Make them, which imports matplotlib."""
+        found = getattr(import_module(f"{__package__}.{self.module}"), self.name)(*self.given)
+        return found if isinstance(found, Sequence) else list(found) if isinstance(found, Iterable) else [found]
+
+
+def figures(function: str, *given: Any) -> Figures:
+    """Those that a function draws, such as ``twin_section.twin_pictures``."""
+    module, _, name = function.partition(".")
+    return Figures(module, name, given)
 
 
 @dataclass(frozen=True)

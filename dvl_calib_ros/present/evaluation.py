@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -31,13 +30,11 @@ from .document import (
     Table,
     Warned,
     Where,
+    figures,
     number,
     parameter_texts,
     signed,
 )
-
-if TYPE_CHECKING:
-    from .style import Picture
 
 # Deviation from a published figure up to which a cell is coloured so
 DEVIATIONS = ((0.05, "good"), (0.25, "off"), (0.5, "far"), (math.inf, "bad"))
@@ -64,11 +61,11 @@ def evaluation(e: Evaluation) -> Document:
             Section("", [Facts(_facts(e))]),
             Section("", [Warned()], Where.PAGE),
             Section("Velocity error after calibration", [_score_table(e)]),
-            _pictures("", lambda p: [p.improvement_picture(e)]),
+            _pictures("", figures("evaluation_pictures.improvement_picture", e)),
             Section("Velocity error against calibration time", [_time_table(e)], Where.TERMINAL),
             _pictures(
                 "Velocity error against calibration time",
-                lambda p: list(p.time_pictures(e)),
+                figures("evaluation_pictures.time_pictures", e),
                 e.models,
                 "Rings: published." if np.isfinite(published_of(e)).any() else "",
             ),
@@ -79,7 +76,7 @@ def evaluation(e: Evaluation) -> Document:
                 [
                     _pictures(
                         "How fast is the misalignment found?",
-                        lambda p: list(p.convergence_pictures(e)),
+                        figures("evaluation_pictures.convergence_pictures", e),
                         (),
                         "Calibrated on each run with attitude, from ten seconds on, with a reference of this noise or "
                         "none. Roll is shown by turns only: without them the whole angle stays near that of the prior.",
@@ -99,22 +96,11 @@ def evaluation(e: Evaluation) -> Document:
     )
 
 
-def _pictures(
-    title: str,
-    draw: Callable[..., Sequence[Picture]],
-    models: Sequence[str] = (),
-    note: str = "",
-) -> Section:
-    """Figures for a page, with the legend of models, drawn by functions of `evaluation_pictures`."""
-
-    def made() -> Sequence[Picture]:
-        from . import evaluation_pictures
-
-        return draw(evaluation_pictures)
-
+def _pictures(title: str, drawn: Figures, models: Sequence[str] = (), note: str = "") -> Section:
+    """Figures for a page, with the legend of models."""
     legend = [Legend(models, "")] if models else []
     said = [Sentence(note, soft=True)] if note else []
-    return Section(title, [*legend, *said, Figures(made)], Where.PAGE)
+    return Section(title, [*legend, *said, drawn], Where.PAGE)
 
 
 def published_of(e: Evaluation) -> Array:
@@ -280,7 +266,7 @@ def _coverages(e: Evaluation) -> Iterable[Section]:
     for title, coverages in studies:
         if coverages:
             yield Section(f"Can the uncertainty be trusted? {title}", [_coverage_table(coverages)])
-            yield _pictures("", lambda p, coverages=coverages: [p.coverage_picture(coverages)])  # type: ignore[misc]
+            yield _pictures("", figures("evaluation_pictures.coverage_picture", coverages))
 
 
 def _coverage_table(coverages: Sequence[Coverage]) -> Table:
@@ -331,7 +317,7 @@ def _pull(study: ErrorsInVariables | None) -> list[Section]:
     table = Table(("GNSS σ, m/s", *study.models), rows, notes=("Pull of the scale in %: predicted / measured.",))
     return [
         Section("Noise in the reference pulls the scale", [Sentence(study.formula), table]),
-        _pictures("", lambda p: [p.pull_picture(study)], study.models),
+        _pictures("", figures("evaluation_pictures.pull_picture", study), study.models),
     ]
 
 
@@ -365,7 +351,7 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> list[Section]:
     )
     table = Table(("run", "headings, °", *e.columns), rows, marked=len(study.runs), dense=True, notes=notes)
     return [
-        _pictures(title, lambda p: [p.study_picture(e, study)], e.models),
+        _pictures(title, figures("evaluation_pictures.study_picture", e, study), e.models),
         Section(title, [table], Where.TERMINAL),
         Section("", [table], Where.PAGE),
     ]
@@ -386,7 +372,7 @@ def best_of_trace(trace: Trace) -> str:
 def _trace(trace: Trace) -> Section:
     return _pictures(
         f"Velocity before and after correction: {trace.trajectory}, calibrated on {trace.calibrated_on}",
-        lambda p: p.trace_pictures(trace),
+        figures("evaluation_pictures.trace_pictures", trace),
         list(trace.corrected),
         f"Errors put in: {trace.combination}. Corrected by {best_of_trace(trace)}, the best on it.",
     )
@@ -407,7 +393,7 @@ def _held_out(held_out: Sequence[HeldOut]) -> list[Section]:
 
     def draw(name: str) -> Section:
         of_set = [each for each in held_out if each.set_name == name]
-        return _pictures("", lambda p: [p.held_out_picture(name, of_set)])
+        return _pictures("", figures("evaluation_pictures.held_out_picture", name, of_set))
 
     return [Section("Held-out verification", [Table(("model", *sets), rows, notes=notes)]), *map(draw, sets)]
 

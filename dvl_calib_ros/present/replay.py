@@ -10,7 +10,6 @@ import shlex
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,7 +34,6 @@ from .document import (
     Commands,
     Document,
     Facts,
-    Figures,
     Item,
     Legend,
     Map,
@@ -47,15 +45,11 @@ from .document import (
     Warned,
     Where,
     Worth,
+    figures,
     fitting_unit,
     parameter_texts,
 )
 from .terms import estimate_table
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from .style import Picture
 
 # What the verdict's word asks of the reader.
 ADVICE = {
@@ -109,6 +103,13 @@ def replayed(
     own = [note for note in run.notes if not note.startswith(others)] if warnings is None else warnings
     first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
     where = Where.BOTH if details else Where.PAGE
+    history = run.history
+    velocities: list[Item] = []
+    data: list[Item] = []
+    if history is not None:
+        drawn = figures("replay_pictures.velocity_pictures", run, history)
+        velocities = [Sentence(_velocity_note(run), soft=True), drawn]
+        data = [figures("replay_pictures.data_pictures", result, history, shown)]
     return Document(
         title="DVL calibration",
         subtitle=", ".join(bag.name or str(bag) for bag in bags),
@@ -117,7 +118,7 @@ def replayed(
         sections=[
             Section("", _worth(run) if not rejected else [], Where.PAGE),
             Section(_headline(run) if not rejected else f"Not to be used. {_headline(run)}", _mounting(run, rejected)),
-            Section("", [] if rejected else [_figures(lambda _: _mounted(result))], Where.PAGE),
+            Section("", [] if rejected else [figures("mounting_figures.mounting_pictures", result)], Where.PAGE),
             Section("", [Facts(_facts(run, bags))], Where.PAGE),
             Section("", [] if rejected else [Sentence("Corrected mounting, ready to paste:", soft=True)], Where.PAGE),
             Section("", [] if rejected else [_paste(run)]),
@@ -131,11 +132,11 @@ def replayed(
             ),
             Section("Held-out verification", _held_out(result, shown), Where.PAGE),
             Section("Estimates", [estimate_table(result, shown)], where),
-            *(_families(run, shown)),
-            Section("Velocity before and after correction", _velocities(run), Where.PAGE),
+            *_families(result, history, shown),
+            Section("Velocity before and after correction", velocities, Where.PAGE),
             Section("Data", [Facts(_selected(run))] if details else [], Where.TERMINAL),
             Section("" if details else "Data", [_stream_table(result)], where),
-            Section("", _data(run, shown), Where.PAGE),
+            Section("", data, Where.PAGE),
         ],
         parameters=parameter_texts(result.parameters),
         lead=full(first.says) if first is not None else "",
@@ -212,13 +213,8 @@ def _navigation(run: Replayed) -> list[Item]:
     if navigation is None:
         return []
 
-    def draw(history: RunHistory) -> Sequence[Picture]:
-        from .navigation_figures import navigation_pictures
-        from .time_axis import TimeAxis
-
-        return navigation_pictures(navigation, {"": navigation}, time=TimeAxis(history.stamps_ns))
-
-    pictures = _of_history(run, draw)
+    history = run.history
+    pictures = [] if history is None else [figures("replay_pictures.navigation", navigation, history)]
     return [*map(Sentence, in_words(navigation)), *([Map(navigation)] if navigation.on_a_map else []), *pictures]
 
 
@@ -232,22 +228,6 @@ def _not_shown(run: Replayed) -> list[Item]:
         Sentence(f"? {' and '.join(dict.fromkeys(axes))}: not shown by this recording; it needs {missing}")
         for missing, axes in causes.items()
     ]
-
-
-def _figures(draw: Callable[[None], Sequence[Picture]]) -> Figures:
-    return Figures(lambda: draw(None))
-
-
-def _of_history(run: Replayed, draw: Callable[[RunHistory], Sequence[Picture]]) -> list[Item]:
-    """Figures of a run that kept its history."""
-    history = run.history
-    return [] if history is None else [Figures(lambda: draw(history))]
-
-
-def _mounted(result: Result) -> Sequence[Picture]:
-    from .mounting_figures import mounting_pictures
-
-    return mounting_pictures(result)
 
 
 def _facts(run: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
@@ -297,11 +277,6 @@ def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
     if not judged:
         return []
 
-    def draw(_: None) -> Sequence[Picture]:
-        from .replay_pictures import held_out_picture
-
-        return [held_out_picture(judged)]
-
     rows: list[tuple[str | Cell, ...]] = [
         (name, *_held_out_cells(judged.get(name)), Cell(each.verdict.value, CELL_KINDS[each.verdict]))
         for name, each in verifications.items()
@@ -314,7 +289,7 @@ def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
             "is what that noise and the uncertainty of the calibration lead one to expect."
         ),
         Table(head, rows, marked=list(verifications).index(result.selected)),
-        _figures(draw),
+        figures("replay_pictures.held_out_picture", judged),
     ]
 
 
@@ -324,30 +299,15 @@ def _held_out_cells(error: HeldOutError | None) -> tuple[str, ...]:
     return (f"{error.uncorrected:.4f}", f"{error.corrected:.4f}", f"{error.predicted:.4f}", str(error.samples))
 
 
-def _families(run: Replayed, shown: Sequence[str]) -> list[Section]:
+def _families(result: Result, history: RunHistory | None, shown: Sequence[str]) -> list[Section]:
     """Estimates over time and innovations, for the models with GNSS and for those without."""
-    result, sections = run.result, []
+    sections = []
     for aided, title in FAMILIES:
         models = [name for name in shown if MODELS[name].aided == aided and result.estimates[name].used]
-
-        def draw(history: RunHistory, models: Sequence[str] = models) -> Sequence[Picture]:
-            from .replay_pictures import estimate_pictures
-
-            return list(estimate_pictures(result, history, models))
-
-        pictures = _of_history(run, draw) if models else []
-        sections.append(Section(title, [Legend(models, result.selected), *pictures] if pictures else [], Where.PAGE))
+        if models and history is not None:
+            drawn = figures("replay_pictures.estimate_pictures", result, history, models)
+            sections.append(Section(title, [Legend(models, result.selected), drawn], Where.PAGE))
     return sections
-
-
-def _velocities(run: Replayed) -> list[Item]:
-    def draw(history: RunHistory) -> Sequence[Picture]:
-        from .replay_pictures import velocity_pictures
-
-        return velocity_pictures(run, history)
-
-    pictures = _of_history(run, draw)
-    return [Sentence(_velocity_note(run), soft=True), *pictures] if pictures else []
 
 
 def _velocity_note(run: Replayed) -> str:
@@ -371,15 +331,6 @@ def _stream_table(result: Result) -> Table:
         rest = [f"{value} {what.replace('_', ' ')}" for what, value in counts.items() if value and what != "received"]
         rows.append((name, str(counts.get("received", "–")), Cell(", ".join(rest) or "–", "text")))
     return Table(("", "received", Cell("of which", "text")), rows)
-
-
-def _data(run: Replayed, shown: Sequence[str]) -> list[Item]:
-    def draw(history: RunHistory) -> Sequence[Picture]:
-        from .replay_pictures import data_pictures
-
-        return data_pictures(run.result, history, shown)
-
-    return _of_history(run, draw)
 
 
 def next_commands(

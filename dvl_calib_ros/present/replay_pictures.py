@@ -10,15 +10,22 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.verification import HeldOutError
+from ..replay.navigation import Navigation
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
 from . import replay_figures as figures
+from .navigation_figures import navigation_pictures
 from .style import Picture, picture
 from .terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 from .time_axis import TimeAxis
 
 BODY_AXES = ("ahead", "to port", "up")
 HELD_OUT_KINDS = ("uncorrected", "corrected", "predicted")
+
+
+def navigation(found: Navigation, history: RunHistory) -> Sequence[Picture]:
+    """The track, by the same time as the other figures."""
+    return navigation_pictures(found, {"": found}, time=TimeAxis(history.stamps_ns))
 
 
 def held_out_picture(judged: dict[str, HeldOutError]) -> Picture:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from scipy.signal import welch
@@ -11,48 +11,14 @@ from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
 from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
-from .document import Table
 from .style import Picture, picture
 from .time_axis import TimeAxis
+from .twin_table import ALL, differences, rms
 
 # Points of a spectrum in each decade of frequency
 SPECTRUM_STEPS = 10
 # Lines over time are means over this share of the run, and over so many seconds at least
 WINDOW_SHARE, WINDOW_S = 1.0 / 100.0, 3.0
-ALL = "all of the run"
-WITHOUT, WITH, ALONE = "without", "with", "twin"
-
-
-def differences(twin: HeldOutTwin, has_effects: bool) -> dict[str, Array]:
-    """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
-    return {WITHOUT: twin.without, WITH: twin.with_effects} if has_effects else {ALONE: twin.without}
-
-
-def rms(values: Array) -> float:
-    """m/s of the vector, of values (N, 3)."""
-    return float(np.sqrt((values**2).sum(axis=1).mean())) if len(values) else float("nan")
-
-
-def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
-    """Error of every recording in every regime of motion, m/s."""
-    rows = []
-    for twin in twins:
-        noise = float(np.sqrt((twin.noise**2).sum()))
-        for regime, mask in {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}.items():
-            errors = [f"{rms(values[mask]):.4f}" for values in differences(twin, has_effects).values()]
-            rows.append(
-                (twin.name if regime == ALL else "", regime, f"{100.0 * mask.mean():.0f} %", *errors, f"{noise:.4f}")
-            )
-    heads = ("without, m/s", "with, m/s") if has_effects else ("recorded less twin, m/s",)
-    return Table(
-        ("recording", "regime", "share", *heads, "noise, m/s"),
-        rows,
-        notes=(
-            "Rms of the vector, noise of DVL and reference included, where there is a reference: the error and the "
-            "noise at the top are these, of all recordings. The twin moves as the reference says, and its parameters "
-            "had not seen the samples that it is compared with.",
-        ),
-    )
 
 
 def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool) -> Iterable[Picture]:

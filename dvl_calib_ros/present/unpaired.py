@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from ..unpaired.results import ComparedEffect, ComparedNoise, Status, UnpairedComparison, Verdict
 from ..verdict.kinds import Severity
-from .document import Answer, Cell, Document, Figures, Section, Sentence, Table, Where, interval, intervals, p_value
-
-if TYPE_CHECKING:
-    from .style import Picture
+from .document import Answer, Cell, Document, Section, Sentence, Table, Where, figures, interval, intervals, p_value
 
 SEVERITIES = {
     Verdict.NO_DIFFERENCE: Severity.ACCEPT,
@@ -33,10 +29,10 @@ def unpaired(c: UnpairedComparison) -> Document:
         sections=[
             Section("Effect by effect", [_effects(c.effects), *_needs(c.effects)] if c.effects else []),
             Section("How far the gap shrinks", [_rungs(c)] if c.rungs else []),
-            Section("", [Figures(lambda: _shrinks(c))] if c.rungs else [], Where.PAGE),
+            Section("", [figures("unpaired_figures.shrink_pictures", c)] if c.rungs else [], Where.PAGE),
             Section("Noise and stream", [_noise(c.noise)] if c.noise else []),
             Section("", [_levels(c)] if c.levels else [], Where.TERMINAL),
-            Section("", [Figures(lambda: _noises(c))], Where.PAGE),
+            Section("", [figures("unpaired_figures.noise_pictures", c)], Where.PAGE),
             Section("What the motions could not have shown", _not_shown(c)),
             Section(
                 "Each side by itself",
@@ -45,18 +41,6 @@ def unpaired(c: UnpairedComparison) -> Document:
             ),
         ],
     )
-
-
-def _shrinks(c: UnpairedComparison) -> list[Picture]:
-    from .unpaired_figures import shrink_pictures
-
-    return list(shrink_pictures(c))
-
-
-def _noises(c: UnpairedComparison) -> list[Picture]:
-    from .unpaired_figures import noise_pictures
-
-    return list(noise_pictures(c))
 
 
 def _effects(effects: Sequence[ComparedEffect]) -> Table:

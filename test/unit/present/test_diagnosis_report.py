@@ -18,7 +18,8 @@ from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.reports import write_report
-from dvl_calib_ros.present.twin_section import rms, spectrum
+from dvl_calib_ros.present.twin_section import spectrum
+from dvl_calib_ros.present.twin_table import rms
 
 pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each
 
