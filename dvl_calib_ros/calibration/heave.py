@@ -55,8 +55,8 @@ class HeaveSums(NamedTuple):
         return HeaveSums(*(np.stack(each) for each in zip(*sums, strict=True)))
 
 
-# Places of two of them.
-_TOLD, _SCATTER = 0, 1
+# Place of what rows told among them.
+_TOLD = 0
 
 
 class HeaveRows:

@@ -75,6 +75,11 @@ def test_an_arrow_up_and_an_unknown_room_are_seen(tmp_path, monkeypatch, name, t
     assert rooms.arrows_up() == []
 
 
+def test_no_estimator_is_asked_for_by_its_name_outside_its_own_room():
+    named = [path for path in rooms.modules() if '"G2"' in path.read_text() and path.parent.name != "delay"]
+    assert named == []
+
+
 def test_the_size_is_printed_with_arrows(capsys):
     assert main(["size"]) == 0
     *_, lines, arrows = capsys.readouterr().out.splitlines()
