@@ -30,7 +30,7 @@ REGISTERED, CLEARLY = 0.3, 0.5
 # What a clock leaves open of the lever arm is said from here on, m: the calibration's own σ does not hold it.
 SAID_FROM_M = 0.08
 # Of a stream one sample in so long is registered, ns.
-EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 200_000_000, Stream.IMU: 50_000_000}
+EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
 # What a clock of the DVL's that drifts or leaps is told by.
 MOVING = frozenset({"dvl_clock_drift", "dvl_time_jump", "dvl_time_jump_at"})
 # Samples of the DVL that are compared to find frames: no more tell more.
@@ -164,7 +164,7 @@ def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> Mot
 
 
 def _some(block: SampleBlock) -> SampleBlock:
-    """The first sample of every so many seconds."""
+    """The first sample of every so long."""
     bins = block.stamps_ns // EVERY_NS[block.stream]
     return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
 

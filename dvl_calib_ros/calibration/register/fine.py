@@ -63,7 +63,8 @@ class Fitted(NamedTuple):
     noise makes it, by blocks of time and by how long what is left lasts.
 
     level: m/s per axis, robust, of what is left of `rows` references. speed: RMS of what was compared, m/s.
-    at: (J,) which references these are, of those that are looked at.
+    at: (J,) which references these are, of those that are looked at. raised: (9,) by how much σ of each was, above that
+    of white noise.
     """
 
     x: Array
@@ -76,6 +77,7 @@ class Fitted(NamedTuple):
     axes: int
     inflation: float
     at: Index
+    raised: Array
 
     def cost(self, level: float, among: Index) -> float:
         """What is left of these references, in chi-square by a level of noise (m/s), robust."""
@@ -90,6 +92,11 @@ class Fitted(NamedTuple):
     def std(self) -> Array:
         """(9,)."""
         return np.sqrt(np.maximum(np.diag(self.p), 0.0))
+
+    def by(self, state: int) -> Array:
+        """(9,) by how much all are others for each unit of one: as the motion has it, whatever the noise is."""
+        of_white = self.p[:, state] / self.raised
+        return np.asarray(of_white / of_white[state])
 
     @property
     def dvl_late(self) -> float:
@@ -174,7 +181,7 @@ class Fit:
         p, factor = self._covariance(rows, information, level, weight)
         squares, axes = (rows.residual**2).sum(axis=1), rows.residual.shape[1]
         inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
-        return Fitted(x, p, rotation, level, len(rows.at), rows.speed, squares, axes, inflation, rows.at)
+        return Fitted(x, p, rotation, level, len(rows.at), rows.speed, squares, axes, inflation, rows.at, factor)
 
     def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
         """Which references (J,) are compared at a state, and what is left of each (J,), as in `Fitted.cost`."""

@@ -285,12 +285,11 @@ def _open(fit: Fit, free: Fitted, late: float, rotation: Array | None) -> dict[s
     """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
     if not fit.is_turned:
         return {"open_late": 0.0, "open_by": np.zeros(4)}
-    std, p, off = float(free.std[LATE]), free.p, abs(float(free.x[LATE]) - late)
+    std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
     if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
         # as good as in time, and so far away that it turns another arm there
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
-        std, p = max(std, off), p if near is None else near.p
-    by = p[:, LATE] / p[LATE, LATE]
+        std, by = max(std, off), by if near is None else near.by(LATE)
     return {"open_late": std, "open_by": np.append(by[ARM], 1.0 + by[APART])}
 
 
