@@ -12,6 +12,7 @@ from ..calibration.error_model import corrected_mounting
 from ..calibration.frames import Array, rpy_from_rotation
 from ..calibration.mounting_pose import rpy_std
 from ..calibration.parameters import Parameters
+from ..calibration.quantities import quantities
 from ..replay.replay import Replayed
 
 _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")
@@ -49,10 +50,11 @@ def calibration_figure(replayed: Replayed) -> Figure:
     turned = (turned + 180.0) % 360.0 - 180.0
     std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.misalignment_covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
-    for axis, name in enumerate(("roll", "pitch", "yaw")):
+    for axis, found in enumerate(quantities(result)[:3]):  # whose σ is also of the next recording
         value, sleeve = turned[:, axis], std[:, axis]
+        label = f"{found.name} {value[-1]:+.2f}° ± {found.in_unit(found.std)}"
         angles.fill_between(time, value - sleeve, value + sleeve, color=_COLOURS[axis], alpha=0.15, linewidth=0)
-        angles.plot(time, value, color=_COLOURS[axis], label=f"{name} {value[-1]:+.2f}° ± {sleeve[-1]:.2f}°")
+        angles.plot(time, value, color=_COLOURS[axis], label=label)
     span = turned[settled]
     margin = 0.2 * float(np.ptp(span)) + 0.1
     angles.set_ylim(float(span.min()) - margin, float(span.max()) + margin)

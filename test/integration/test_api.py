@@ -116,6 +116,12 @@ def test_bags_are_compared_as_result_files_are(calibration, bag, tmp_path):
     assert found.word in ("same", "suspicious", "moved")
 
 
+def test_the_picture_states_the_sigma_of_the_mounting(calibration):
+    legend = [text.get_text() for text in calibration.plot().axes[0].get_legend().get_texts()]
+    for name, std, said in zip(("roll", "pitch", "yaw"), calibration.mounting.std_deg, legend, strict=True):
+        assert said.startswith(name) and said.endswith(f"± {std:.2f}°")
+
+
 def test_results_print_as_their_answer_and_in_a_notebook_with_tables(bag, calibration, tmp_path):
     examined = dc.doctor(bag)
     assert str(examined).startswith(f"{examined.verdict}: ") and "yaw" in str(examined)
