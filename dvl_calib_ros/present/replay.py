@@ -186,8 +186,22 @@ def _mounting(run: Replayed, rejected: bool) -> list[Item]:
         ],
         is_valid=not rejected,
     )
-    heading = "Yaw is against the IMU's heading: a constant error of the heading is in it, and harmless with that IMU."
-    return [numbers, *([Sentence(heading)] if run.reference_frame in EARTH and not rejected else [])]
+    return [numbers, *([Sentence(against)] if (against := _against(run)) and not rejected else [])]
+
+
+def _against(run: Replayed) -> str:
+    """What the angles are measured against, whose own error no data of this kind tell from the DVL's."""
+    if not MODELS[run.result.selected].aided:
+        return (
+            "Without a reference the angles are against the way in which the vehicle goes ahead: a constant crab is in "
+            "the yaw, and one that goes astern is turned round."
+        )
+    if run.reference_frame in EARTH:
+        return (
+            "Angles are against the IMU's own: a constant error of its heading is in the yaw, one of its level in roll "
+            "and pitch, and both are harmless with that IMU."
+        )
+    return ""
 
 
 def _paste(run: Replayed) -> Commands:

@@ -211,3 +211,18 @@ def test_clocks_are_taken_off_where_it_is_noise_that_leaves_much_of_a_low_speed(
     found = discover([tmp_path / "bag"], Parameters())
     assert found.clocks is not None and found.clocks.registration.offsets
     assert dc.replay(tmp_path / "bag", history=False).verdict != "reject"
+
+
+@pytest.mark.parametrize("has_reference", [False, True])
+def test_the_answer_says_against_what_its_angles_are(tmp_path, capsys, has_reference):
+    """What nobody can tell is said: a constant crab without a reference, the IMU's own errors with one."""
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    told.imu("/imu", "base_link")
+    if has_reference:
+        vehicle(told)
+    out, _ = succeed(capsys, "replay", told.write(tmp_path / "bag"))
+    said = " ".join(out.split())
+    own = "one of its level in roll and pitch, and both are harmless with that IMU"
+    crab = "a constant crab is in the yaw, and one that goes astern is turned round"
+    assert (own in said, crab in said) == (has_reference, not has_reference)
