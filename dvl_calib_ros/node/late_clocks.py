@@ -10,7 +10,7 @@ from ..verdict.reasons import Reason, finding
 
 
 class LateClocks:
-    """What is to be taken off, once: where nobody named an offset, and two looks that show all clocks agree.
+    """What is to be taken off, once: where nobody named an offset, and two looks at the clocks agree.
 
     found: what is said of it, while it is off.
     """
@@ -23,7 +23,7 @@ class LateClocks:
 
     def parameters(self, registration: Registration | None, parameters: Parameters) -> Parameters | None:
         """The parameters to begin anew with, by the newest look; None for as they are."""
-        if self._stands or registration is None or registration is self._before or not registration.are_known:
+        if self._stands or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
         late = registration.taken_off

@@ -1,4 +1,4 @@
-"""A clock is taken off while the node runs where two looks agree on it, and where they show how all clocks stand."""
+"""A clock is taken off while the node runs where two looks agree on it, at a moment that stamps decide."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ class Look:
     """What is asked of a registration."""
 
     late: float
-    are_known: bool = True
 
     @property
     def taken_off(self):
@@ -34,14 +33,6 @@ def test_two_looks_that_agree_take_a_clock_off_once():
     found = clocks.parameters(Look(2.52), Parameters())
     assert found is not None and found.reference_time_offset == 2.52
     assert clocks.parameters(Look(3.0), Parameters()) is clocks.parameters(Look(3.01), Parameters()) is None
-
-
-def test_data_that_do_not_show_how_all_clocks_stand_take_none_off():
-    """A replay does not either: at one speed a clock looks like a lever arm."""
-    clocks = LateClocks(given=())
-    assert (
-        clocks.parameters(Look(2.5, False), Parameters()) is clocks.parameters(Look(2.5, False), Parameters()) is None
-    )
 
 
 class Later:
