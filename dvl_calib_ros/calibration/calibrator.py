@@ -29,8 +29,9 @@ from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
 from .days import day_covariance, offset_covariance
-from .delay.hold_out import Recording, Terms
+from .delay.hold_out import NO_TERMS, Compared, Recording, Terms
 from .delay.workers import Worker
+from .error_model import correction_matrix
 from .estimator import Estimator, Given, LinearEstimator, kind_of
 from .frames import Array, Vector
 from .heading_deviation import comes_first, heading_advice
@@ -133,6 +134,7 @@ class Calibrator:
         self._recordings_ns, self._registrations = recordings_ns, registrations
         self._observer = Observer(parameters)
         self._day_covariances: dict[str, Array] = {}
+        self._compared: tuple[Recording, Compared] | None = None  # as mounted
         self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
         self.reset()
 
@@ -590,8 +592,19 @@ class Calibrator:
         if kept is None:
             return None
         x, recording = state.x, kept[0]
-        terms = Terms.of_state(x) if model.estimator else Terms(model.error_terms_from_state @ x, np.zeros(3), 0.0)
-        error = recording.compared(np.arange(len(recording.dvl.times)), terms, self.parameters).error
+        every = np.arange(len(recording.dvl.times))
+        if model.estimator:
+            error = recording.compared(every, Terms.of_state(x), self.parameters).error
+        else:
+            if self._compared is None or self._compared[0] is not recording:
+                self._compared = recording, recording.compared(every, NO_TERMS, self.parameters)
+            seen, errors, t = (
+                self._compared[1],
+                model.error_terms_from_state @ x,
+                self.parameters.rotation_dvl_from_body,
+            )
+            change = recording.dvl.velocity @ (t.T - correction_matrix(errors[:3], errors[3:], t)).T
+            error = seen.error + np.matmul(seen.measured, change[..., None])[..., 0]
         square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
         if not len(square):
             return None

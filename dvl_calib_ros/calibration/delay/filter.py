@@ -33,7 +33,7 @@ from ..tables import Table
 from ..verification import HeldOutError
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .clocks import Rest
-from .hold_out import Recording, Terms, held_out_error
+from .hold_out import Kept, Recording, Terms, held_out_error
 from .known import DayState, Posterior
 from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
 from .solver import BlockSolver, Outcome
@@ -99,6 +99,7 @@ class DelayFilter(Estimator):
         self._coming: deque[tuple[int, Solved, int]] = deque()
         self._gathered_ns: list[int] = []  # the same of those that are not
         self._is_telling = self._is_settled = False
+        self._recording: tuple[Kept, Recording] | None = None  # asked for by each model's verification
         # asked for with each message
         self._of_recording: tuple[Posterior, Registration | None, GaussianState] | None = None
         self._suggested: tuple[Outcome, str] | None = None
@@ -466,7 +467,12 @@ class DelayFilter(Estimator):
     def recording(self) -> tuple[Recording, int] | None:
         """All that was kept for verification, and the stamp (ns) of its time 0; None for nothing."""
         solver = self._idle_solver()
-        return (Recording.of(solver.kept), solver.epoch_ns) if solver.kept else None
+        if not solver.kept:
+            return None
+        newest = solver.kept[-1]  # another one once anything is kept or left out
+        if self._recording is None or self._recording[0] is not newest:
+            self._recording = newest, Recording.of(solver.kept)
+        return self._recording[1], solver.epoch_ns
 
     @property
     def n_days(self) -> int:
