@@ -11,7 +11,6 @@ question that is asked of it is a method.)
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -94,8 +93,8 @@ class Calibrator:
     earlier. on_event: told of restarts in words. on_rows: given the aligned rows, in order, once all models have had
     them. on_restart: called when all of them are to be forgotten. verified: keep what hold-out verification needs.
     trace: filled with the models' states over time. recordings_ns: stamps between one recording and the next, each of
-    which is a day of its own; registrations: of each of them, where it was registered already. worker: does what would
-    hold up live messages; None: all is done at once, and comes to the same.
+    which is a day of its own. worker: does what would hold up live messages; None: all is done at once, and comes to
+    the same.
     """
 
     def __init__(
@@ -111,7 +110,6 @@ class Calibrator:
         verified: bool = False,
         trace: StateTrace | None = None,
         recordings_ns: Sequence[int] = (),
-        registrations: Sequence[Registration | None] = (),
         worker: Worker | None = None,
         models: Collection[str] = tuple(MODELS),
     ) -> None:
@@ -131,7 +129,7 @@ class Calibrator:
         self._verified = verified
         self._trace = trace
         self._worker = worker
-        self._recordings_ns, self._registrations = recordings_ns, registrations
+        self._recordings_ns = recordings_ns
         self._observer = Observer(parameters)
         self._day_covariances: dict[str, Array] = {}
         self._compared: tuple[Recording, Compared] | None = None  # as mounted
@@ -186,13 +184,8 @@ class Calibrator:
                 verified=self._verified,
                 worker=self._worker,
                 together=together,
-                registered=self._registered,
             )
         )
-
-    def _registered(self, stamp_ns: int) -> Registration | None:
-        is_of_each = len(self._registrations) == len(self._recordings_ns) + 1
-        return self._registrations[bisect_right(self._recordings_ns, stamp_ns)] if is_of_each else None
 
     def _before_clearing(self) -> None:
         for each in self._further:

@@ -41,8 +41,7 @@ class Given:
     base: the estimator of the model that this one extends; None where it extends none. initial: a state to start from,
     of the model. on_evidence: to be told, once something new takes effect, of the stamp from which on DVL samples may
     go by it. verified: keep what hold-out needs. worker: does what would hold up live messages; None: at once.
-    together: how many blocks of time may be gathered before they are looked at, unless somebody asks. registered: how
-    the instruments stand in the recording that a stamp (ns) is of, where that is known already.
+    together: how many blocks of time may be gathered before they are looked at, unless somebody asks.
     """
 
     model: Model
@@ -54,7 +53,6 @@ class Given:
     verified: bool
     worker: Worker | None
     together: int
-    registered: Callable[[int], Registration | None] = lambda _: None
 
 
 class Estimator(ABC):

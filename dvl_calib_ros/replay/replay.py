@@ -118,7 +118,6 @@ def replay(
         verified=judged,
         trace=recorder.trace if recorder else None,
         recordings_ns=_between(recording),
-        registrations=[one.registration(topics, parameters) for one in _in_time(recording)],
     )
     decoder = MessageDecoder(calibrator.parameters)
     clocks = _feed_all(recording, chosen, decoder, calibrator, on_progress)
@@ -172,10 +171,6 @@ def replay(
         decoder.turns_dvl,
         navigation=navigation,
     )
-
-
-def _in_time(recording: Recording) -> list[Recording]:
-    return sorted(recording.each, key=lambda one: one.span_ns)
 
 
 def _between(recording: Recording) -> list[int]:

@@ -80,13 +80,14 @@ def test_what_is_wrong_with_the_last_is_said_before_the_first_is_read(bags, pass
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("words", "expected", "calibrated"),
     [
-        ("doctor BAG", 1), ("replay BAG", 1), ("replay BAG OTHER", 2), ("compare BAG OTHER", 2), ("diagnose BAG", 1),
-        ("diagnose BAG OTHER", 2),
+        ("doctor BAG", 1, 0), ("replay BAG", 1, 1), ("replay BAG OTHER", 2, 4), ("compare BAG OTHER", 2, 2),
+        ("diagnose BAG", 1, 0), ("diagnose BAG OTHER", 2, 0),
     ],
 )  # fmt: skip
-def test_a_command_registers_each_recording_once(words, expected, bags, monkeypatch, capsys):
+def test_a_command_registers_each_recording_once(words, expected, calibrated, bags, monkeypatch, capsys):
+    """Beside what a calibration registers by its own samples, as a live one does."""
     counted: Counter[str] = Counter()
 
     def counting(name):
@@ -100,4 +101,4 @@ def test_a_command_registers_each_recording_once(words, expected, bags, monkeypa
         monkeypatch.setattr(f"dvl_calib_ros.{name}.register", counting(name))
     command, *arguments = words.split()
     succeed(capsys, command, *(bags[word] for word in arguments))
-    assert counted == {"discovery.clocks": expected}
+    assert +counted == +Counter({"discovery.clocks": expected, "calibration.delay.clocks": calibrated})

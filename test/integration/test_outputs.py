@@ -47,7 +47,9 @@ COMMAND = {
         f"diagnose bag --simulator {LOOSE} --simulator-params params.yaml",
         ("bag", "bag/bag.mcap", LOOSE, "params.yaml"), ("--json", "--report"),
     ),
-    "doctor": Command("doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json",)),
+    "doctor": Command(
+        "doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--report"),
+    ),
     "evaluate": Command(
         "evaluate runs --partial --params params.yaml", ("runs", "runs/T_dvl.npy", "params.yaml"),
         ("--json", "--csv", "--report"),

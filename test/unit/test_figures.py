@@ -19,6 +19,7 @@ from validation.figures.unmarked import unmarked
 # What looks measured and is not, by page: parameters, limits, arithmetic, what the paper says, examples of output
 DEFINITIONS = {
     "evaluation.md": ("R 0.2 m/s with GNSS and 0.025 m/s without",),
+    "glossary.md": ("differ by less than 2 σ",),
     "lever_arm.md": (
         "two hundred simulated runs of 120 s", "delays within 2.9 s", "mounting_rpy 0 0 0.785",
     ),

@@ -7,7 +7,6 @@ lever arm of ρ u explains almost as well: so what G2 has kept of each day is re
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -154,13 +153,9 @@ class Looked(NamedTuple):
 class KeptClocks:
     """What registration says of clocks and frames, of the days that are over and of this one."""
 
-    def __init__(
-        self, parameters: Parameters, live: bool, registered: Callable[[int], Registration | None] = lambda _: None
-    ) -> None:
-        """live: they go on for hours. registered: what is known already of the recording that a stamp (ns) is of."""
-        self._parameters = parameters
-        self._registered, self._is_live = registered, live
-        self._newest_ns = 0
+    def __init__(self, parameters: Parameters, live: bool) -> None:
+        """live: they go on for hours."""
+        self._parameters, self._is_live = parameters, live
         self._seen = _Seen()
         if live:
             self._seen.take_room()
@@ -172,7 +167,6 @@ class KeptClocks:
     def add(self, kept: Kept, frames: Codes, from_ns: int) -> None:
         """Take a block's streams, which begins at a stamp. frames: (J,) codes of those that its references are said to
         be in."""
-        self._newest_ns = from_ns
         self._seen.add(kept)
         self._declared += np.bincount(frames, minlength=len(FRAMES))
         self._blocks += 1
@@ -211,7 +205,7 @@ class KeptClocks:
         nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
         declared = FRAMES[int(self._declared.argmax())]
         try:
-            found = self._registered(self._newest_ns) or register(motion, nominal, lever_arm)
+            found = register(motion, nominal, lever_arm)
             configuration = fitting_configuration(motion, declared, nominal, lever_arm, found)
             rest = self._rest(posterior) if self._is_live and posterior is not None else None
             return Looked(self._blocks, found, configuration, rest)

@@ -89,11 +89,8 @@ class BlockSolver:
         verified: bool,
         *,
         live: bool = False,
-        registered: Callable[[int], Registration | None] = lambda _: None,
     ) -> None:
-        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way.
-
-        registered: as `KeptClocks`."""
+        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way."""
         self._parameters = parameters
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
@@ -103,7 +100,7 @@ class BlockSolver:
         self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
         self._dvl_stream = DvlStream()
         self._turned = False
-        self._clocks = KeptClocks(parameters, live, registered)
+        self._clocks = KeptClocks(parameters, live)
         self._is_live = live
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)

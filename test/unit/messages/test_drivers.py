@@ -455,7 +455,7 @@ def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_
     assert main(["replay", str(bag), "-v", "--json", str(tmp_path / "out.json")]) == 0
     said = "marine_acoustic_msgs/msg/Dvl, turned from forward-right-down to forward-left-up"
     shown = capsys.readouterr().out
-    assert said in shown and "1 few_beams" in shown
+    assert said in shown and "1 few beams" in shown
     document = json.loads((tmp_path / "out.json").read_text())
     assert document["dvl"] == {"type": MARINE, "turned_from_frd": True}
     assert document["parameters"]["dvl_type"] == MARINE  # what the node needs to go on with the result
