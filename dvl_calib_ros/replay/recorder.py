@@ -14,6 +14,7 @@ from ..calibration.history import StateTrace
 from ..calibration.models import MODELS, Needs
 from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
+from ..calibration.results import Estimate
 from ..calibration.samples import AlignedBlock, Codes, Pairing, Stamps
 
 # Rows kept of each series at most: a figure shows no more.
@@ -115,8 +116,8 @@ class Recorder:
             assert seen.reference_body is not None
             self._paired.add(paired.stamps_ns, seen.reference_body)
 
-    def history(self, calibrator: Calibrator) -> RunHistory:
-        """What was collected until `Calibrator.finish`, with the calibrator's state as it is now at its end."""
+    def history(self, calibrator: Calibrator, estimates: Mapping[str, Estimate]) -> RunHistory:
+        """What was collected until `Calibrator.finish`, with the estimates of its result at its end."""
         numbers = self.trace.numbers()
         stamps_ns = np.concatenate([*self._stamps_ns, np.zeros(0, dtype=np.int64)])
         pairing = np.concatenate([*self._pairing, np.zeros(0, dtype=np.uint8)])
@@ -127,7 +128,10 @@ class Recorder:
         paired_ns, reference_velocity = self._paired.columns((), (3,))
         return RunHistory(
             stamps_ns=np.append(stamps_ns[numbers], calibrator.last_ns or 0),
-            models={name: _model_history(name, calibrator, self.trace, numbers, stamps_ns[numbers]) for name in MODELS},
+            models={
+                name: _model_history(estimates[name], calibrator, self.trace, numbers, stamps_ns[numbers])
+                for name in MODELS
+            },
             paired_share=_share(np.column_stack([paired[at], decided[at]])) if len(at) else np.full(1, np.nan),
             dvl_ns=dvl_ns.astype(np.int64),
             dvl_velocity=dvl_velocity,
@@ -137,9 +141,9 @@ class Recorder:
 
 
 def _model_history(
-    name: str, calibrator: Calibrator, trace: StateTrace, numbers: Stamps, stamps_ns: Stamps
+    estimate: Estimate, calibrator: Calibrator, trace: StateTrace, numbers: Stamps, stamps_ns: Stamps
 ) -> ModelHistory:
-    estimate = calibrator.estimate(name)
+    name = estimate.model
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
     states, covariances = [estimate.state[None]], [estimate.recording_covariance[None]]
     sums = [[(nis_sum, estimate.used)]]

@@ -131,7 +131,7 @@ def replay(
     # a configuration that is wrong, such as a late reference, is why the arm is another
     told = [] if result.suggestion else told_arm_advice(result.estimates, calibrator.parameters)
     found += told
-    history = recorder.history(calibrator) if recorder else None
+    history = recorder.history(calibrator, result.estimates) if recorder else None
     navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
     if navigation is not None:
         deviates = heading_advice(navigation.deviation)

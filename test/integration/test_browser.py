@@ -96,7 +96,7 @@ def test_no_page_is_wider_than_the_screen(browser, any_report, size):
 
 def test_the_summary_is_on_the_first_screen_of_a_phone(browser, report):
     page, _ = opened(browser, report, PHONE)
-    box = page.locator(".verdict").bounding_box()
+    box = page.locator(".verdict, .said").first.bounding_box()
     assert box["y"] + box["height"] < PHONE[1]
     page.close()
 
