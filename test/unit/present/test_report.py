@@ -325,7 +325,7 @@ def test_after_a_restart_the_history_starts_anew():
         else:
             calibrator.feed_dvl(sample)
     calibrator.finish()
-    history = recorder.history(calibrator)
+    history = recorder.history(calibrator, calibrator.result().estimates)
     assert calibrator.restarts == 1
     for stamps in (history.stamps_ns, history.dvl_ns, history.paired_ns):
         assert first[0].stamp_ns <= min(stamps) and max(stamps) <= first[-1].stamp_ns
