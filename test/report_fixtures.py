@@ -19,10 +19,10 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.noise_findings import NoiseFinding
-from dvl_calib_ros.diagnosis.results import Diagnosis, FoundEffect, Verdict
+from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.diagnosis.series import DiagnosisSeries
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
-from dvl_calib_ros.diagnosis.where import Place
+from dvl_calib_ros.diagnosis.where import GapPlace
 from dvl_calib_ros.evaluation.bags import CrossCheck
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,
@@ -193,7 +193,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
         followed=Followed("turn rate, °/s (to port)", "y", 5.0 * np.sin(time / 8.0), noise[:, 1]),
     )  # fmt: skip
     values: dict[str, Any] = {
-        "verdict": Verdict.AMBIGUOUS,
+        "verdict": DiagnosisVerdict.AMBIGUOUS,
         "sentence": "The gap is explained by <i>two</i> effects.",
         "gap": Gap(0.0421, 0.0353, 0.0346, 0.982, (0.91, 1.0), 0.007, 0.03),
         "effects": (
@@ -201,7 +201,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
             FoundEffect(OWN_EFFECT, (), {"gain": (1500.0, 1200.0, 1800.0)}, -0.02, 1e-9),
         ),
         "noise": (NoiseFinding("outliers", {"share": (0.02, 0.01, 0.03)}, 1e-12),),
-        "where": (Place("y", "turning", (0.0, 150.0), (0.0, 2.5), 0.7, 1e-15),),
+        "where": (GapPlace("y", "turning", (0.0, 150.0), (0.0, 2.5), 0.7, 1e-15),),
         "untestable": {"water_lock": "attitude"},
         "minimum_detectable": {"lever_arm": {"x_m": 0.11, "z_m": 0.9}, OWN_EFFECT: {"gain": 3.0}},
         "next_manoeuvre": "turns to both sides at two speeds",

@@ -34,7 +34,7 @@ from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulation.waves import Waves
 from dvl_calib_ros.unpaired.compare import compare_logs
-from dvl_calib_ros.unpaired.logs import Log, Source, read_log
+from dvl_calib_ros.unpaired.logs import Log, RecordedSide, read_log
 
 SECONDS = 240.0
 # A number of the log that is further from the source's than that, in its own standard deviations, is another one. Of
@@ -113,7 +113,7 @@ def run(simulator: str, seed: int, folder: Path) -> Outcome:
 
 
 def diagnosed(bag: Path, parameters: Parameters) -> tuple[Log, dict]:
-    log = read_log(Source(open_recording([bag]), parameters, Topics()))
+    log = read_log(RecordedSide(open_recording([bag]), parameters, Topics()))
     write_json(bag.with_suffix(".json"), diagnosis_document(log.diagnosis))
     return log, json.loads(bag.with_suffix(".json").read_text())
 

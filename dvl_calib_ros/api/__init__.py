@@ -212,9 +212,9 @@ def diagnose(
     ]
     if simulator is not None:
         from ..unpaired.compare import compare as against
-        from ..unpaired.logs import Source
+        from ..unpaired.logs import RecordedSide
 
-        real, made = (Source(recording, found.parameters, found.topics) for recording, found in sides)
+        real, made = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
         return against(real, made)
     from ..diagnosis.diagnose import diagnose as run
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .batches import Batch, Index
 from .channels import Channel, Decoder, DecodingError
-from .layout import Columns, Layout, NoLayoutError, Rows, layout_of
+from .layout import Layout, MessageColumns, NoLayoutError, Rows, layout_of
 from .reader import BagReader
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
@@ -34,7 +34,7 @@ class Part:
     channel: Channel
     arrival: Stamps
     log_ns: Stamps
-    columns: Columns | None
+    columns: MessageColumns | None
     _data: Sequence[bytes]
     _decoder: Decoder
 
@@ -131,7 +131,7 @@ class _Layouts:
         self._decoder = decoder
         self._known: dict[tuple[Channel, int], list[Layout]] = {}
 
-    def split(self, channel: Channel, data: Rows) -> Iterator[tuple[Columns | None, Index]]:
+    def split(self, channel: Channel, data: Rows) -> Iterator[tuple[MessageColumns | None, Index]]:
         """Messages of one length, and which of them they are, by layout; those without any last, with None."""
         known = self._known.setdefault((channel, data.itemsize), [])
         left = np.arange(len(data))
@@ -144,10 +144,10 @@ class _Layouts:
             rows = layout.view(data if len(left) == len(data) else data[left])
             shared = layout.shared(rows)
             if shared.all():
-                yield Columns(layout, rows), left
+                yield MessageColumns(layout, rows), left
                 return
             if shared.any():
-                yield Columns(layout, rows[shared]), left[shared]
+                yield MessageColumns(layout, rows[shared]), left[shared]
             left = left[~shared]
         if len(left):
             yield None, left

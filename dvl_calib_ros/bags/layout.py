@@ -71,7 +71,7 @@ class Layout:
         return shared
 
 
-class Columns:
+class MessageColumns:
     """Rows with the names of a message's fields, as a message has them: ``columns.twist.twist.linear.x`` is (N,).
 
     Strings are (N, length) bytes, arrays of numbers (N, size). Raises AttributeError for what is no field.
@@ -93,22 +93,22 @@ class Columns:
             return np.zeros((len(self), 0), dtype=np.uint8)
         if path not in layout.inner:
             raise AttributeError(f"no field {path!r}")
-        return Columns(layout, self._rows, f"{path}.")
+        return MessageColumns(layout, self._rows, f"{path}.")
 
     def messages(self) -> Iterator[bytes]:
         """The bytes of each message, as recorded."""
         return (row.tobytes() for row in self._rows.view(("V", self._rows.itemsize)))
 
-    def part(self, at: Any) -> Columns:
+    def part(self, at: Any) -> MessageColumns:
         """The rows of a slice, of indices or of a mask."""
-        return Columns(self._layout, self._rows[at], self._prefix)
+        return MessageColumns(self._layout, self._rows[at], self._prefix)
 
 
 def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
     """The layout of a message. Raises NoLayoutError, also where rosbags makes something else of the message."""
     if len(data) < ENCAPSULATION or data[:2] not in (b"\0\0", b"\0\1"):
         raise NoLayoutError("no CDR")
-    walk = _Walk(store, data)
+    walk = _LayoutWalk(store, data)
     walk.message("", msgtype)
     if not walk.at <= len(data) <= walk.at + _PADDING:
         raise NoLayoutError("of another length than it says")
@@ -130,7 +130,7 @@ def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
     return layout
 
 
-class _Walk:
+class _LayoutWalk:
     """Goes through a message's definition and the message at once."""
 
     def __init__(self, store: Typestore, data: bytes) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from .frames import Array
-from .heading_states import BlockTerms, HeadingStates, Seen, all_told, heading_states, with_terms
+from .heading_states import BlockTerms, HeadingEvidence, HeadingStates, all_told, heading_states, with_terms
 from .kalman import GaussianState
 from .samples import Index, Stamps
 from .time_blocks import TimeBlocks
@@ -86,7 +86,7 @@ class BlockScatter:
         if index not in self._found:
             of_one = GaussianState(*(each[index : index + 1] for each in self._state))
             self._found[index] = heading_states(
-                [Seen.of(self._blocks, of_one, np.array([index]), 0)], self._heading_std
+                [HeadingEvidence.of(self._blocks, of_one, np.array([index]), 0)], self._heading_std
             )[0]
         return self._found[index]
 

@@ -28,10 +28,10 @@ from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
 from .days import day_covariance, offset_covariance
-from .delay.hold_out import NO_TERMS, Compared, Recording, Terms
+from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording
 from .delay.workers import Worker
 from .error_model import correction_matrix
-from .estimator import Estimator, Given, LinearEstimator, kind_of
+from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
 from .frames import Array, Vector
 from .heading_deviation import comes_first, heading_advice
 from .headings import EVERY_NS, Headings
@@ -71,7 +71,7 @@ _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
 _KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estimator}
 
 
-class _Seen(NamedTuple):
+class _RowsSeen(NamedTuple):
     """Rows first .. decided - 1 as models with some needs see them: those that have these, with their numbers.
 
     observations: None where no row has them.
@@ -132,7 +132,7 @@ class Calibrator:
         self._recordings_ns = recordings_ns
         self._observer = Observer(parameters)
         self._day_covariances: dict[str, Array] = {}
-        self._compared: tuple[Recording, Compared] | None = None  # as mounted
+        self._compared: tuple[ThinnedRecording, Compared] | None = None  # as mounted
         self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
         self.reset()
 
@@ -166,7 +166,7 @@ class Calibrator:
         self._further = tuple(self._estimators[name] for name in self._models if MODELS[name].estimator)
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
-        self._seen: dict[Needs, _Seen] = {}
+        self._seen: dict[Needs, _RowsSeen] = {}
         if self._trace is not None:
             self._trace.start(self._groups)
 
@@ -174,7 +174,7 @@ class Calibrator:
         """The estimator that a model names."""
         together = 1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK)
         return _KINDS[model.name](
-            Given(
+            EstimatorSetup(
                 model=model,
                 parameters=self.parameters,
                 aligner=self._aligner,
@@ -343,7 +343,7 @@ class Calibrator:
             Needs.NOTHING: partners.n_judged, Needs.ATTITUDE: partners.n_oriented, Needs.REFERENCE: partners.n_paired,
         }[needs]  # fmt: skip
 
-    def _observed(self, needs: Needs, first: int, decided: int) -> _Seen:
+    def _observed(self, needs: Needs, first: int, decided: int) -> _RowsSeen:
         """Rows first .. decided - 1 as models with these needs see them; several groups ask for the same."""
         seen = self._seen.get(needs)
         if seen is None or (seen.first, seen.decided) != (first, decided):
@@ -355,7 +355,7 @@ class Calibrator:
             found = (
                 self._observer.observe(block, needs, self._aligner.partners.prior.sway_heave) if len(block) else None
             )
-            seen = self._seen[needs] = _Seen(first, decided, block, numbers, found)
+            seen = self._seen[needs] = _RowsSeen(first, decided, block, numbers, found)
         return seen
 
     def _forget_rows(self) -> None:
@@ -623,7 +623,7 @@ class Calibrator:
         return np.zeros(len(stamps_ns), dtype=np.intp) if keeper is None else keeper.day_of(stamps_ns)
 
     @property
-    def recording(self) -> tuple[Recording, int] | None:
+    def recording(self) -> tuple[ThinnedRecording, int] | None:
         """What was kept for verification of all streams, and the stamp (ns) of its time 0; None for nothing."""
         keeper = self._keeper
         return None if keeper is None else keeper.recording

@@ -117,7 +117,7 @@ class Change:
     first_after: Extrinsics
 
 
-class Answer(NamedTuple):
+class ComparisonAnswer(NamedTuple):
     """What comes of a comparison's word. severity: as of a verdict, which colours it. exit_code: of the command."""
 
     severity: Severity
@@ -125,9 +125,9 @@ class Answer(NamedTuple):
 
 
 ANSWERS = {
-    "same": Answer(Severity.ACCEPT, 0),
-    "suspicious": Answer(Severity.MARGINAL, 3),
-    "moved": Answer(Severity.REJECT, 1),
+    "same": ComparisonAnswer(Severity.ACCEPT, 0),
+    "suspicious": ComparisonAnswer(Severity.MARGINAL, 3),
+    "moved": ComparisonAnswer(Severity.REJECT, 1),
 }
 
 
@@ -156,7 +156,7 @@ class Comparison(Answering):
         return "moved" if self.moved else "suspicious" if self.suspicious else "same"
 
     @property
-    def answer(self) -> Answer:
+    def answer(self) -> ComparisonAnswer:
         """What comes of the word."""
         return ANSWERS[self.word]
 

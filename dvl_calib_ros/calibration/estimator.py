@@ -16,7 +16,7 @@ import numpy as np
 from .alignment import Aligner
 from .bank import Group, ModelCounts
 from .delay.clocks import Rest
-from .delay.hold_out import Recording, Terms
+from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
 from .folds import Moments
 from .frames import Array
@@ -35,7 +35,7 @@ NEVER = 2**63 - 1
 
 
 @dataclass(frozen=True)
-class Given:
+class EstimatorSetup:
     """What an estimator of a model is made with.
 
     base: the estimator of the model that this one extends; None where it extends none. initial: a state to start from,
@@ -139,7 +139,7 @@ class Estimator(ABC):
         return None
 
     @property
-    def recording(self) -> tuple[Recording, int] | None:
+    def recording(self) -> tuple[ThinnedRecording, int] | None:
         """What it kept of all streams for verification, and the stamp (ns) of its time 0; None for nothing."""
         return None
 
@@ -254,7 +254,7 @@ class LinearEstimator(Estimator):
         return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in states]
 
 
-def kind_of(model: Model) -> Callable[[Given], Estimator]:
+def kind_of(model: Model) -> Callable[[EstimatorSetup], Estimator]:
     """What makes the estimator that a model names; what another package does wrong is raised when one is made."""
     name = model.estimator
     try:
@@ -264,9 +264,9 @@ def kind_of(model: Model) -> Callable[[Given], Estimator]:
     except Exception as error:  # whatever a foreign package does wrong
         says = f"model {model.name}: its estimator {name} cannot be used ({type(error).__name__}: {error}); mend or "
 
-        def refuse(_: Given) -> Estimator:
+        def refuse(_: EstimatorSetup) -> Estimator:
             raise ParameterError(f"{says}uninstall that package")
 
         return refuse
-    make: Callable[[Given], Estimator] = kind
+    make: Callable[[EstimatorSetup], Estimator] = kind
     return make

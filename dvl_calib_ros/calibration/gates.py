@@ -6,7 +6,7 @@ import numpy as np
 
 from .frames import Array, Vector
 from .parameters import Parameters
-from .samples import Codes, Mask, Stamps, Verdict
+from .samples import Codes, Mask, SampleUse, Stamps
 
 
 class Gates:
@@ -22,16 +22,16 @@ class Gates:
         verdict = np.zeros(len(velocity), dtype=np.uint8)
         slow = _squared(velocity) < p.min_speed * p.min_speed
         if slow.any():
-            verdict[slow] = Verdict.SLOW
+            verdict[slow] = SampleUse.SLOW
             moving = np.flatnonzero(~slow)
-            verdict[moving[self._frozen(velocity[moving], p)]] = Verdict.FROZEN
+            verdict[moving[self._frozen(velocity[moving], p)]] = SampleUse.FROZEN
         else:
-            verdict[self._frozen(velocity, p)] = Verdict.FROZEN
+            verdict[self._frozen(velocity, p)] = SampleUse.FROZEN
         if p.max_turn_rate > 0.0:
             square = _squared(angular_velocity)
-            open_ = verdict == Verdict.USED
-            verdict[open_ & np.isnan(square)] = Verdict.NO_TURN_RATE
-            verdict[open_ & (square > p.max_turn_rate * p.max_turn_rate)] = Verdict.TURNING
+            open_ = verdict == SampleUse.USED
+            verdict[open_ & np.isnan(square)] = SampleUse.NO_TURN_RATE
+            verdict[open_ & (square > p.max_turn_rate * p.max_turn_rate)] = SampleUse.TURNING
         return verdict
 
     def _frozen(self, velocity: Array, p: Parameters) -> Mask:

@@ -144,7 +144,7 @@ class HeadingStates(NamedTuple):
     inflation: Array
 
 
-class Seen(NamedTuple):
+class HeadingEvidence(NamedTuple):
     """M hypotheses as they stood once: x (M, n), P (M, n, n) without a deviation, and what blocks of time told of them.
 
     best: place of the one that says how large it is. information (M, n + 6, n + 6), vector (M, n + 6): of all blocks
@@ -158,11 +158,11 @@ class Seen(NamedTuple):
     blocks: BlocksOfOne
 
     @staticmethod
-    def of(blocks: TimeBlocks, states: GaussianState, numbers: Index, best: int) -> Seen:
+    def of(blocks: TimeBlocks, states: GaussianState, numbers: Index, best: int) -> HeadingEvidence:
         """Of hypotheses with these numbers (M,) in the blocks, as of now."""
         information, vector = blocks.total
         some = numbers if blocks.count else numbers[:0]
-        return Seen(states, best, information[some], vector[some], blocks.of(int(numbers[best])))
+        return HeadingEvidence(states, best, information[some], vector[some], blocks.of(int(numbers[best])))
 
     @property
     def has_terms(self) -> bool:
@@ -170,7 +170,7 @@ class Seen(NamedTuple):
         return self.vector.shape[1] > self.states.x.shape[1]
 
 
-def heading_states(seen: Sequence[Seen], std: float) -> list[HeadingStates]:
+def heading_states(seen: Sequence[HeadingEvidence], std: float) -> list[HeadingStates]:
     """The deviation each time; none where blocks are without terms, which say no more than `inflation`.
 
     std: rad, `heading_deviation_std`.
@@ -185,7 +185,7 @@ def heading_states(seen: Sequence[Seen], std: float) -> list[HeadingStates]:
     return [found[number] if number in found else _none(each) for number, each in enumerate(seen)]
 
 
-def _none(seen: Seen) -> HeadingStates:
+def _none(seen: HeadingEvidence) -> HeadingStates:
     """Of blocks without terms; and numbers that ran away say nothing of the heading."""
     m, n = seen.states.x.shape
     factor: Array = np.ones(n)
@@ -199,14 +199,14 @@ class _Deviation(NamedTuple):
     """What M hypotheses know of the coefficients. onto: (5, 6), from terms to coefficients. turned: (M, 5, n), by how
     much the states turn them. information (M, 5, 5), scores (M, 5): theirs, whatever the states are."""
 
-    seen: Seen
+    seen: HeadingEvidence
     onto: Array
     turned: Array
     information: Array
     scores: Array
 
     @staticmethod
-    def of(seen: Seen) -> _Deviation:
+    def of(seen: HeadingEvidence) -> _Deviation:
         """By what was seen."""
         x, p = seen.states
         n, told = x.shape[1], seen.information

@@ -62,7 +62,7 @@ FORETOLD_BY, NEW_AT_MOST = 12, 4.0
 FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
 
 
-class Followed(NamedTuple):
+class LeftOver(NamedTuple):
     """What the velocity that is left follows.
 
     tilt, tilt_std: (2,) share of roll and of pitch that the DVL's velocity leaves out, 0 of a right one, 1 of a
@@ -99,7 +99,7 @@ class _Fit(NamedTuple):
 
 def left_over(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array
-) -> Followed | None:
+) -> LeftOver | None:
     """None where there is too little to look at.
 
     Parameters
@@ -152,13 +152,13 @@ def left_over(
     # without tilt, what waves do to it looks like turning
     shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
     smoothed_std = float(fast.std[-1]) if shows else math.inf
-    return Followed(
+    return LeftOver(
         tilt, std, slow.x[-3:], slow.std[-3:], float(fast.x[-1]), smoothed_std, lean, speed,
         *_circular(time, velocity - error, both, fast),
     )  # fmt: skip
 
 
-def left_over_advice(found: Followed | None, of_positions: bool = False) -> list[Reason]:
+def left_over_advice(found: LeftOver | None, of_positions: bool = False) -> list[Reason]:
     """What to say of it, as bad as it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
@@ -197,7 +197,7 @@ def left_over_advice(found: Followed | None, of_positions: bool = False) -> list
     return said
 
 
-def _smoothed_one(found: Followed) -> str:
+def _smoothed_one(found: LeftOver) -> str:
     return "reference" if found.smoothed > 0.0 else "DVL"
 
 

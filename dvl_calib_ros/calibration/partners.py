@@ -17,7 +17,7 @@ from .gates import Gates, PriorWindow
 from .models import Needs
 from .parameters import Parameters
 from .rows import Rows
-from .samples import FRAME_CODES, Mask, Pairing, Stamps, VelocityFrame, Verdict
+from .samples import FRAME_CODES, Mask, Pairing, SampleUse, Stamps, VelocityFrame
 from .streams import LONG_AGO_NS, Track
 
 BODY = FRAME_CODES[VelocityFrame.BODY]
@@ -65,12 +65,12 @@ class Partners:
         verdict = self.gates.judge(rows.velocity_dvl[at], rates, parameters)
         rows.verdict[at] = verdict
         self.n_judged = end
-        used = verdict == Verdict.USED
+        used = verdict == SampleUse.USED
         n_used = int(np.count_nonzero(used))
         if n_used < end - first:
-            for code, count in enumerate(np.bincount(verdict, minlength=len(Verdict.NAMES)).tolist()):
-                if code != Verdict.USED:
-                    add_count(tally, Verdict.NAMES[code], count)
+            for code, count in enumerate(np.bincount(verdict, minlength=len(SampleUse.NAMES)).tolist()):
+                if code != SampleUse.USED:
+                    add_count(tally, SampleUse.NAMES[code], count)
         self.given[Needs.NOTHING] += n_used
         if self._has_lever_arm:
             add_count(tally, "lever_arm_uncompensated", int(np.count_nonzero(used & np.isnan(rates[:, 0]))))
@@ -96,7 +96,7 @@ class Partners:
         self.n_oriented = first + n
         if self.needs_turn_rate:
             self.judge(first + n, parameters)
-        usable = rows.verdict[at] == Verdict.USED
+        usable = rows.verdict[at] == SampleUse.USED
         n_usable = int(np.count_nonzero(usable))
         oriented = int(np.count_nonzero(usable & ~np.isnan(rows.attitude[at, 0] + rows.attitude[at, 4])))
         add_count(self._tally["pairing"], "oriented", oriented)
@@ -148,4 +148,4 @@ class Partners:
         add_count(tally, "paired", paired)
         add_count(tally, "unpaired", n - paired)
         add_count(tally, "without_attitude", int(np.count_nonzero(pairing == Pairing.WITHOUT_ATTITUDE)))
-        self.given[Needs.REFERENCE] += int(np.count_nonzero(is_paired & (rows.verdict[at] == Verdict.USED)))
+        self.given[Needs.REFERENCE] += int(np.count_nonzero(is_paired & (rows.verdict[at] == SampleUse.USED)))

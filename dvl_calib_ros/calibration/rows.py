@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from .frames import Array
-from .samples import AlignedBlock, Codes, Mask, Pairing, Stamps, Verdict
-from .tables import Table
+from .samples import AlignedBlock, Codes, Mask, Pairing, SampleUse, Stamps
+from .tables import RowTable
 
 
-class Rows(Table):
+class Rows(RowTable):
     """The columns of `AlignedBlock` as they come to be known."""
 
     LAYOUT: ClassVar = {
@@ -49,7 +49,7 @@ class Rows(Table):
 
     def await_partners(self, at: int | slice) -> None:
         """Fill in what is not known yet."""
-        self.verdict[at] = Verdict.AWAITING
+        self.verdict[at] = SampleUse.AWAITING
         self.prior_known[at] = False
         self.attitude[at] = math.nan
         self.pairing[at] = Pairing.AWAITING

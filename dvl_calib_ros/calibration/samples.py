@@ -299,7 +299,7 @@ class Streams(NamedTuple):
             yield self[stream].stream, next(rows[stream])
 
 
-class Verdict:
+class SampleUse:
     """Why a DVL sample in order is not used by any model; `USED` if it is. Codes of `AlignedBlock.verdict`.
 
     AWAITING: not known until it has, or can no longer have, an angular velocity.
@@ -322,7 +322,7 @@ class AlignedBlock:
 
     stamps_ns: (N,) compensated for dvl_time_offset. row: (N,) number of the DVL's message since the start, from 0.
     velocity_dvl: (N, 3) m/s, DVL frame. covariance: (N, 3, 3) (m/s)² of it, nan where not given. interval_ns: (N,)
-    since the sample before, 0 for the first. verdict: (N,) see `Verdict`. prior_known: (N,) whether prior sway and
+    since the sample before, 0 for the first. verdict: (N,) see `SampleUse`. prior_known: (N,) whether prior sway and
     heave were known by then. attitude: (N, 7) interpolated quaternion (x, y, z, w) of ``rotation_enu_from_body`` and
     angular velocity, rad/s, body frame; nan where not known. pairing: (N,) see `Pairing`. reference: (N, 12)
     interpolated velocity (3), m/s, and covariance (9, nan where not given), in the frame of frames: (N,) places in
@@ -363,7 +363,7 @@ class AlignedBlock:
     @cached_property
     def usable(self) -> Mask:
         """(N,) rows for models that need nothing else."""
-        return self.verdict == Verdict.USED
+        return self.verdict == SampleUse.USED
 
     @cached_property
     def oriented(self) -> Mask:
@@ -378,6 +378,6 @@ class AlignedBlock:
     def reasons(self) -> list[str]:
         """(N,) in words, why a row does not go to every model: the gates' verdict, else the pairing's."""
         return [
-            Verdict.NAMES[verdict] if verdict else Pairing.NAMES[pairing]
+            SampleUse.NAMES[verdict] if verdict else Pairing.NAMES[pairing]
             for verdict, pairing in zip(self.verdict.tolist(), self.pairing.tolist(), strict=True)
         ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from .frames import Array
 from .samples import Codes, Index, Mask, Stamps
-from .tables import Table
+from .tables import RowTable
 
 # Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
 LONG_AGO_NS = -(2**62)
@@ -144,7 +144,7 @@ class Brackets(NamedTuple):
     found: Mask
 
 
-class Track(Table):
+class Track(RowTable):
     """The recent past of one stream, to be interpolated but never extrapolated.
 
     values: what interpolates linearly or, of an IMU, the quaternion and the angular velocity, see samples.py; of a

@@ -14,7 +14,7 @@ SMALLEST = 128
 FULL = 0.75
 
 
-class Table:
+class RowTable:
     """Rows with a column per entry of `LAYOUT` (dtype, shape of one element), which are attributes of these names.
 
     The arrays are longer than what they hold: rows are in the slots begin .. size - 1. A row's number, counted since

@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.writer import Compression, Storage
     from ..calibration.samples import VelocityFrame
     from ..simulation.injection import injection
-    from ..simulation.recorded import Recording
+    from ..simulation.recorded import MotionSource
     from ..simulation.scenario import Scenario, write_bag
     from ..simulation.sensors import DvlErrors, ImuErrors
     from ..simulation.waves import Waves
@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
     scale = [0.01 * s for s in arguments.scale] * (3 if len(arguments.scale) == 1 else 1)
     bias_x, bias_y, bias_z = map(math.radians, arguments.gyro_bias)
     gnss_topic, imu_topic = arguments.motion_topics
-    recording = arguments.motion_of and Recording(
+    recording = arguments.motion_of and MotionSource(
         arguments.motion_of, gnss_topic, imu_topic, arguments.motion_frame, arguments.motion_smoothing
     )
     if recording:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from ..discovery.discover import Discovery
-    from ..unpaired.logs import Source
+    from ..unpaired.logs import RecordedSide
 
 NOT_WITH = ("apply", "twin")
 
@@ -60,13 +60,13 @@ def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
 
 def _source(
     arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
-) -> tuple[Source, Discovery]:
+) -> tuple[RecordedSide, Discovery]:
     """One side's bags and what they say of themselves."""
-    from ..unpaired.logs import Source
+    from ..unpaired.logs import RecordedSide
 
     own = argparse.Namespace(**{**vars(arguments), "params": params})
     recording = common.opened(bags, common.load(own))
     discovery = common.discovered(own, recording, common.load(own))
     common.print_warnings(discovery.doubts)
     parameters = common.load(own, defaults).replace(**discovery.values)
-    return Source(recording, parameters, discovery.topics), discovery
+    return RecordedSide(recording, parameters, discovery.topics), discovery

@@ -12,7 +12,7 @@ from ..calibration.frames import Array
 from .composed import Hypothesis, Problem
 from .fitting import Fit, Fitter
 from .folds import fitted_without, folds_of, stretch_of
-from .selection import Selection
+from .selection import EffectSelection
 from .settings import SETTINGS
 
 RESAMPLES = 1000
@@ -64,7 +64,7 @@ class HeldOutResiduals:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
-def held_out(selection: Selection) -> HeldOutResiduals:
+def held_out(selection: EffectSelection) -> HeldOutResiduals:
     """What is left before and after the effects of a selection, on held-out data.
 
     Of one recording stretches of time in turn are held out; of several whole ones, with what belongs to the day
@@ -92,7 +92,7 @@ def held_out(selection: Selection) -> HeldOutResiduals:
     )
 
 
-def _with_its_own_day(selection: Selection, hypothesis: Hypothesis, recording: int) -> Fit:
+def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
     """Fit to one recording with the vehicle as others tell it and the day as it tells itself."""
     problem, noise = selection.fitter.problem, selection.fit.noise
     alone = only(problem, recording)
@@ -112,7 +112,7 @@ def only(problem: Problem, recording: int) -> Problem:
     return replace(made, grids=(problem.grids[recording],), of_axes=problem.measured)
 
 
-def measure_gap(selection: Selection, residuals: HeldOutResiduals) -> Gap:
+def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
     """Held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
     before, after, floor = residuals.squares()
     n = len(residuals.before)
@@ -151,7 +151,7 @@ def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tu
     return found
 
 
-def closure_alone(selection: Selection, gap: Gap, name: str) -> float:
+def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
     """Share of the gap that one effect closes without the others, as fitted to all data."""
     fitter, fit = selection.fitter, selection.fit
     chosen = [effect for effect in fit.effects if effect.name == name]
@@ -167,7 +167,7 @@ def closure_alone(selection: Selection, gap: Gap, name: str) -> float:
 # ------------------------------------------------------------------ noise
 
 
-def noise_floor(selection: Selection) -> Array:
+def noise_floor(selection: EffectSelection) -> Array:
     """(F, 3) (m/s)²: the noise of each sample.
 
     Where what the fit leaves is as small as the high frequencies say that the noise is, it is what is left, sample by

@@ -25,11 +25,11 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
-from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, MountingEffect, Needs, ParameterSpec
+from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter, MountingEffect
 from ..effects.composition import Injection, late, traces, turns
 from .curve import Curve
 from .noise import segments_of
-from .recordings import Recording
+from .recordings import RecordedStreams
 from .settings import SETTINGS
 
 Values = Mapping[str, float]
@@ -37,12 +37,12 @@ Values = Mapping[str, float]
 _PASSES = 3
 
 
-def is_time_of_run(spec: ParameterSpec) -> bool:
+def is_time_of_run(spec: EffectParameter) -> bool:
     """Whether a parameter is a time at which an effect begins or ends."""
     return spec.unit == "s" and not np.isfinite(spec.high)
 
 
-def amplitudes(effect: Effect) -> list[ParameterSpec]:
+def amplitudes(effect: Effect) -> list[EffectParameter]:
     """Parameters with a derivative: all but times of the run."""
     return [spec for spec in effect.parameters if not is_time_of_run(spec)]
 
@@ -59,7 +59,7 @@ class Parameter:
     """One number that is fitted. recording: whose, None for all (of the vehicle)."""
 
     effect: Effect
-    spec: ParameterSpec
+    spec: EffectParameter
     recording: int | None
 
 
@@ -192,7 +192,7 @@ class Grid:
 class Problem:
     """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare."""
 
-    recordings: tuple[Recording, ...]
+    recordings: tuple[RecordedStreams, ...]
     rotation_dvl_from_body: Array
     lever_arm: Array
     grids: tuple[Grid, ...]
@@ -203,7 +203,7 @@ class Problem:
     # ------------------------------------------------------------------ the data
 
     @cached_property
-    def available(self) -> frozenset[Needs]:
+    def available(self) -> frozenset[EffectNeeds]:
         """What effects may need and every recording has."""
         return frozenset.intersection(*(recording.available for recording in self.recordings))
 
@@ -243,7 +243,7 @@ class Problem:
     @cached_property
     def earth_from_compared(self) -> Array | None:
         """(M, A, A) from the frame of the residual to the earth's, None without attitude."""
-        if Needs.ATTITUDE not in self.available:
+        if EffectNeeds.ATTITUDE not in self.available:
             return None
         parts = []
         for recording, grid in zip(self.recordings, self.grids, strict=True):
@@ -251,7 +251,7 @@ class Problem:
             parts.append(rotation @ np.swapaxes(self.projection(recording, rotation), 1, 2))
         return np.concatenate(parts)[:, [axis for axis in range(3) if self.measured[axis]]]
 
-    def projection(self, recording: Recording, rotation_enu_from_body: Array | None) -> Array:
+    def projection(self, recording: RecordedStreams, rotation_enu_from_body: Array | None) -> Array:
         """(F, A, 3) from the body frame to the axes that are compared: those of the body, or of it held level."""
         if all(self.measured):
             return np.eye(3)[None]
@@ -266,9 +266,9 @@ class Problem:
         projected: Array = level @ rotation_enu_from_body[:, :2]
         return projected
 
-    def to_compared(self, recording: Recording, at: Array, of_dvl: bool) -> Array:
+    def to_compared(self, recording: RecordedStreams, at: Array, of_dvl: bool) -> Array:
         """(M, A, 3) or (1, A, 3) from the frame of the DVL or of the reference to the axes that are compared."""
-        oriented = Needs.ATTITUDE in self.available
+        oriented = EffectNeeds.ATTITUDE in self.available
         rotation = recording.rotation_enu_from_body(at) if oriented else None
         projection = self.projection(recording, rotation)
         if of_dvl:
@@ -324,16 +324,16 @@ class Problem:
         projection = self._kept_projection(stream, rotation, attitude)
         return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix, dvl, reference, projection)
 
-    def _kept_projection(self, stream: Recording, rotation: Array | None, at: Array) -> Array:
+    def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
         """`projection` at times (F,) s of the attitude, of which the last few are kept."""
         if stream.attitude is None or all(self.measured):
             return self.projection(stream, rotation)
         what = f"projection {self.measured}"
         return np.asarray(stream.attitude.kept.at(what, at, lambda: self.projection(stream, rotation)))
 
-    def _oriented(self, stream: Recording, at: Array) -> tuple[Array | None, Array | None]:
-        rotation = stream.rotation_enu_from_body(at) if Needs.ATTITUDE in self.available else None
-        return rotation, stream.angular_velocity(at) if Needs.ANGULAR_VELOCITY in self.available else None
+    def _oriented(self, stream: RecordedStreams, at: Array) -> tuple[Array | None, Array | None]:
+        rotation = stream.rotation_enu_from_body(at) if EffectNeeds.ATTITUDE in self.available else None
+        return rotation, stream.angular_velocity(at) if EffectNeeds.ANGULAR_VELOCITY in self.available else None
 
     def all_seen(self, hypothesis: Hypothesis) -> list[Seen]:
         """Every recording through a hypothesis."""
@@ -500,7 +500,7 @@ def _left_jacobian(angles: Array) -> Array:
     return np.asarray(np.eye(3) + once * cross + twice * (cross @ cross))
 
 
-def _difference(spec: ParameterSpec, values: Values, of: Callable[[Values], Array]) -> Array:
+def _difference(spec: EffectParameter, values: Values, of: Callable[[Values], Array]) -> Array:
     """d of / d parameter, by central differences, within its bounds."""
     step = 0.05 * spec.typical
     low, high = max(values[spec.name] - step, spec.low), min(values[spec.name] + step, spec.high)
@@ -509,7 +509,7 @@ def _difference(spec: ParameterSpec, values: Values, of: Callable[[Values], Arra
 
 
 def make_problem(
-    recordings: Sequence[Recording], rotation_dvl_from_body: Array, lever_arm: Array, offsets: Sequence[Offsets]
+    recordings: Sequence[RecordedStreams], rotation_dvl_from_body: Array, lever_arm: Array, offsets: Sequence[Offsets]
 ) -> Problem:
     """The problem on bins where all streams are known, with offsets (about which hypotheses lie) and without."""
     grids = tuple(_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
@@ -528,7 +528,7 @@ class Offsets:
 MARGIN_S = 0.5
 
 
-def _grid(recording: Recording, offsets: Offsets) -> Grid:
+def _grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     settings = SETTINGS
     by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
     base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)

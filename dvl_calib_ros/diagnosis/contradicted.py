@@ -18,7 +18,7 @@ from ..effects.base import ActsOn
 from ..effects.composition import late
 from .composed import Hypothesis, Problem
 from .curve import FAST_ENOUGH_S
-from .recordings import Recording
+from .recordings import RecordedStreams
 
 # Scatter about neighbours and about the other stream, beyond which both contradict
 FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
@@ -29,7 +29,7 @@ FEWEST = 30
 _PASSES = 3
 
 
-def without_contradicted(problem: Problem, hypothesis: Hypothesis) -> tuple[Recording, ...] | None:
+def without_contradicted(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
     """The recordings without samples of slow streams that neighbours and the other stream contradict; None if none is.
 
     Parameters
@@ -42,7 +42,7 @@ def without_contradicted(problem: Problem, hypothesis: Hypothesis) -> tuple[Reco
     return None if all(one is two for one, two in zip(found, problem.recordings, strict=True)) else tuple(found)
 
 
-def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> Recording:
+def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
     recording = problem.recordings[index]
     dvl = _kept(problem, hypothesis, index, ActsOn.DVL_CLOCK)
     reference = _kept(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)

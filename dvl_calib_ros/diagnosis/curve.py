@@ -29,7 +29,7 @@ FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 
 
-class Kept:
+class Remembered:
     """What was made of a stream at some times, the last few: fits look at the same times again and again."""
 
     _LIMIT = 8
@@ -59,7 +59,7 @@ class Curve:
     claimed: Array | None = None
     like: Curve | None = None
     claims: Array | None = None
-    kept: Kept = field(init=False, default_factory=Kept, repr=False)
+    kept: Remembered = field(init=False, default_factory=Remembered, repr=False)
 
     @cached_property
     def interval(self) -> float:

@@ -14,7 +14,7 @@ from ..calibration.distributions import normal_isf
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
-from ..effects.base import ClockEffect, Effect, Needs
+from ..effects.base import ClockEffect, Effect, EffectNeeds
 from ..effects.registry import EFFECTS
 from ..errors import InputError
 from ..recordings.recording import Recording as Opened
@@ -25,10 +25,10 @@ from .dvl import dvl_seen
 from .fitting import prior_std
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
-from .recordings import Recording, load_recordings
+from .recordings import RecordedStreams, load_recordings
 from .registered import check_clocks
-from .results import Diagnosis, FoundEffect, Verdict, diagnosis_document
-from .selection import Selected, Selection, blocks_of, select
+from .results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
+from .selection import EffectSelection, Selected, blocks_of, select
 from .series import collect_series
 from .settings import SETTINGS
 from .standing import is_borne_out, matters, settled
@@ -65,7 +65,7 @@ def diagnose(
 
 
 def diagnose_recordings(
-    recordings: Sequence[Recording],
+    recordings: Sequence[RecordedStreams],
     parameters: Parameters,
     notes: Sequence[str] = (),
     effects: Mapping[str, Effect] = EFFECTS,
@@ -99,9 +99,9 @@ def diagnose_recordings(
     covariance = selection.fit.covariance(blocks_of(selection.fitter.problem))
     found = tuple(_found(selection, each, covariance, len(testable), gap) for each in selection.selected)
     columns = rest.columns
-    if selection.selected and not (verdict is Verdict.UNKNOWN and rest.found):
+    if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and rest.found):
         columns = selection.fit.columns[:, :, 6:]
-    is_gap = verdict in (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
+    is_gap = verdict in (DiagnosisVerdict.KNOWN, DiagnosisVerdict.AMBIGUOUS, DiagnosisVerdict.UNKNOWN)
     hypothesis = selection.fit.hypothesis
     calibration = zip([*hypothesis.phi, *hypothesis.scale], np.sqrt(np.diag(covariance)[:6]).tolist(), strict=True)
     return Diagnosis(
@@ -125,7 +125,7 @@ def diagnose_recordings(
     )
 
 
-def _check_bounds(selection: Selection) -> None:
+def _check_bounds(selection: EffectSelection) -> None:
     """Raise InputError for a clock that is as far off as can be: it is further, and nothing beside it is right."""
     hypothesis = selection.fit.hypothesis
     for each in hypothesis.parameters():
@@ -142,7 +142,7 @@ def _interval(value: float, std: float) -> Triple:
     return value, value - 1.96 * std, value + 1.96 * std
 
 
-def _lacks(effect: Effect, available: frozenset[Needs], recordings: Sequence[Recording]) -> str:
+def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
     """What recordings lack for an effect to be testable, '' if nothing."""
     lacking = [need.value for need in effect.needs - available]
     if effect.relative_to_first and len(recordings) < 2:
@@ -150,7 +150,7 @@ def _lacks(effect: Effect, available: frozenset[Needs], recordings: Sequence[Rec
     return ", ".join(sorted(lacking))
 
 
-def _compared_axes(selection: Selection) -> str:
+def _compared_axes(selection: EffectSelection) -> str:
     problem = selection.fitter.problem
     axes = "".join(name for name, measured in zip("xyz", problem.measured, strict=True) if measured)
     if len(axes) == 3:
@@ -159,7 +159,7 @@ def _compared_axes(selection: Selection) -> str:
     return f"{axes} of the body" if in_body else f"{axes} of the body held level" if axes == "xy" else f"{axes} (ENU)"
 
 
-def _says_nothing(recordings: Sequence[Recording]) -> str:
+def _says_nothing(recordings: Sequence[RecordedStreams]) -> str:
     """Why recordings cannot say anything, '' if they can."""
     seconds = sum(recording.seconds for recording in recordings)
     samples = sum(min(len(recording.dvl.time), len(recording.reference.time)) for recording in recordings)
@@ -178,7 +178,7 @@ def _says_nothing(recordings: Sequence[Recording]) -> str:
 def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
     nan = float("nan")
     return Diagnosis(
-        verdict=Verdict.INSUFFICIENT_EXCITATION,
+        verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION,
         sentence=f"This recording cannot show a gap: {why}.",
         gap=Gap(nan, nan, nan, nan, (nan, nan)),
         effects=(),
@@ -191,19 +191,19 @@ def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
     )
 
 
-def _verdict(selection: Selection, rest: Unexplained, gap: Gap, visible_share: float) -> Verdict:
+def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
     if matters(selection.fitter.problem, selection.fit, rest):
-        return Verdict.UNKNOWN
+        return DiagnosisVerdict.UNKNOWN
     # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
     if selection.selected and gap.not_explained > gap.noise_floor:
-        return Verdict.UNKNOWN
+        return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
-        return Verdict.AMBIGUOUS if ambiguous else Verdict.KNOWN
-    return Verdict.NO_GAP if visible_share >= MIN_VISIBLE_SHARE else Verdict.INSUFFICIENT_EXCITATION
+        return DiagnosisVerdict.AMBIGUOUS if ambiguous else DiagnosisVerdict.KNOWN
+    return DiagnosisVerdict.NO_GAP if visible_share >= MIN_VISIBLE_SHARE else DiagnosisVerdict.INSUFFICIENT_EXCITATION
 
 
-def _minimum_detectable(selection: Selection, effect: Effect, n_tested: int) -> dict[str, float]:
+def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: int) -> dict[str, float]:
     """Size of each parameter that is found with a power of 80 per cent at the level of the tests."""
     fit, problem = selection.fit, selection.fitter.problem
     columns = [fit.columns]
@@ -222,7 +222,7 @@ def _minimum_detectable(selection: Selection, effect: Effect, n_tested: int) -> 
     return {spec.name: factor * float(each) for spec, each in zip(amplitudes(effect), own, strict=False)}
 
 
-def _somewhere(effect: Effect, recordings: Sequence[Recording]) -> list[Mapping[str, float]]:
+def _somewhere(effect: Effect, recordings: Sequence[RecordedStreams]) -> list[Mapping[str, float]]:
     """Defaults, with what comes in the midst of the run where no time is given."""
     values: list[Mapping[str, float]] = []
     for recording in recordings:
@@ -240,7 +240,7 @@ def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
     return any(size <= VISIBLE_TIMES_TYPICAL * typical[name] for name, size in sizes.items())
 
 
-def _found(selection: Selection, selected: Selected, covariance: Array, n_tested: int, gap: Gap) -> FoundEffect:
+def _found(selection: EffectSelection, selected: Selected, covariance: Array, n_tested: int, gap: Gap) -> FoundEffect:
     fit, effect = selection.fit, selected.effect
     stds = np.sqrt(np.diag(covariance))[6:].tolist()
     by_recording: dict[int, dict[str, Triple]] = {}
@@ -283,7 +283,7 @@ def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:
 
 
 def _next_manoeuvre(
-    verdict: Verdict,
+    verdict: DiagnosisVerdict,
     selected: Sequence[Selected],
     testable: Mapping[str, Effect],
     untestable: Mapping[str, str],
@@ -298,7 +298,7 @@ def _next_manoeuvre(
             + "; ".join(dict.fromkeys(each.manoeuvre for each in (effect, *others)))
             for effect, others in sets
         )
-    if verdict is Verdict.UNKNOWN:
+    if verdict is DiagnosisVerdict.UNKNOWN:
         return "the same route again: what stays with the place, the time or the motion tells what it follows"
 
     def times_typical(name: str) -> float:
@@ -313,7 +313,12 @@ def _next_manoeuvre(
 
 
 def _sentence(
-    verdict: Verdict, gap: Gap, found: Sequence[FoundEffect], rest: Unexplained, visible: Sequence[str], n_tested: int
+    verdict: DiagnosisVerdict,
+    gap: Gap,
+    found: Sequence[FoundEffect],
+    rest: Unexplained,
+    visible: Sequence[str],
+    n_tested: int,
 ) -> str:
     names = " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found)
     falls = (
@@ -322,13 +327,13 @@ def _sentence(
     )
     is_left = gap.not_explained > WORTH_TELLING * gap.noise_floor
     left = f"; {1e3 * gap.not_explained:.1f} mm/s are not explained" if is_left else ""
-    if is_left and rest.found and verdict is not Verdict.UNKNOWN:
+    if is_left and rest.found and verdict is not DiagnosisVerdict.UNKNOWN:
         left += f" and follow {rest.about}"
-    if verdict is Verdict.KNOWN:
+    if verdict is DiagnosisVerdict.KNOWN:
         return f"The gap is explained by {names}: {falls}{left}."
-    if verdict is Verdict.AMBIGUOUS:
+    if verdict is DiagnosisVerdict.AMBIGUOUS:
         return f"The gap is explained by {names}: {falls}{left}; this data cannot tell between them."
-    if verdict is Verdict.UNKNOWN:
+    if verdict is DiagnosisVerdict.UNKNOWN:
         if found:
             follows = f"what is left follows {rest.about}" if rest.found else "what it follows does not show"
             return (
@@ -338,7 +343,7 @@ def _sentence(
             f"There is an error of {1e3 * gap.before:.1f} mm/s, over noise of {1e3 * gap.noise_floor:.1f}, that no "
             f"effect of the library explains; it follows {rest.about}."
         )
-    if verdict is Verdict.NO_GAP:
+    if verdict is DiagnosisVerdict.NO_GAP:
         return (
             f"No gap beyond the noise of {gap.noise_floor:.3f} m/s{left}; {len(visible)} of {n_tested} effects would "
             "have shown at sizes that matter."

@@ -16,8 +16,8 @@ from ..calibration.parameters import Parameters
 from ..effects.registry import EFFECTS
 from .composed import Hypothesis, Problem, Values
 from .curve import Curve
-from .recordings import Recording
-from .selection import Selection
+from .recordings import RecordedStreams
+from .selection import EffectSelection
 from .twin import simulated, with_quiet_reference
 
 Three = tuple[float, float, float]
@@ -54,7 +54,7 @@ class DvlSeen:
 STALE = "stale_samples"
 
 
-def dvl_seen(selection: Selection, parameters: Parameters) -> DvlSeen:
+def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
     """The DVL of what was selected; parameters: those with which the recordings were read."""
     problem = replace(selection.fitter.problem, lever_arm=np.zeros(3))
     hypothesis = _whole(selection, parameters)
@@ -84,7 +84,7 @@ def dvl_seen(selection: Selection, parameters: Parameters) -> DvlSeen:
     )
 
 
-def _whole(selection: Selection, parameters: Parameters) -> Hypothesis:
+def _whole(selection: EffectSelection, parameters: Parameters) -> Hypothesis:
     """The hypothesis with what the parameters compensated before it was fitted."""
     hypothesis = selection.fit.hypothesis
     n = len(selection.fitter.problem.recordings)
@@ -113,7 +113,7 @@ def _rms(difference: Array) -> float:
     return float(np.sqrt((difference**2).sum(axis=1).mean()))
 
 
-def _noise(recordings: Sequence[Recording], selection: Selection) -> Array:
+def _noise(recordings: Sequence[RecordedStreams], selection: EffectSelection) -> Array:
     """(3,) m/s: the lesser of what neighbours do not tell of the DVL's own samples, and of their residual.
 
     The first holds motion that is too quick for the DVL's rate (of a slow one no more is believed than it claims), the

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..calibration.distributions import chi2_sf
 from ..calibration.frames import Array
-from ..effects.base import Needs
+from ..effects.base import EffectNeeds
 from .claims import Claims, claims_of, exponents, followed, stretches_of
 from .composed import Problem, Seen
 from .noise import Noise, white_noise
@@ -31,7 +31,7 @@ class Level:
 def covariates(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
     """(M,) each: speed m/s, turn rate rad/s where there is an IMU."""
     found = {"speed": problem.sampled(seen, lambda motion: motion.speed)}
-    if Needs.ANGULAR_VELOCITY in problem.available:
+    if EffectNeeds.ANGULAR_VELOCITY in problem.available:
         found["turn_rate"] = problem.sampled(seen, lambda motion: np.linalg.norm(motion.turn_rate, axis=1))
     return {name: values for name, values in found.items() if np.std(values) > 1e-3 * max(1.0, abs(np.mean(values)))}
 

@@ -21,7 +21,7 @@ from ..effects.composition import late, traces
 from .composed import Hypothesis, Problem, Seen
 from .curve import FAST_ENOUGH_S, Curve
 from .fitting import Fit
-from .recordings import Recording
+from .recordings import RecordedStreams
 
 # Passes in which the true time of a late stamp is found
 _PASSES = 3
@@ -67,7 +67,7 @@ def made_up(problem: Problem, fit: Fit, count: int) -> Iterator[tuple[Problem, l
         yield other, seen, residual + beyond * fit.noise.unwhiten(rng.standard_normal(residual.size))
 
 
-def _moving(recording: Recording) -> Recording:
+def _moving(recording: RecordedStreams) -> RecordedStreams:
     """A recording whose curves are the motion between its samples."""
 
     def through(curve: Curve | None) -> Curve | None:
@@ -81,7 +81,7 @@ def _moving(recording: Recording) -> Recording:
     )
 
 
-def _drawn(recording: Recording, reference: Array, share: float, rng: np.random.Generator) -> Recording:
+def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.random.Generator) -> RecordedStreams:
     def noisy(curve: Curve, values: Array) -> Curve:
         noise = share * curve.noise * curve.loudness * rng.standard_normal(values.shape)
         return Curve(curve.time, values + noise, curve.claimed, claims=curve.claims)

@@ -19,7 +19,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.register.registration import Registration
 from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ..calibration.screening import SMALLEST_VARIANCE
-from ..effects.base import Needs
+from ..effects.base import EffectNeeds
 from ..errors import InputError
 from ..messages.decode import MessageDecoder
 from ..recordings.check import check_topics
@@ -42,7 +42,7 @@ SLOWEST_AVERAGE_HZ = 2.5
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedStreams:
     """The streams of one recording. Times in s since its first DVL stamp (first_ns).
 
     name: of the bag. dvl: (N, 3) m/s, DVL frame. reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
@@ -69,11 +69,11 @@ class Recording:
     registration: Registration | None = None
 
     @property
-    def available(self) -> frozenset[Needs]:
+    def available(self) -> frozenset[EffectNeeds]:
         """What effects may need and this recording has."""
         has = {
-            Needs.ATTITUDE: self.attitude is not None,
-            Needs.ANGULAR_VELOCITY: self.attitude is not None or self.rates is not None,
+            EffectNeeds.ATTITUDE: self.attitude is not None,
+            EffectNeeds.ANGULAR_VELOCITY: self.attitude is not None or self.rates is not None,
         }
         return frozenset(need for need, there in has.items() if there)
 
@@ -127,7 +127,7 @@ def make_recording(
     reference_std: Array | None = None,
     axes: str = "auto",
     first_ns: int = 0,
-) -> Recording:
+) -> RecordedStreams:
     """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4).
 
     Parameters
@@ -156,7 +156,7 @@ def make_recording(
     dvl_curve, reference_curve = curve(dvl, dvl_std), curve(reference, reference_std)
     if dvl_curve is None or reference_curve is None:
         raise InputError(f"{name}: fewer than two samples of DVL or reference")
-    return Recording(
+    return RecordedStreams(
         name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), _rms(dvl_std), _rms(reference_std),
         _measured_axes(reference[1], _usual(reference_std), axes), repeats, len(time), spikes, first_ns,
     )  # fmt: skip
@@ -209,7 +209,7 @@ def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool,
 class Loaded:
     """Recordings and what the user should know of the data."""
 
-    recordings: tuple[Recording, ...]
+    recordings: tuple[RecordedStreams, ...]
     notes: tuple[str, ...]
 
 
@@ -219,7 +219,7 @@ def load_recordings(source: Opened | Sequence[Path], parameters: Parameters, top
     if len(set(paths)) < len(paths):
         raise InputError(f"{', '.join(map(str, paths))}: a bag is named twice")
     opened = source if isinstance(source, Opened) else open_recording(source, topics, parameters)
-    recordings: list[Recording] = []
+    recordings: list[RecordedStreams] = []
     notes: list[str] = []
     known: list[Recorded] = []
     for name, path, one in zip(recording_names(paths), paths, opened.each, strict=True):
@@ -263,7 +263,7 @@ def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) ->
     return streams, [*opened.notes, *map(str, found), *map(str, decoder.problems.values())]
 
 
-def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[str]) -> Recording:
+def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[str]) -> RecordedStreams:
     clocks = Clocks.of(parameters)
     dvl = _in_order(_valid(streams.dvl, parameters), parameters, notes)
     if not len(dvl):

@@ -10,13 +10,13 @@ from ..calibration.delay.rows import ImuColumns
 from ..calibration.extrinsics import turn_between
 from ..calibration.frames import Array
 from ..calibration.register.far import far_clocks
-from ..calibration.register.motion import Motion, make_motion
+from ..calibration.register.motion import MotionStreams, make_motion
 from ..calibration.register.registration import register
 from ..calibration.samples import VelocityFrame
-from ..effects.base import Needs
+from ..effects.base import EffectNeeds
 from ..errors import InputError
 from .composed import Offsets
-from .recordings import Recording
+from .recordings import RecordedStreams
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class FirstGuess:
     phi: Array
 
 
-def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
+def check_clocks(recording: RecordedStreams, rotation_dvl_from_body: Array) -> None:
     """Raise InputError if stamps are too far apart for anything to be found.
 
     Parameters
@@ -45,7 +45,7 @@ def check_clocks(recording: Recording, rotation_dvl_from_body: Array) -> None:
         raise InputError(f"{recording.name}: {far.says}")
 
 
-def first_guess(recording: Recording, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
+def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
     """Delays, lever arm and mounting of one recording; none where it cannot be registered."""
     found = recording.registration
     if found is None and (motion := _motion(recording)) is not None:
@@ -56,12 +56,12 @@ def first_guess(recording: Recording, rotation_dvl_from_body: Array, lever_arm: 
     return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi)
 
 
-def _motion(recording: Recording) -> Motion | None:
+def _motion(recording: RecordedStreams) -> MotionStreams | None:
     attitude, dvl, reference = recording.attitude, recording.dvl, recording.reference
     times = np.zeros(0) if attitude is None else attitude.time
     quaternions = np.zeros((0, 4)) if attitude is None else attitude.values
     rates = np.full((len(times), 3), np.nan)
-    if len(times) > 1 and Needs.ANGULAR_VELOCITY in recording.available:
+    if len(times) > 1 and EffectNeeds.ANGULAR_VELOCITY in recording.available:
         rates = recording.angular_velocity(times)
     elif recording.rates is not None:
         times, rates = recording.rates.time, recording.rates.values

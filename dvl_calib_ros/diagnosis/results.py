@@ -11,13 +11,13 @@ from ..verdict.answering import Answering
 from .closure import Gap
 from .dvl import DvlSeen
 from .noise_findings import NoiseFinding
-from .selection import Selection
+from .selection import EffectSelection
 from .series import DiagnosisSeries
 from .twin import Twin
-from .where import Place
+from .where import GapPlace
 
 
-class Verdict(str, Enum):
+class DiagnosisVerdict(str, Enum):
     """The answer in a word."""
 
     NO_GAP = "no_gap"
@@ -50,12 +50,12 @@ class Diagnosis(Answering):
     selection: the fits behind it, None where nothing could be fitted.
     """
 
-    verdict: Verdict
+    verdict: DiagnosisVerdict
     sentence: str
     gap: Gap
     effects: tuple[FoundEffect, ...]
     noise: tuple[NoiseFinding, ...]
-    where: tuple[Place, ...]
+    where: tuple[GapPlace, ...]
     untestable: Mapping[str, str]
     minimum_detectable: Mapping[str, Mapping[str, float]]
     next_manoeuvre: str
@@ -66,7 +66,7 @@ class Diagnosis(Answering):
     recordings: tuple[tuple[str, int], ...] = ()
     twins: tuple[Twin, ...] = ()
     dvl: DvlSeen | None = None
-    selection: Selection | None = field(default=None, repr=False, compare=False)
+    selection: EffectSelection | None = field(default=None, repr=False, compare=False)
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
-from .recordings import Recording
+from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
 from .settings import SETTINGS
 
@@ -67,7 +67,7 @@ class Selected:
 
 
 @dataclass(frozen=True)
-class Selection:
+class EffectSelection:
     """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
     fitter; guesses per recording.
     """
@@ -78,13 +78,16 @@ class Selection:
     fitter: Fitter
     guesses: tuple[FirstGuess, ...]
 
-    def withdrawn(self) -> Selection:
+    def withdrawn(self) -> EffectSelection:
         """Without any effect."""
         return replace(self, selected=(), fit=self.base)
 
 
 def started(
-    recordings: Sequence[Recording], rotation_dvl_from_body: Array, lever_arm: Array, effects: Mapping[str, Effect]
+    recordings: Sequence[RecordedStreams],
+    rotation_dvl_from_body: Array,
+    lever_arm: Array,
+    effects: Mapping[str, Effect],
 ) -> tuple[Problem, Hypothesis, tuple[FirstGuess, ...]]:
     """The problem about the first guess of each recording, and a hypothesis with what it holds."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
@@ -101,8 +104,11 @@ def started(
 
 
 def select(
-    recordings: Sequence[Recording], rotation_dvl_from_body: Array, lever_arm: Array, effects: Mapping[str, Effect]
-) -> Selection:
+    recordings: Sequence[RecordedStreams],
+    rotation_dvl_from_body: Array,
+    lever_arm: Array,
+    effects: Mapping[str, Effect],
+) -> EffectSelection:
     """Select among testable effects."""
     problem, start, guesses = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
@@ -130,7 +136,7 @@ def select(
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
-    return Selection(ordered, base, fit, fitter, guesses)
+    return EffectSelection(ordered, base, fit, fitter, guesses)
 
 
 # ------------------------------------------------------------------ noise
@@ -505,4 +511,4 @@ def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapp
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
-__all__ = ["Offsets", "Selected", "Selection", "blocks_of", "log_p_value", "select"]
+__all__ = ["EffectSelection", "Offsets", "Selected", "blocks_of", "log_p_value", "select"]

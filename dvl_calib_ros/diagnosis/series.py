@@ -12,7 +12,7 @@ from ..calibration.frames import Array
 from .closure import HeldOutResiduals
 from .followed import Followed, what_it_follows
 from .noise import segments_of
-from .selection import Selection
+from .selection import EffectSelection
 from .unexplained import Unexplained
 from .where import regimes
 
@@ -94,7 +94,7 @@ class DiagnosisSeries:
 
 
 def collect_series(
-    selection: Selection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
+    selection: EffectSelection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
 ) -> DiagnosisSeries:
     """The series of what was selected and of what it leaves. covariance: (6 + p, 6 + p) of the fit."""
     fitter, fit = selection.fitter, selection.fit

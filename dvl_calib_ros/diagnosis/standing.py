@@ -11,7 +11,7 @@ from ..effects.base import Effect
 from .closure import Gap
 from .composed import Problem
 from .fitting import Fit
-from .selection import Selection, price
+from .selection import EffectSelection, price
 from .settings import SETTINGS
 from .unexplained import Unexplained, holds_out, told_elsewhere, unexplained
 
@@ -22,14 +22,14 @@ WEAK = 1e-3
 FAINT, BORNE_OUT = 200.0, 0.25
 
 
-def settled(selection: Selection, n_tested: int) -> tuple[Selection, Unexplained]:
+def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection, Unexplained]:
     """A selection without what an unknown cause explains better, and what it then leaves.
 
     Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
     """
     fitter, fit = selection.fitter, selection.fit
     rest = unexplained(fitter, fit)
-    best: tuple[float, Selection, Unexplained] | None = None
+    best: tuple[float, EffectSelection, Unexplained] | None = None
     for out in _subsets(selection):
         names = {effect.name for effect in out}
         kept = [effect for effect in fit.effects if effect.name not in names]
@@ -49,7 +49,7 @@ def settled(selection: Selection, n_tested: int) -> tuple[Selection, Unexplained
     return (selection, rest) if best is None else (best[1], best[2])
 
 
-def _subsets(selection: Selection) -> list[tuple[Effect, ...]]:
+def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     effects = selection.fit.effects
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
@@ -61,7 +61,7 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
     return holds_out(problem, fit, rest) > SETTINGS.unexplained_held_out
 
 
-def is_borne_out(selection: Selection, gap: Gap, n_tested: int) -> bool:
+def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
     """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
     fit = selection.fit
     explained = selection.base.deviance - fit.deviance

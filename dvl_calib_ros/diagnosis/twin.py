@@ -11,8 +11,8 @@ from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import at_dvl, late, traces, turns
 from .composed import Hypothesis, Problem
-from .recordings import Recording
-from .selection import Selection
+from .recordings import RecordedStreams
+from .selection import EffectSelection
 
 # Passes in which the true time of a late stamp is found, and the motion of which a reference makes what it says
 _PASSES = 3
@@ -24,14 +24,14 @@ class Twin:
     without, with_effects: (N, 3) m/s, DVL frame; without: the calibration alone.
     """
 
-    recording: Recording
+    recording: RecordedStreams
     time: Array
     recorded: Array
     without: Array
     with_effects: Array
 
 
-def twins(selection: Selection) -> tuple[Twin, ...]:
+def twins(selection: EffectSelection) -> tuple[Twin, ...]:
     """Of every recording, on its own motion, at its DVL's stamps; without noise."""
     problem = selection.fitter.problem
     found = []

@@ -69,12 +69,12 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     problem, noise = fitter.problem, fit.noise
     looks, white, raw = _looked(fitter, fit, problem, fit.seen, fit.residual)
     followed = lines(problem, white.reshape(-1, problem.axes))
-    recoloured: list[Look] = []
+    recoloured: list[FollowTest] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
         for name, columns in raw.items():
             if name != "time":
                 drop, rank, _ = _recoloured(noise, fit.columns, columns, fit.residual)
-                recoloured.append(Look(name, np.arange(columns.shape[2]), True, drop, rank))
+                recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
     looked_at = float(np.log(len(looks) + len(followed) + len(recoloured)))
     nominal = [
         *(look.log_p() for look in looks),
@@ -119,7 +119,7 @@ def _first(each: tuple[float, str, Array]) -> float:
 
 
 @dataclass(frozen=True)
-class Look:
+class FollowTest:
     """One test. name: of the group of functions; at: which of its columns. energy: explained, chi-square of so many
     dof; is_whole: of the whole group.
     """
@@ -137,7 +137,7 @@ class Look:
 
 def _looked(
     fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
-) -> tuple[list[Look], Array, dict[str, Array]]:
+) -> tuple[list[FollowTest], Array, dict[str, Array]]:
     """All looks at a residual (M, A) of a problem seen through a fit; what it is whitened, of unit variance, beside
     the fit's columns; and the columns of every group.
     """
@@ -147,14 +147,14 @@ def _looked(
     white = noise.whiten(residual)
     white = white - q @ (q.T @ white)
     white = white / np.sqrt(float(white @ white) / (len(white) - q.shape[1]))
-    looks: list[Look] = []
+    looks: list[FollowTest] = []
     raw: dict[str, Array] = {}
     sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
         told = _Told.by(q, noise.whiten(raw[name]), white)
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
-            looks.append(Look(name, at, number == 0, *told.energy(at)))
+            looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
     return looks, white, raw
 
 
@@ -166,7 +166,7 @@ def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
     return np.asarray(far | np.append(far[1:], False) | np.append(False, far[:-1]))
 
 
-def _grown(fitter: Fitter, fit: Fit, looks: Sequence[Look]) -> list[float]:
+def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
     """By what factor each look's energy is larger than chi-square in made-up recordings, at least 1."""
     energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
     for other, seen, residual in made_up(fitter.problem, fit, MADE_UP):
@@ -177,7 +177,7 @@ def _grown(fitter: Fitter, fit: Fit, looks: Sequence[Look]) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """The clearest line in the spectrum of one recording. log_p: adjusted for all frequencies looked at, up to a
     factor. waves: (M, 2) cosine and sine, zero in other recordings.
     """
@@ -187,7 +187,7 @@ class Line:
     waves: Array
 
 
-def lines(problem: Problem, innovations: Array) -> list[Line]:
+def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
     """Lines in the innovations (M, A), of unit variance, of each recording that is long enough.
 
     Noise of the sky has no period, coloured as it may be. Waves have: what is left of them at the pairing of two
@@ -210,7 +210,7 @@ def lines(problem: Problem, innovations: Array) -> list[Line]:
         period = 1.0 / float(frequency[inside][best])
         phase = 2.0 * np.pi * problem.time / period
         waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
-        found.append(Line(period, float(log_p.min() + np.log(log_p.size)), waves))
+        found.append(SpectralLine(period, float(log_p.min() + np.log(log_p.size)), waves))
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
-from ..effects.base import EffectInput, Needs
+from ..effects.base import EffectInput, EffectNeeds
 from .composed import Problem, Seen
 from .fitting import Fit, Fitter
 from .holm import holm
@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Place:
+class GapPlace:
     """share: of the gap's energy in m²/s² that lies here. p: adjusted (Holm) over all places looked at."""
 
     axis: str
@@ -52,7 +52,7 @@ def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) ->
     speeds = of(lambda motion: motion.speed)
     change = of(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
     found = {"accelerating": np.abs(change) > ACCELERATING_MPS2}
-    if Needs.ANGULAR_VELOCITY in problem.available:
+    if EffectNeeds.ANGULAR_VELOCITY in problem.available:
         found["turning"] = np.abs(of(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
         found["straight"] = ~found["turning"]
     slow, fast = np.quantile(speeds, [1 / 3, 2 / 3])
@@ -61,7 +61,7 @@ def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) ->
     return {name: mask for name, mask in found.items() if 0.02 < mask.mean() < 0.98}
 
 
-def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[Place]:
+def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace]:
     """Places where the residual of the calibration alone is more than noise, those with most of the gap first.
 
     columns: (M, A, p) that make up the gap: traces of the effects, or the dictionary where no effect explains it.
@@ -85,19 +85,19 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[Place]:
     for start, end in itertools.pairwise(edges.tolist()):
         within = (problem.time >= start) & (problem.time <= end)
         cells += [(axis, ALL, (float(start), float(end)), within) for axis in range(problem.axes)]
-    found: list[Place] = []
+    found: list[GapPlace] = []
     for axis, name, segment, mask in cells:
         p = float(np.exp(_log_p(noise, functions, q, white, axis, mask)))
         share = float((gap[mask, axis] ** 2).sum()) / total
-        found.append(Place(names[axis], name, segment, (0.0, nyquist), share, p))
+        found.append(GapPlace(names[axis], name, segment, (0.0, nyquist), share, p))
         if name == ALL and segment == (0.0, seconds):
             found += [
-                Place(names[axis], ALL, segment, (low, min(high, nyquist)), part / total, p)
+                GapPlace(names[axis], ALL, segment, (low, min(high, nyquist)), part / total, p)
                 for low, high, part in _bands(gap[:, axis], nyquist)
             ]
     adjusted = holm([place.p for place in found])
     kept = [
-        Place(place.axis, place.regime, place.segment_s, place.band_hz, place.share, float(p))
+        GapPlace(place.axis, place.regime, place.segment_s, place.band_hz, place.share, float(p))
         for place, p in zip(found, adjusted, strict=True)
         if p < LEVEL and place.share > 0.02
     ]
@@ -118,7 +118,7 @@ def _simplest(problem: Problem, seen: Sequence[Seen]) -> Array:
     """(M, c): one, speed, and turn rate where it is known."""
     speed = problem.sampled(seen, lambda motion: motion.speed)
     functions = [np.ones_like(speed), speed]
-    if Needs.ANGULAR_VELOCITY in problem.available:
+    if EffectNeeds.ANGULAR_VELOCITY in problem.available:
         functions.append(problem.sampled(seen, lambda motion: motion.turn_rate[:, 2]))
     return np.column_stack(functions)
 

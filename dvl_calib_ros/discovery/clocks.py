@@ -16,7 +16,7 @@ import numpy as np
 from ..calibration.parameters import Parameters
 from ..calibration.register.far import Far, far_clocks
 from ..calibration.register.fine import white_noise
-from ..calibration.register.motion import Motion, motion_of
+from ..calibration.register.motion import MotionStreams, motion_of
 from ..calibration.register.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
 from ..calibration.samples import SampleBlock, Stream, Streams
 from ..messages.decode import MessageDecoder
@@ -133,7 +133,7 @@ def _found(
     return FoundClocks(registration, offsets, hypothesis)
 
 
-def _beside_noise(found: Registration, motion: Motion) -> float:
+def _beside_noise(found: Registration, motion: MotionStreams) -> float:
     """What a registration leaves beside the reference's own noise, as a share of the speed."""
     noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
     return math.sqrt(max(found.left**2 - noise, 0.0))
@@ -150,7 +150,7 @@ def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Param
         yield parameters.replace(gnss_frame=frame, imu_rpy=rpy, imu_frame=world)
 
 
-def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> Motion | None:
+def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> MotionStreams | None:
     """What is registered: of fast streams so much that memory does not grow with their rates."""
     own = recording.of_types(topics, parameters)
     named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}

@@ -18,7 +18,7 @@ from ..calibration.delay.rows import ImuColumns
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.register.arrival import limit_s
-from ..calibration.register.motion import Motion, in_order, make_motion
+from ..calibration.register.motion import MotionStreams, in_order, make_motion
 from ..calibration.register.readings import (
     CLEARLY,
     FITS,
@@ -655,7 +655,7 @@ def _difference(dvl: Look, reference: Look) -> float | None:
     return found[0].best_left if found else None
 
 
-def _motion(dvl: Look, reference: Look, imu: Look | None) -> Motion | None:
+def _motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:
     """What was looked at, as messages have it; None where there is too little."""
     columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
     if imu is not None and imu.has_orientation:

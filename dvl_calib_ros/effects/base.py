@@ -69,7 +69,7 @@ class EffectInput:
         return self.time - (self.time[0] if self.start is None else self.start)
 
 
-class Needs(Enum):
+class EffectNeeds(Enum):
     """What a recording must hold for an effect to be testable."""
 
     ATTITUDE = "attitude"
@@ -101,7 +101,7 @@ class ActsOn(Enum):
 
 
 @dataclass(frozen=True)
-class ParameterSpec:
+class EffectParameter:
     """One parameter.
 
     typical: size in `unit` that would be worth knowing of. low, high: bounds. default: its value where none is given;
@@ -120,10 +120,10 @@ class ParameterSpec:
 
 def along_axes(
     suffix: str, unit: str, typical: float, bound: float, description: str, linear: bool = True
-) -> tuple[ParameterSpec, ...]:
+) -> tuple[EffectParameter, ...]:
     """One parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
     return tuple(
-        ParameterSpec(f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear)
+        EffectParameter(f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear)
         for axis in "xyz"
     )
 
@@ -142,9 +142,9 @@ class AnyEffect:
 
     name: ClassVar[str]
     summary: ClassVar[str]
-    parameters: ClassVar[tuple[ParameterSpec, ...]]
+    parameters: ClassVar[tuple[EffectParameter, ...]]
     acts_on: ClassVar[ActsOn]
-    needs: ClassVar[frozenset[Needs]] = frozenset()
+    needs: ClassVar[frozenset[EffectNeeds]] = frozenset()
     confounded_with: ClassVar[tuple[str, ...]] = ()
 
     @property

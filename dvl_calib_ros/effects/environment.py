@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, Effect, EffectInput, Needs, ParameterSpec
+from .base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
 
 _CURRENT = "{} part of the velocity added: minus the current, which carries the water along"
 
@@ -20,14 +20,14 @@ class WaterLock(Effect):
     summary = "the DVL tracks water: an earth-fixed velocity (minus the current) added from from_s to to_s"
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
-        ParameterSpec("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),
-        ParameterSpec("north_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("north")),
-        ParameterSpec("from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False),
-        ParameterSpec("to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False),
+        EffectParameter("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),
+        EffectParameter("north_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("north")),
+        EffectParameter("from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False),
+        EffectParameter("to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False),
     )
     of_the_day = True
     acts_on = ActsOn.MOTION
-    needs = frozenset({Needs.ATTITUDE})
+    needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("heading_error", "velocity_bias")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -47,11 +47,11 @@ class HeadingError(Effect):
     summary = "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
-        ParameterSpec("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),
-        ParameterSpec("cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False),
+        EffectParameter("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),
+        EffectParameter("cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False),
     )
     acts_on = ActsOn.REFERENCE
-    needs = frozenset({Needs.ATTITUDE})
+    needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("water_lock",)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.frames import Array, cross
-from .base import ActsOn, Effect, EffectInput, Needs, ParameterSpec, along_axes, vector
+from .base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter, along_axes, vector
 
 
 class LeverArm(Effect):
@@ -18,7 +18,7 @@ class LeverArm(Effect):
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
     acts_on = ActsOn.MOTION
-    needs = frozenset({Needs.ANGULAR_VELOCITY})
+    needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     confounded_with = ("sideslip", "reference_time_offset", "reference_lag")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -33,10 +33,10 @@ class Sideslip(Effect):
     summary = "sway that only the DVL sees: coefficient · ω_z · horizontal speed"
     manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
     parameters = (
-        ParameterSpec("coefficient_s", "s", 0.1, -10.0, 10.0, "sway per turn rate and speed; negative: outward"),
+        EffectParameter("coefficient_s", "s", 0.1, -10.0, 10.0, "sway per turn rate and speed; negative: outward"),
     )
     acts_on = ActsOn.MOTION
-    needs = frozenset({Needs.ANGULAR_VELOCITY})
+    needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     confounded_with = ("lever_arm", "reference_time_offset", "reference_lag")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -52,13 +52,13 @@ class TiltCoupling(Effect):
     summary = "an error in proportion to pitch or roll, body frame"
     manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
     parameters = (
-        ParameterSpec("x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)"),
-        ParameterSpec("z_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "heave error per pitch"),
-        ParameterSpec("y_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "sway error per roll (positive: port side up)"),
-        ParameterSpec("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll"),
+        EffectParameter("x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)"),
+        EffectParameter("z_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "heave error per pitch"),
+        EffectParameter("y_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "sway error per roll (positive: port side up)"),
+        EffectParameter("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll"),
     )
     acts_on = ActsOn.DVL
-    needs = frozenset({Needs.ATTITUDE})
+    needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("velocity_bias", "lever_arm")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:

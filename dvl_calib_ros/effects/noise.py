@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, Disturbance, EffectInput, Needs, NoiseEffect, ParameterSpec
+from .base import ActsOn, Disturbance, EffectInput, EffectNeeds, EffectParameter, NoiseEffect
 
 _SHARE = "share of the samples, 0 .. 1"
 
@@ -19,8 +19,8 @@ class Outliers(NoiseEffect):
     name = "outliers"
     summary = "some DVL samples are far off"
     parameters = (
-        ParameterSpec("share", "1", 0.01, 0.0, 1.0, _SHARE),
-        ParameterSpec("std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis", 0.5),
+        EffectParameter("share", "1", 0.01, 0.0, 1.0, _SHARE),
+        EffectParameter("std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis", 0.5),
     )
     acts_on = ActsOn.DVL
 
@@ -41,7 +41,7 @@ class StaleSamples(NoiseEffect):
 
     name = "stale_samples"
     summary = "some DVL samples repeat the one before"
-    parameters = (ParameterSpec("share", "1", 0.05, 0.0, 1.0, _SHARE),)
+    parameters = (EffectParameter("share", "1", 0.05, 0.0, 1.0, _SHARE),)
     acts_on = ActsOn.DVL
 
     def disturb(
@@ -74,12 +74,12 @@ class NoiseInflation(NoiseEffect):
     name = "noise_inflation"
     summary = "the DVL's noise is larger than reported, or grows with speed or turn rate"
     parameters = (
-        ParameterSpec("std_mps", "m/s", 0.02, 0.0, 10.0, "standard deviation added, per axis"),
-        ParameterSpec("per_speed", "1", 0.01, 0.0, 10.0, "its growth per m/s of speed"),
-        ParameterSpec("per_turn_rate_m", "m", 0.1, 0.0, 100.0, "its growth per rad/s of turn rate"),
+        EffectParameter("std_mps", "m/s", 0.02, 0.0, 10.0, "standard deviation added, per axis"),
+        EffectParameter("per_speed", "1", 0.01, 0.0, 10.0, "its growth per m/s of speed"),
+        EffectParameter("per_turn_rate_m", "m", 0.1, 0.0, 100.0, "its growth per rad/s of turn rate"),
     )
     acts_on = ActsOn.DVL
-    needs = frozenset({Needs.ANGULAR_VELOCITY})
+    needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
 
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
@@ -100,8 +100,8 @@ class ColouredReferenceNoise(NoiseEffect):
     name = "coloured_reference_noise"
     summary = "the reference's noise is correlated in time"
     parameters = (
-        ParameterSpec("std_mps", "m/s", 0.05, 0.0, 10.0, "standard deviation, per axis"),
-        ParameterSpec("correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e", 5.0),
+        EffectParameter("std_mps", "m/s", 0.05, 0.0, 10.0, "standard deviation, per axis"),
+        EffectParameter("correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e", 5.0),
     )
     acts_on = ActsOn.REFERENCE
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, Effect, EffectInput, MountingEffect, ParameterSpec, along_axes, vector
+from .base import ActsOn, Effect, EffectInput, EffectParameter, MountingEffect, along_axes, vector
 
 HOUR_S = 3600.0
 
@@ -34,7 +34,9 @@ class QuadraticScale(Effect):
     name = "quadratic_scale"
     summary = "an error that grows with speed squared: coefficient · ‖v‖ · v"
     manoeuvre = "straight legs at three speeds or more"
-    parameters = (ParameterSpec("coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed"),)
+    parameters = (
+        EffectParameter("coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed"),
+    )
     acts_on = ActsOn.DVL
     confounded_with = ("velocity_bias",)
 
@@ -49,7 +51,9 @@ class ScaleDrift(Effect):
     name = "scale_drift"
     summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
-    parameters = (ParameterSpec("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),)
+    parameters = (
+        EffectParameter("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),
+    )
     of_the_day = True
     acts_on = ActsOn.DVL
     confounded_with = ("misalignment_drift",)
@@ -113,7 +117,7 @@ class SoundSpeedMoved(Effect):
     name = "sound_speed_moved"
     summary = "the scale-factor error is another than in the first of several recordings: ratio · v"
     manoeuvre = "straight legs, in each recording"
-    parameters = (ParameterSpec("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
+    parameters = (EffectParameter("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
     acts_on = ActsOn.DVL
     of_the_day = True
     relative_to_first = True
@@ -133,7 +137,7 @@ class AxisNonorthogonality(Effect):
     summary = "the DVL's axes are not at right angles: symmetric shear S v, DVL frame"
     manoeuvre = "sway and heave beside surge: drift across, dive or go in waves"
     parameters = tuple(
-        ParameterSpec(
+        EffectParameter(
             f"{axes}_rad", "rad", 0.01, -0.3, 0.3, f"half of what the angle between {axes[0]} and {axes[1]} lacks"
         )
         for axes in ("xy", "xz", "yz")

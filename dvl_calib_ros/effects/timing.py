@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..calibration.frames import Array
 from ..calibration.register.coarse import LONGEST_S
 from ..calibration.samples import VelocityFrame
-from .base import ActsOn, ClockEffect, Effect, EffectInput, Needs, ParameterSpec
+from .base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter
 
 # As far as clocks are registered
 LONGEST_OFFSET_S = LONGEST_S
 
 
-def _seconds(what: str) -> tuple[ParameterSpec]:
-    return (ParameterSpec("seconds", "s", 0.1, -LONGEST_OFFSET_S, LONGEST_OFFSET_S, what, linear=False),)
+def _seconds(what: str) -> tuple[EffectParameter]:
+    return (EffectParameter("seconds", "s", 0.1, -LONGEST_OFFSET_S, LONGEST_OFFSET_S, what, linear=False),)
 
 
 class _DvlClock(ClockEffect):
@@ -52,7 +52,7 @@ class TimeOffsetJump(_DvlClock):
     manoeuvre = "turns and changes of speed before and after"
     parameters = (
         *_seconds("how much later a stamp is from then on"),
-        ParameterSpec("at_s", "s", 0.0, 0.0, np.inf, "when, since the start", linear=False),
+        EffectParameter("at_s", "s", 0.0, 0.0, np.inf, "when, since the start", linear=False),
     )
     confounded_with = ("dvl_time_offset", "clock_drift")
 
@@ -68,7 +68,7 @@ class ClockDrift(_DvlClock):
     summary = "the DVL's clock runs fast: its stamps get later by so many seconds per hour"
     manoeuvre = "turns and changes of speed at the beginning, in the middle and at the end"
     parameters = (
-        ParameterSpec("seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False),
+        EffectParameter("seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False),
     )
     confounded_with = ("dvl_time_offset", "time_offset_jump")
 
@@ -106,7 +106,7 @@ class AttitudeTimeOffset(ClockEffect):
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = _seconds("how late a stamp is; positive: late")
     acts_on = ActsOn.ATTITUDE_CLOCK
-    needs = frozenset({Needs.ATTITUDE})
+    needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("dvl_time_offset", "reference_time_offset", "sideslip", "lever_arm")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
@@ -130,7 +130,7 @@ class ReferenceLag(Effect):
     name = "reference_lag"
     summary = "the reference is low-pass filtered: T dg'/dt = g - g', in the frame it was recorded in"
     manoeuvre = "sharp turns as well as wide ones, and quick changes of speed"
-    parameters = (ParameterSpec("time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False),)
+    parameters = (EffectParameter("time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False),)
     acts_on = ActsOn.REFERENCE
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 

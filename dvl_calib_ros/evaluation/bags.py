@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import __version__
 from ..calibration.calibrator import Calibrator
-from ..calibration.delay.hold_out import Recording, Terms
+from ..calibration.delay.hold_out import Terms, ThinnedRecording
 from ..calibration.error_model import correction_matrix
 from ..calibration.frames import Array
 from ..calibration.models import MODELS, Needs
@@ -70,7 +70,7 @@ class _Replayed:
     n_paired: int
     notes: tuple[str, ...]
     delayed: Mapping[str, Terms]
-    recording: Recording | None
+    recording: ThinnedRecording | None
     selected: tuple[str, Terms | None]
     dvl: Recorded | None = None
     failed: tuple[str, ...] = ()
@@ -181,7 +181,7 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
         measured.clear()
         reference.clear()
 
-    kept: list[Recording] = []
+    kept: list[ThinnedRecording] = []
 
     def keep_recording(calibrator: Calibrator) -> None:
         if calibrator.recording is not None:

@@ -14,7 +14,7 @@ from ..calibration.parameters import Parameters
 from . import protocol
 from .baselines import BASELINES
 from .estimation import SensorData, estimate
-from .results import Curve, Failure, mean_of_known
+from .results import ConvergenceCurve, Failure, mean_of_known
 from .trajectories import Trajectory
 
 TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
@@ -81,17 +81,17 @@ def _turns_off(body_from_dvl: Array, misalignment: Array) -> Array:
     return np.asarray((found * truth.inv()).as_rotvec())
 
 
-def curves(models: Sequence[str], squares: Array) -> tuple[Curve, ...]:
+def curves(models: Sequence[str], squares: Array) -> tuple[ConvergenceCurve, ...]:
     """squares: (..., curves, T, 3) rad², over seeds and runs; nan where a curve cannot run."""
     mean = mean_of_known(squares, tuple(range(squares.ndim - 3)))
     return tuple(
-        Curve(name, std, np.sqrt(each))
+        ConvergenceCurve(name, std, np.sqrt(each))
         for (name, std), each in zip(curve_keys(models), mean, strict=True)
         if np.isfinite(each).all()
     )
 
 
-def curves_document(found: Sequence[Curve]) -> dict[str, Any]:
+def curves_document(found: Sequence[ConvergenceCurve]) -> dict[str, Any]:
     """Plain data, degrees."""
     return {
         "times_s": list(TIMES_S),

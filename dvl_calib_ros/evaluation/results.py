@@ -175,7 +175,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Curve:
+class ConvergenceCurve:
     """One way to calibrate. name: model or baseline. gnss_std: noise of the reference, m/s, None without any.
 
     rms: (T, 3) rad about the body's x, y, z at `convergence.TIMES_S`, over runs, combinations of errors and seeds.
@@ -234,7 +234,7 @@ class Evaluation(Answering):
     version: str
     held_out: tuple[HeldOut, ...] = ()
     baselines: Mapping[str, Array] = field(default_factory=dict)
-    convergence: tuple[Curve, ...] = ()
+    convergence: tuple[ConvergenceCurve, ...] = ()
     coverage_of_all: tuple[Coverage, ...] = ()
     failures: tuple[Failure, ...] = ()
 

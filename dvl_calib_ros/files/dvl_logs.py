@@ -33,7 +33,7 @@ _BAD_VELOCITY = -32768
 _FLU_FROM_RDI: Array = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-class Log(NamedTuple):
+class DvlLog(NamedTuple):
     """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason."""
 
     samples: list[DvlSample]
@@ -50,7 +50,7 @@ def is_dvl_log(path: Path) -> bool:
     return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or b'"vx"' in start
 
 
-def read_dvl_log(path: Path) -> Log:
+def read_dvl_log(path: Path) -> DvlLog:
     """Read a log of either kind. Raises InputError for what is none, or holds no velocity that can be used."""
     content = path.read_bytes()
     log = _read_json(path, content) if b'"vx"' in content[:_SNIFFED] else _read_pd0(path, content)
@@ -59,13 +59,13 @@ def read_dvl_log(path: Path) -> Log:
         raise InputError(f"{path}: no velocity that can be used ({why})")
     in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda each: each.stamp_ns)
     log.left_out["of a time that was there already"] += len(log.samples) - len(in_order)
-    return Log(in_order, +log.left_out)
+    return DvlLog(in_order, +log.left_out)
 
 
 # ---------------------------------------------------------------------- Water Linked
 
 
-def _read_json(path: Path, content: bytes) -> Log:
+def _read_json(path: Path, content: bytes) -> DvlLog:
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
     for line in content.decode("utf-8", "replace").splitlines():
@@ -81,7 +81,7 @@ def _read_json(path: Path, content: bytes) -> Log:
             sample = _json_sample(path, report, left_out)
             if sample is not None:
                 samples.append(sample)
-    return Log(samples, left_out)
+    return DvlLog(samples, left_out)
 
 
 def _json_sample(path: Path, report: dict[str, Any], left_out: Counter[str]) -> DvlSample | None:
@@ -136,7 +136,7 @@ def _ensembles(content: bytes) -> Iterator[dict[int, bytes]]:
         yield {struct.unpack_from("<H", body, each)[0]: body[each:] for each in offsets if each + 2 <= len(body)}
 
 
-def _read_pd0(path: Path, content: bytes) -> Log:
+def _read_pd0(path: Path, content: bytes) -> DvlLog:
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
     for data in _ensembles(content):
@@ -147,7 +147,7 @@ def _read_pd0(path: Path, content: bytes) -> Log:
             continue
         if sample is not None:
             samples.append(sample)
-    return Log(samples, left_out)
+    return DvlLog(samples, left_out)
 
 
 def _pd0_sample(path: Path, data: dict[int, bytes], left_out: Counter[str]) -> DvlSample | None:

@@ -31,7 +31,7 @@ from ..verdict.reasons import finding
 from .parameter_edit import as_yaml, new_file, with_parameters
 from .parameter_files import NODE_NAME, changed_parameters, load_parameters
 from .result_file import load_result, static_transform_arguments
-from .urdf import Mounting, Urdf, numbers
+from .urdf import Urdf, UrdfMounting, numbers
 
 # A mounting written by hand with three digits is meant to be the one that the calibration began with, rad.
 SAME_MOUNTING = 2e-3
@@ -204,7 +204,7 @@ def angle_between(a: Array, b: Array) -> float:
 
 
 def calibrated_urdf(
-    urdf: Urdf, mounting: Mounting, calibrated: CalibratedMounting, force: bool = False, keep_position: bool = False
+    urdf: Urdf, mounting: UrdfMounting, calibrated: CalibratedMounting, force: bool = False, keep_position: bool = False
 ) -> bytes:
     """The URDF with the calibrated mounting, and position where that was found; its own bytes if it has them already.
 

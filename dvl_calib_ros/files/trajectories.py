@@ -38,7 +38,7 @@ SHOWN = 200
 AXIS_NAMES = ({"x", "vx", "surge", "roll"}, {"y", "vy", "sway", "pitch"}, {"z", "vz", "heave", "yaw"})
 
 
-class Columns(NamedTuple):
+class TimedRows(NamedTuple):
     """Time (N,) s, values (N, 3), and in a sentence each what of the file is not among them."""
 
     time: Array
@@ -46,7 +46,7 @@ class Columns(NamedTuple):
     left_out: tuple[str, ...] = ()
 
 
-def read_columns(path: Path, unit: str) -> Columns:
+def read_columns(path: Path, unit: str) -> TimedRows:
     """Rows of a CSV or NPY file, values in `unit`. Raises InputError naming file and row.
 
     Left out, and said, are rows without a finite number in every column, as an invalid sample of a bag is, and of a
@@ -68,7 +68,7 @@ def read_columns(path: Path, unit: str) -> Columns:
     backwards = np.diff(table[:, 0]) <= 0.0
     if backwards.any():
         raise InputError(f"{path}: time does not increase at row {rows[int(np.argmax(backwards)) + 1]}")
-    return Columns(table[:, 0], table[:, 1:], tuple(left_out))
+    return TimedRows(table[:, 0], table[:, 1:], tuple(left_out))
 
 
 def _read_npy(path: Path) -> Array:

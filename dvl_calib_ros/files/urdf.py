@@ -37,7 +37,7 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Mounting:
+class UrdfMounting:
     """Where a URDF has the DVL: the fixed joints from the body to it, the last of which is its own.
 
     rotation_body_from_dvl (3, 3), rotation_body_from_parent (3, 3): of the joint's parent. position: m, in the body.
@@ -58,7 +58,7 @@ class Urdf:
     joints: tuple[Joint, ...]
     generated: bool
 
-    def mounting(self, base: str, dvl: str, joint: str | None = None) -> Mounting:
+    def mounting(self, base: str, dvl: str, joint: str | None = None) -> UrdfMounting:
         """Follow fixed joints from the DVL's link up to the body's. Raises InputError.
 
         base, dvl: frame ids, with or without a namespace before the link's name. joint: the DVL's own, if it is not
@@ -79,7 +79,7 @@ class Urdf:
             parent = rotation
             position = position + rotation @ each.xyz
             rotation = rotation @ rotation_from_rpy(each.rpy)
-        return Mounting(chain[-1], rotation, parent, position)
+        return UrdfMounting(chain[-1], rotation, parent, position)
 
     def _joint(self, name: str) -> Joint:
         found = [each for each in self.joints if each.name == name]
@@ -98,7 +98,7 @@ class Urdf:
     def _fixed(self) -> str:
         return "its fixed joints: " + (", ".join(each.name for each in self.joints if each.kind == "fixed") or "none")
 
-    def moved(self, mounting: Mounting, rotation_body_from_dvl: Array, position: Array | None = None) -> bytes:
+    def moved(self, mounting: UrdfMounting, rotation_body_from_dvl: Array, position: Array | None = None) -> bytes:
         """The file with the DVL's own joint so that the mounting is this (3, 3); all other bytes as they are.
 
         position: (3,) m in the body where the DVL is to be; None: its joint's xyz stays.
@@ -155,11 +155,11 @@ def read_urdf(path: Path) -> Urdf:
 
 def parse_urdf(path: Path, content: bytes) -> Urdf:
     """As `read_urdf`, of what is in memory; path: what errors call it."""
-    return _Reader(path, content).read()
+    return _UrdfReader(path, content).read()
 
 
 @dataclass
-class _Reader:
+class _UrdfReader:
     """Walks through the elements; only joints directly under the robot count."""
 
     path: Path

@@ -118,7 +118,7 @@ TURNED_COVARIANCE = np.outer(FLU_FROM_FRD.diagonal(), FLU_FROM_FRD.diagonal())
 UNREADABLE = (AttributeError, TypeError, ValueError, IndexError, OverflowError)
 
 
-class _Reader:
+class _VelocityReader:
     """Reads the velocity and its covariance from messages of one type. turned: as in `LinearCovariance`."""
 
     def __init__(self, kind: VelocityType, turned: bool = False) -> None:
@@ -146,7 +146,7 @@ class MessageDecoder:
         self.dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)
         self.imu_alignment = ImuAlignment(parameters)
-        self._reference_readers = [_Reader(self.reference_type, turned) for turned in (False, True)]
+        self._reference_readers = [_VelocityReader(self.reference_type, turned) for turned in (False, True)]
         self._on_problem = on_problem
         self.forget()
 
@@ -155,7 +155,7 @@ class MessageDecoder:
         self.problems: dict[str, Reason] = {}
         self.zero_stamps = 0
         self.dvl_frame: str | None = self.parameters.dvl_frame or None
-        self._dvl_reader: _Reader | None = None
+        self._dvl_reader: _VelocityReader | None = None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, DeclaredFrame | None] = {}
         self._fixes = FixDifference(self.parameters.position_window)
@@ -172,7 +172,7 @@ class MessageDecoder:
             if broken is not None:
                 return Refusal(broken.counter)
             if self._dvl_reader is None:
-                self._dvl_reader = _Reader(kind, self.turns_dvl)
+                self._dvl_reader = _VelocityReader(kind, self.turns_dvl)
                 self.note_axes()
             velocity, covariance = self._dvl_reader(message)
             stamp = self._stamp_ns(Stream.DVL, message.header, received_ns)

@@ -61,7 +61,7 @@ class RecentCounts:
         }
 
 
-class _Seen(NamedTuple):
+class _Taken(NamedTuple):
     """How many samples of a stream have been taken, and since when it is that many (s)."""
 
     taken: int
@@ -76,7 +76,7 @@ class Silence:
 
     def __init__(self, now_s: float) -> None:
         self._started_s = now_s
-        self._seen: dict[str, _Seen] = {}
+        self._seen: dict[str, _Taken] = {}
 
     def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, Reason]:
         """Stream -> what is wrong. counts: the calibrator's, as of now."""
@@ -85,7 +85,7 @@ class Silence:
             lost = _NOT_TAKEN | calibrator.refused_as[stream]
             taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             if stream not in self._seen or self._seen[stream].taken != taken:
-                self._seen[stream] = _Seen(taken, now_s)
+                self._seen[stream] = _Taken(taken, now_s)
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
         for stream, (code, topic) in _SILENT.items():

@@ -20,7 +20,7 @@ MOST_PAIRS = 10
 _DEGREE = math.degrees(1.0)
 
 
-class Quantity(NamedTuple):
+class ComparedQuantity(NamedTuple):
     """What is compared. component: its index in `COMPONENTS`. turn: what a difference of it is called.
 
     factor: from SI. changes: of `Comparison`.
@@ -35,14 +35,14 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = (
-    Quantity(0, "roll", "about x", "°", _DEGREE, "moved"),
-    Quantity(1, "pitch", "about y", "°", _DEGREE, "moved"),
-    Quantity(2, "yaw", "about z", "°", _DEGREE, "moved"),
-    Quantity(3, "lever arm x", "lever arm x", "m", 1.0, "moved"),
-    Quantity(4, "lever arm y", "lever arm y", "m", 1.0, "moved"),
-    Quantity(5, "lever arm z", "lever arm z", "m", 1.0, "moved"),
-    Quantity(6, "scale", "scale", "%", 100.0, "scale_changed"),
-    Quantity(7, "stamps late", "stamps late", "s", 1.0, "clock_changed"),
+    ComparedQuantity(0, "roll", "about x", "°", _DEGREE, "moved"),
+    ComparedQuantity(1, "pitch", "about y", "°", _DEGREE, "moved"),
+    ComparedQuantity(2, "yaw", "about z", "°", _DEGREE, "moved"),
+    ComparedQuantity(3, "lever arm x", "lever arm x", "m", 1.0, "moved"),
+    ComparedQuantity(4, "lever arm y", "lever arm y", "m", 1.0, "moved"),
+    ComparedQuantity(5, "lever arm z", "lever arm z", "m", 1.0, "moved"),
+    ComparedQuantity(6, "scale", "scale", "%", 100.0, "scale_changed"),
+    ComparedQuantity(7, "stamps late", "stamps late", "s", 1.0, "clock_changed"),
 )
 
 
@@ -86,7 +86,7 @@ def comparison(result: Comparison) -> Document:
     )
 
 
-def shown_quantities(result: Comparison) -> list[Quantity]:
+def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
     """Quantities that two calibrations have shown at least."""
     return [each for each in QUANTITIES if sum(own.shown[each.component] for own in result.calibrations) > 1]
 
@@ -110,7 +110,7 @@ def _calibrations(result: Comparison) -> Table:
     )
 
 
-def _cells(values: Array, stds: Array, columns: Sequence[Quantity], signed: bool = False) -> list[str]:
+def _cells(values: Array, stds: Array, columns: Sequence[ComparedQuantity], signed: bool = False) -> list[str]:
     return [
         with_std(each.factor * values[each.component], each.factor * stds[each.component], signed=signed)
         for each in columns

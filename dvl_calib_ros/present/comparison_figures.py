@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ..calibration.comparison import Change, Comparison
 from ..calibration.extrinsics import Extrinsics
-from .comparison import Quantity, shown_quantities, values_of
+from .comparison import ComparedQuantity, shown_quantities, values_of
 from .style import INK, Picture, drawing, new_figure, picture
 
 _POINT, _MOVED = "#1f6fb2", "#c0392b"
@@ -43,7 +43,7 @@ def trend_png(comparison: Comparison) -> bytes:
     return target.getvalue()
 
 
-def _picture(comparison: Comparison, quantity: Quantity) -> Picture:
+def _picture(comparison: Comparison, quantity: ComparedQuantity) -> Picture:
     def draw() -> Figure:
         figure, axes = new_figure(height=PANEL_HEIGHT)
         _draw(axes, comparison, quantity)
@@ -59,7 +59,7 @@ def _picture(comparison: Comparison, quantity: Quantity) -> Picture:
     return picture(title, f"{quantity.name} over time, in {quantity.unit}: {told}", draw)
 
 
-def _draw(axes: Axes, comparison: Comparison, quantity: Quantity) -> None:
+def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
     """One quantity over time with ±1σ; a line where it is said to have changed."""
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)

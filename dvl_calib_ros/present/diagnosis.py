@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from ..calibration.frames import Array
-from ..diagnosis.results import Diagnosis, Verdict
+from ..diagnosis.results import Diagnosis, DiagnosisVerdict
 from ..diagnosis.series import DiagnosisSeries
 from ..effects.registry import EFFECTS
 from ..verdict.kinds import Severity
@@ -38,11 +38,11 @@ from .twin_table import twin_table
 
 BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
 SEVERITIES = {
-    Verdict.NO_GAP: Severity.ACCEPT,
-    Verdict.KNOWN: Severity.ACCEPT,
-    Verdict.AMBIGUOUS: Severity.MARGINAL,
-    Verdict.INSUFFICIENT_EXCITATION: Severity.MARGINAL,
-    Verdict.UNKNOWN: Severity.REJECT,
+    DiagnosisVerdict.NO_GAP: Severity.ACCEPT,
+    DiagnosisVerdict.KNOWN: Severity.ACCEPT,
+    DiagnosisVerdict.AMBIGUOUS: Severity.MARGINAL,
+    DiagnosisVerdict.INSUFFICIENT_EXCITATION: Severity.MARGINAL,
+    DiagnosisVerdict.UNKNOWN: Severity.REJECT,
 }
 NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",

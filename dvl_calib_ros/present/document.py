@@ -118,7 +118,7 @@ def figures(function: str, *given: Any) -> Figures:
 
 
 @dataclass(frozen=True)
-class Found:
+class FindingLine:
     """Something that was found, with its remedy."""
 
     reason: Reason
@@ -195,7 +195,7 @@ class Warned:
     warned: bool = True
 
 
-Item = Warned | Sentence | Table | Figures | Found | Commands | Facts | Numbers | Worth | Legend | Map
+Item = Warned | Sentence | Table | Figures | FindingLine | Commands | Facts | Numbers | Worth | Legend | Map
 
 
 @dataclass(frozen=True)

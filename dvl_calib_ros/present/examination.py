@@ -7,7 +7,7 @@ import shlex
 from ..examination.examine import NO_IMU, Examination, Shown
 from ..verdict.kinds import Severity
 from ..verdict.reasons import full
-from .document import Answer, Cell, Commands, Document, Found, Section, Sentence, Table
+from .document import Answer, Cell, Commands, Document, FindingLine, Section, Sentence, Table
 
 BAR = 20
 ANSWERS = {
@@ -34,7 +34,7 @@ def examination(examined: Examination) -> Document:
             Section(f"{names}: {examined.seconds:.0f} s", [_contents(examined), *said]),
             Section(
                 f"{len(found)} found" if found else "Nothing wrong was found",
-                list(map(Found, found)) or [Sentence("")],
+                list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(motion, [_shown(examined.shown)] if examined.shown else [Sentence(nothing)]),
             Section("", [Commands(next_commands(examined))]),

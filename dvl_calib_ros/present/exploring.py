@@ -34,7 +34,7 @@ def mark_time(axes: Axes, run: str) -> None:
     axes.set_gid(f"{TIME_MARK} {run}")
 
 
-class Track(Line2D):
+class MapTrack(Line2D):
     """A line on a map, once more and unseen, with the time of each of its points on the axis of the run's figures."""
 
     def __init__(self, line: Line2D, run: str, times: Array) -> None:
@@ -47,7 +47,7 @@ class Track(Line2D):
 def explorable(figure: Figure) -> str:
     """A drawn figure over time, or a map with tracks, as base64 of deflated JSON; "" for any other figure."""
     axes = figure.axes[0]
-    tracks = [line for line in axes.get_lines() if isinstance(line, Track)]
+    tracks = [line for line in axes.get_lines() if isinstance(line, MapTrack)]
     if tracks:
         return _packed(_map(figure, axes, tracks))
     mark = axes.get_gid() or ""
@@ -91,7 +91,7 @@ def _packed(plot: dict[str, Any]) -> str:
     return base64.b64encode(zlib.compress(json.dumps(plot, separators=(",", ":")).encode(), 9)).decode()
 
 
-def _map(figure: Figure, axes: Axes, tracks: Sequence[Track]) -> dict[str, Any]:
+def _map(figure: Figure, axes: Axes, tracks: Sequence[MapTrack]) -> dict[str, Any]:
     """Where the points of tracks are in the picture, per cent from its left and upper edge."""
     shown = []
     for track in tracks:

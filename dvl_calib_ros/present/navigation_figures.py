@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
 from ..replay.navigation import Navigation
-from .exploring import Track
+from .exploring import MapTrack
 from .replay_figures import AFTER, BAD
 from .style import INK, WIDTH, Picture, legend_above, new_figure, picture
 from .time_axis import TimeAxis
@@ -58,7 +58,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
         _coloured(figure, axes, one)
     if time is not None:
         for line in lines:
-            axes.add_line(Track(line, time.run, time(one.stamps_ns)))
+            axes.add_line(MapTrack(line, time.run, time(one.stamps_ns)))
     axes.plot(*one.reference[0], "o", color=INK, markersize=4.0)
     for track, colour in zip(drawn[1:], (BAD, *_OTHERS), strict=False):
         axes.plot(*track[-1], "s", color=colour, markersize=3.5)

@@ -26,7 +26,7 @@ from .time_axis import TimeAxis
 GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
 
 
-class Line(NamedTuple):
+class ModelLine(NamedTuple):
     """One error term of one model over time: value and std (N,), in the unit of the axis."""
 
     model: str
@@ -34,7 +34,9 @@ class Line(NamedTuple):
     std: Array
 
 
-def estimate_over_time(time: TimeAxis, stamps_ns: Array, lines: Sequence[Line], selected: str, label: str) -> Figure:
+def estimate_over_time(
+    time: TimeAxis, stamps_ns: Array, lines: Sequence[ModelLine], selected: str, label: str
+) -> Figure:
     """One error term with the ±1σ sleeves of several models; the selected one stands out."""
     figure, axes = new_figure()
     kept = thin(len(stamps_ns))
@@ -51,7 +53,7 @@ def estimate_over_time(time: TimeAxis, stamps_ns: Array, lines: Sequence[Line], 
     return figure
 
 
-def _settled_range(lines: Sequence[Line]) -> tuple[float, float]:
+def _settled_range(lines: Sequence[ModelLine]) -> tuple[float, float]:
     """Limits that show every estimate from the first tenth on, and its σ at the end; not the prior's width."""
     settled = [line.value[len(line.value) // 10 :] for line in lines]
     low = min(min(value.min(), line.value[-1] - line.std[-1]) for value, line in zip(settled, lines, strict=True))

@@ -66,9 +66,9 @@ def _scales_shown(models: Sequence[str]) -> list[Term]:
     return [ANY_SCALE]
 
 
-def _line(name: str, history: ModelHistory, term: Term) -> figures.Line:
+def _line(name: str, history: ModelHistory, term: Term) -> figures.ModelLine:
     index = state_of(MODELS[name], term)
-    return figures.Line(name, term.factor * history.state[:, index], term.factor * history.std[:, index])
+    return figures.ModelLine(name, term.factor * history.state[:, index], term.factor * history.std[:, index])
 
 
 def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from .document import Cell, Commands, Document, Facts, Found, Map, Numbers, Sentence, Table, Where
+from .document import Cell, Commands, Document, Facts, FindingLine, Map, Numbers, Sentence, Table, Where
 
 if TYPE_CHECKING:
     from rich.padding import Padding
@@ -56,7 +56,7 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
                 yield _table(item)
             elif isinstance(item, Sentence):
                 yield Text(printable(item.text), "dim" if item.soft else "")
-            elif isinstance(item, Found):
+            elif isinstance(item, FindingLine):
                 yield from _found(item.reason)
             elif isinstance(item, Commands):
                 for name, line in item.lines:  # to be copied: never broken

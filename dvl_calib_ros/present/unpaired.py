@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ..unpaired.results import ComparedEffect, ComparedNoise, Status, UnpairedComparison, Verdict
+from ..unpaired.results import ComparedEffect, ComparedNoise, ComparisonStatus, SimulatorVerdict, UnpairedComparison
 from ..verdict.kinds import Severity
 from .document import Answer, Cell, Document, Section, Sentence, Table, Where, figures, interval, intervals, p_value
 
 SEVERITIES = {
-    Verdict.NO_DIFFERENCE: Severity.ACCEPT,
-    Verdict.ONLY_NOISE: Severity.MARGINAL,
-    Verdict.CANNOT_TELL: Severity.MARGINAL,
-    Verdict.DIFFERENT: Severity.REJECT,
+    SimulatorVerdict.NO_DIFFERENCE: Severity.ACCEPT,
+    SimulatorVerdict.ONLY_NOISE: Severity.MARGINAL,
+    SimulatorVerdict.CANNOT_TELL: Severity.MARGINAL,
+    SimulatorVerdict.DIFFERENT: Severity.REJECT,
 }
-CELLS = {Status.MISSING: "bad", Status.OTHER_SIZE: "off", Status.ONLY_SIMULATOR: "off"}
+CELLS = {ComparisonStatus.MISSING: "bad", ComparisonStatus.OTHER_SIZE: "off", ComparisonStatus.ONLY_SIMULATOR: "off"}
 MM = 1e3
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..bags.channels import Channel, Decoder, DecodingError
 from ..bags.columns import Part
-from ..bags.layout import Columns
+from ..bags.layout import MessageColumns
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import Codes, Covariances, Index, Stamps
@@ -264,7 +264,7 @@ def turning(message: Any) -> Array:
     return _columns_of(getattr(twist, "twist", twist).angular)
 
 
-def _imu(columns: Columns) -> tuple[Array, Array]:
+def _imu(columns: MessageColumns) -> tuple[Array, Array]:
     """Quaternion and angular velocity (N, 7), and acceleration (N, 3); nan where not given."""
     q, w, a = columns.orientation, columns.angular_velocity, columns.linear_acceleration
     values = np.column_stack([q.x, q.y, q.z, q.w, w.x, w.y, w.z]).astype(float, copy=False)
@@ -275,7 +275,7 @@ def _imu(columns: Columns) -> tuple[Array, Array]:
     return values, acceleration
 
 
-def _covariances(kind: VelocityType, columns: Columns) -> Covariances:
+def _covariances(kind: VelocityType, columns: MessageColumns) -> Covariances:
     given, n = kind.covariance(columns), len(columns)
     if given is None:
         return Covariances.none(n)
@@ -287,7 +287,7 @@ def _covariances(kind: VelocityType, columns: Columns) -> Covariances:
     return Covariances(covariances.distinct, np.where(lacks, -1, covariances.index).astype(np.intp))
 
 
-def _broken(kind: VelocityType, columns: Columns, parameters: Parameters) -> Codes:
+def _broken(kind: VelocityType, columns: MessageColumns, parameters: Parameters) -> Codes:
     broken = np.zeros(len(columns), dtype=np.uint8)
     if kind.is_dvl:
         for code, rule in enumerate(kind.rules, start=1):

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.delay.hold_out import NO_TERMS, Recording, Terms
+from ..calibration.delay.hold_out import NO_TERMS, Terms, ThinnedRecording
 from ..calibration.folds import folds_of
 from ..calibration.frames import Array
 from ..calibration.heading_deviation import HeadingDeviation, heading_deviation
 from ..calibration.kalman import GaussianState
-from ..calibration.left_over import Followed, left_over
+from ..calibration.left_over import LeftOver, left_over
 from ..calibration.parameters import Parameters
 from ..calibration.robust import median
 from ..calibration.samples import Index
@@ -105,7 +105,7 @@ class Navigation:
     error_before: Array
     error_after: Array
     deviation: HeadingDeviation | None = None
-    followed: Followed | None = None
+    followed: LeftOver | None = None
 
 
 def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) -> Navigation | None:
@@ -127,7 +127,7 @@ def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) ->
 
 
 def dead_reckoned(
-    recording: Recording,
+    recording: ThinnedRecording,
     folds: NDArray[np.int64],
     terms: Sequence[Terms],
     parameters: Parameters,
@@ -202,7 +202,7 @@ class _Level(NamedTuple):
         kept = (np.empty((n, 3, 3)), np.empty((n, 3)), error, np.empty((n, 3))) if whole else ()
         return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
 
-    def fill(self, recording: Recording, at: Index, terms: Terms, parameters: Parameters) -> None:
+    def fill(self, recording: ThinnedRecording, at: Index, terms: Terms, parameters: Parameters) -> None:
         """Write those of some samples, corrected by these terms."""
         # on the way to them is twenty times as much
         for start in range(0, len(at), COMPARED_AT_ONCE):

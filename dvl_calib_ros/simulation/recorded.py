@@ -32,7 +32,7 @@ ATTITUDE_STEP_S = 0.05
 
 
 @dataclass(frozen=True)
-class Recording:
+class MotionSource:
     """Where a bag's motion is to be found.
 
     gnss_frame: as the parameter. smoothing: s, standard deviation of the window that takes the receiver's noise off
@@ -68,7 +68,7 @@ class _Samples:
     attitude: Array
 
 
-def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None = None) -> Motion:
+def recorded_motion(recording: MotionSource, rate_hz: float, seconds: float | None = None) -> Motion:
     """Motion of a bag, sampled at a rate from time 0: its longest stretch without a gap, or the first part of that.
 
     Raises InputError if it holds no reference velocity with attitude for long enough.
@@ -87,7 +87,7 @@ def recorded_motion(recording: Recording, rate_hz: float, seconds: float | None 
     return Motion(time, on_grid, rotation.as_matrix(), spline(at, 1))
 
 
-def _read(recording: Recording) -> _Samples:
+def _read(recording: MotionSource) -> _Samples:
     opened = recording.opened
     topics = recording.topics.found_in(opened.types)
     _check_topics(recording, topics, opened.types)
@@ -124,7 +124,7 @@ def _last_of_each(blocks: Sequence[SampleBlock]) -> tuple[Stamps, Index]:
     return found, len(stamps_ns) - 1 - from_the_end
 
 
-def _check_topics(recording: Recording, topics: Topics, present: Mapping[str, str]) -> None:
+def _check_topics(recording: MotionSource, topics: Topics, present: Mapping[str, str]) -> None:
     for name, types in ((topics.gnss, tuple(REFERENCE_TYPES)), (topics.imu, (IMU_TYPE,))):
         if present.get(name) not in types:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(present.items())) or "none"
@@ -134,7 +134,7 @@ def _check_topics(recording: Recording, topics: Topics, present: Mapping[str, st
             )
 
 
-def _longest_stretch(recording: Recording, samples: _Samples) -> tuple[float, float]:
+def _longest_stretch(recording: MotionSource, samples: _Samples) -> tuple[float, float]:
     """The longest time (from, to) in which neither velocity nor attitude has a gap."""
     common = [
         (max(a, c), min(b, d))

@@ -20,7 +20,7 @@ from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter
 from .injection import disturbed, injection_document
-from .recorded import Recording, recorded_motion
+from .recorded import MotionSource, recorded_motion
 from .sensors import (
     DvlErrors,
     ImuErrors,
@@ -61,7 +61,7 @@ class Scenario:
     gnss_frame: VelocityFrame = VelocityFrame.ENU
     outages: tuple[tuple[float, float], ...] = ()
     imu_errors: ImuErrors = field(default_factory=ImuErrors)
-    recording: Recording | None = None
+    recording: MotionSource | None = None
     waves: Waves | None = None
     effects: tuple[Injection, ...] = ()
 

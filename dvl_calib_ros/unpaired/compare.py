@@ -9,13 +9,13 @@ import numpy as np
 from ..diagnosis.diagnose import VISIBLE_TIMES_TYPICAL
 from ..diagnosis.holm import holm
 from ..diagnosis.results import Diagnosis
-from ..diagnosis.results import Verdict as Explained
-from ..diagnosis.selection import Selection
+from ..diagnosis.results import DiagnosisVerdict as Explained
+from ..diagnosis.selection import EffectSelection
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
-from .logs import Log, Source, read_log
+from .logs import Log, RecordedSide, read_log
 from .noise import compare_noise, levels_by_regime
-from .results import ComparedEffect, ComparedNoise, Rung, Status, UnpairedComparison, Verdict
+from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
 from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .sizes import (
     Size,
@@ -35,12 +35,18 @@ from .two_sides import Candidate
 
 # Family-wise, of all that is claimed to differ
 LEVEL = 0.01
-ORDER = (Status.MISSING, Status.OTHER_SIZE, Status.ONLY_SIMULATOR, Status.ALIKE, Status.CANNOT_TELL)
+ORDER = (
+    ComparisonStatus.MISSING,
+    ComparisonStatus.OTHER_SIZE,
+    ComparisonStatus.ONLY_SIMULATOR,
+    ComparisonStatus.ALIKE,
+    ComparisonStatus.CANNOT_TELL,
+)
 
 
 def compare(
-    vehicle: Source,
-    simulator: Source,
+    vehicle: RecordedSide,
+    simulator: RecordedSide,
     on_progress: Callable[[float], None] = lambda _: None,
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
@@ -119,7 +125,7 @@ class _Compared:
     def __init__(
         self,
         logs: tuple[Log, Log],
-        selections: tuple[Selection, Selection],
+        selections: tuple[EffectSelection, EffectSelection],
         renamed: tuple[Mapping[str, str], Mapping[str, str]],
         names: Sequence[str],
         effects: Mapping[str, Effect],
@@ -143,7 +149,7 @@ class _Compared:
         there = is_there(vehicle, simulator), is_there(simulator, vehicle)
         status = _status(there, p < LEVEL)
         needs = ""
-        if status is Status.CANNOT_TELL:
+        if status is ComparisonStatus.CANNOT_TELL:
             blind = "simulator" if there[0] else "vehicle"
             least = smallest_difference(vehicle, simulator, len(self.p))
             smallest = ", ".join(f"{key} {value:.2g}" for key, value in least.items())
@@ -151,7 +157,7 @@ class _Compared:
                 f"the two logs together would show a difference of {smallest}; with the {blind}: "
                 f"{self._effects[name].manoeuvre}"
             )
-        side = 1 if status is Status.ONLY_SIMULATOR or not there[0] else 0
+        side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not there[0] else 0
         trace = trace_of(self._selections[side], self._fits[side], self._effects[name])
         adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
         where = lies(self._selections[side], self._fits[side], trace)
@@ -170,7 +176,7 @@ class _Compared:
         effect = self._effects[name]
         what = "a second recording" if effect.relative_to_first else ", ".join(sorted(n.value for n in effect.needs))
         return ComparedEffect(
-            name, Status.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"),
+            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"),
             needs=f"the {lacking}'s log lacks {what}",
         )  # fmt: skip
 
@@ -183,19 +189,19 @@ class _Compared:
         return tuple(dict.fromkeys(others))
 
 
-def _status(there: tuple[bool, bool], differ: bool) -> Status:
+def _status(there: tuple[bool, bool], differ: bool) -> ComparisonStatus:
     if there[0] and there[1]:
-        return Status.OTHER_SIZE if differ else Status.ALIKE
+        return ComparisonStatus.OTHER_SIZE if differ else ComparisonStatus.ALIKE
     if not differ:
-        return Status.CANNOT_TELL
-    return Status.MISSING if there[0] else Status.ONLY_SIMULATOR
+        return ComparisonStatus.CANNOT_TELL
+    return ComparisonStatus.MISSING if there[0] else ComparisonStatus.ONLY_SIMULATOR
 
 
 def _noise(candidate: Candidate, p: float) -> ComparedNoise:
     differ = p < LEVEL and candidate.matters
-    status = _status(candidate.there, differ) if any(candidate.there) else Status.ALIKE
-    if status is Status.CANNOT_TELL:
-        status = Status.ALIKE
+    status = _status(candidate.there, differ) if any(candidate.there) else ComparisonStatus.ALIKE
+    if status is ComparisonStatus.CANNOT_TELL:
+        status = ComparisonStatus.ALIKE
     return ComparedNoise(
         candidate.name, status, candidate.unit, candidate.vehicle, candidate.simulator, p, candidate.note
     )
@@ -217,19 +223,19 @@ def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str,
 
 def _verdict(
     effects: Sequence[ComparedEffect], noise: Sequence[ComparedNoise], vehicle: Diagnosis, simulator: Diagnosis
-) -> Verdict:
+) -> SimulatorVerdict:
     if any(each.status.is_claim for each in effects):
-        return Verdict.DIFFERENT
+        return SimulatorVerdict.DIFFERENT
     if any(each.status.is_claim for each in noise):
-        return Verdict.ONLY_NOISE
+        return SimulatorVerdict.ONLY_NOISE
     unsure = Explained.INSUFFICIENT_EXCITATION in (vehicle.verdict, simulator.verdict)
-    if unsure or any(each.status is Status.CANNOT_TELL for each in effects):
-        return Verdict.CANNOT_TELL
-    return Verdict.NO_DIFFERENCE
+    if unsure or any(each.status is ComparisonStatus.CANNOT_TELL for each in effects):
+        return SimulatorVerdict.CANNOT_TELL
+    return SimulatorVerdict.NO_DIFFERENCE
 
 
 def _sentence(
-    verdict: Verdict,
+    verdict: SimulatorVerdict,
     effects: Sequence[ComparedEffect],
     noise: Sequence[ComparedNoise],
     rungs: Sequence[Rung],
@@ -240,9 +246,9 @@ def _sentence(
     before, after = by_name[AS_IT_IS], by_name[NOISE]
     parts = []
     for status, verb in (
-        (Status.MISSING, "The simulator lacks {}"),
-        (Status.OTHER_SIZE, "has {} of another size"),
-        (Status.ONLY_SIMULATOR, "has {} which the vehicle has not"),
+        (ComparisonStatus.MISSING, "The simulator lacks {}"),
+        (ComparisonStatus.OTHER_SIZE, "has {} of another size"),
+        (ComparisonStatus.ONLY_SIMULATOR, "has {} which the vehicle has not"),
     ):
         named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]
         if named:
@@ -254,7 +260,7 @@ def _sentence(
             f"; put right, its error on the vehicle's own motion falls from {1e3 * before.error_mps:.1f} to "
             f"{1e3 * after.error_mps:.1f} mm/s, held out"
         )
-    elif verdict is Verdict.CANNOT_TELL:
+    elif verdict is SimulatorVerdict.CANNOT_TELL:
         text = "These recordings show no difference in effects, and could not have shown some that matter"
     else:
         text = "The simulator lacks no effect that these recordings show"
@@ -274,6 +280,6 @@ def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedCom
         if diagnosis.selection is None
     ]
     return UnpairedComparison(
-        Verdict.CANNOT_TELL, f"Nothing can be compared. {' '.join(said)}", (), (), {}, (), float("nan"),
+        SimulatorVerdict.CANNOT_TELL, f"Nothing can be compared. {' '.join(said)}", (), (), {}, (), float("nan"),
         {"vehicle": {}, "simulator": {}}, vehicle, simulator,
     )  # fmt: skip

@@ -11,9 +11,9 @@ from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..diagnosis.curve import Curve
 from ..diagnosis.diagnose import diagnose_recordings
-from ..diagnosis.recordings import Recording, load_recordings
+from ..diagnosis.recordings import RecordedStreams, load_recordings
 from ..diagnosis.results import Diagnosis
-from ..diagnosis.selection import Selection
+from ..diagnosis.selection import EffectSelection
 from ..diagnosis.twin import simulated, with_quiet_reference
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
@@ -30,7 +30,7 @@ COPIED = 0.3
 
 
 @dataclass(frozen=True)
-class Source:
+class RecordedSide:
     """What was recorded on one side, and how to read it."""
 
     opened: Opened
@@ -47,20 +47,20 @@ class Log:
     """
 
     diagnosis: Diagnosis
-    recordings: tuple[Recording, ...]
+    recordings: tuple[RecordedStreams, ...]
     facts: tuple[StreamFacts, ...]
     residuals: tuple[Array, ...]
     exact: bool
     copied: bool
 
     @property
-    def selection(self) -> Selection | None:
+    def selection(self) -> EffectSelection | None:
         """The fits behind the diagnosis; None where it could not make any."""
         return self.diagnosis.selection
 
 
 def read_log(
-    source: Source,
+    source: RecordedSide,
     on_progress: Callable[[float], None] = lambda _: None,
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
@@ -80,14 +80,14 @@ def read_log(
     return Log(diagnosis, recordings, facts, residuals, exact, not exact and is_copied(recordings, residuals))
 
 
-def dithered(recording: Recording) -> Recording:
+def dithered(recording: RecordedStreams) -> RecordedStreams:
     """The recording with white noise over its DVL, the same at every call."""
     dvl = recording.dvl
     noise = DITHER_MPS * np.random.default_rng(0).standard_normal(dvl.values.shape)
     return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed, claims=dvl.claims))
 
 
-def dvl_residuals(selection: Selection) -> tuple[Array, ...]:
+def dvl_residuals(selection: EffectSelection) -> tuple[Array, ...]:
     """(N, 3) m/s per recording: recorded less simulated by the fit, DVL frame, on a reference without its noise."""
     problem = with_quiet_reference(selection.fitter.problem)
     return tuple(
@@ -96,7 +96,7 @@ def dvl_residuals(selection: Selection) -> tuple[Array, ...]:
     )
 
 
-def is_copied(recordings: Sequence[Recording], residuals: Sequence[Array]) -> bool:
+def is_copied(recordings: Sequence[RecordedStreams], residuals: Sequence[Array]) -> bool:
     """Whether what is left of the DVL has much less noise than the DVL itself: it has that of its reference."""
     if not residuals:
         return False

@@ -14,7 +14,7 @@ Triple = tuple[float, float, float]
 """A value and its 95 per cent interval."""
 
 
-class Status(str, Enum):
+class ComparisonStatus(str, Enum):
     """How an effect, or a property of the noise, compares."""
 
     MISSING = "missing_in_simulator"
@@ -26,21 +26,21 @@ class Status(str, Enum):
     @property
     def is_claim(self) -> bool:
         """Whether it says that the two differ."""
-        return self in (Status.MISSING, Status.OTHER_SIZE, Status.ONLY_SIMULATOR)
+        return self in (ComparisonStatus.MISSING, ComparisonStatus.OTHER_SIZE, ComparisonStatus.ONLY_SIMULATOR)
 
     @property
     def words(self) -> str:
         """As people read it."""
         return {
-            Status.MISSING: "the simulator lacks it",
-            Status.OTHER_SIZE: "another size",
-            Status.ONLY_SIMULATOR: "only in the simulator",
-            Status.ALIKE: "alike",
-            Status.CANNOT_TELL: "cannot tell",
+            ComparisonStatus.MISSING: "the simulator lacks it",
+            ComparisonStatus.OTHER_SIZE: "another size",
+            ComparisonStatus.ONLY_SIMULATOR: "only in the simulator",
+            ComparisonStatus.ALIKE: "alike",
+            ComparisonStatus.CANNOT_TELL: "cannot tell",
         }[self]
 
 
-class Verdict(str, Enum):
+class SimulatorVerdict(str, Enum):
     """The answer in a word."""
 
     DIFFERENT = "different"
@@ -75,7 +75,7 @@ class ComparedEffect:
     """
 
     name: str
-    status: Status
+    status: ComparisonStatus
     equivalent_to: tuple[str, ...]
     vehicle: Mapping[str, Triple]
     simulator: Mapping[str, Triple]
@@ -90,7 +90,7 @@ class ComparedNoise:
     """One property of the noise or of the stream. vehicle, simulator: value and interval in unit; p: adjusted."""
 
     name: str
-    status: Status
+    status: ComparisonStatus
     unit: str
     vehicle: Triple
     simulator: Triple
@@ -119,7 +119,7 @@ class UnpairedComparison(Answering):
     the effects that its motions could not have shown at sizes that matter, with the smallest size that they would.
     """
 
-    verdict: Verdict
+    verdict: SimulatorVerdict
     sentence: str
     effects: tuple[ComparedEffect, ...]
     noise: tuple[ComparedNoise, ...]
@@ -135,7 +135,7 @@ class UnpairedComparison(Answering):
     @property
     def missing(self) -> tuple[ComparedEffect, ...]:
         """Effects that the vehicle has and the simulator has not, the strongest first."""
-        return tuple(each for each in self.effects if each.status is Status.MISSING)
+        return tuple(each for each in self.effects if each.status is ComparisonStatus.MISSING)
 
 
 def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:

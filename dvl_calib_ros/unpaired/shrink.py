@@ -19,12 +19,12 @@ from ..calibration.frames import Array
 from ..calibration.robust import robust_std
 from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
 from ..diagnosis.folds import fitted_without, stretch_of
-from ..diagnosis.selection import Selection
+from ..diagnosis.selection import EffectSelection
 from ..diagnosis.settings import SETTINGS
 from ..diagnosis.twin import simulated
 from ..effects.base import Effect
 from .logs import Log
-from .results import Rung, Status
+from .results import ComparisonStatus, Rung
 from .sizes import Size
 
 # Windows of the two-sample test: long enough that neighbours are nearly independent
@@ -37,7 +37,7 @@ AS_IT_IS, ALL, NOISE = "as it is", "all effects", "all effects, and the vehicle'
 
 
 @dataclass(frozen=True)
-class Model:
+class SimulatedModel:
     """What is simulated. added: effects fitted to the vehicle; kept: those of the simulator, with their values."""
 
     name: str
@@ -46,25 +46,26 @@ class Model:
     vehicle_noise: bool = False
 
 
-def models(sizes: Mapping[str, tuple[Size, Size, Status]], vehicle: Sequence[Effect]) -> list[Model]:
+def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Sequence[Effect]) -> list[SimulatedModel]:
     """The ladder. sizes: of both sides by name, and how they compare. vehicle: effects that the vehicle has."""
     kept = {
         name: (simulator.effect, _values(simulator))
         for name, (_, simulator, status) in sizes.items()
-        if status is not Status.MISSING and simulator.found and _always(simulator.effect)
+        if status is not ComparisonStatus.MISSING and simulator.found and _always(simulator.effect)
     }
     lacking = [
         sizes[name][0].effect
         for name in sizes
-        if sizes[name][2] in (Status.MISSING, Status.OTHER_SIZE) and sizes[name][0].effect in vehicle
+        if sizes[name][2] in (ComparisonStatus.MISSING, ComparisonStatus.OTHER_SIZE)
+        and sizes[name][0].effect in vehicle
     ]
-    ladder = [Model(AS_IT_IS, (), kept)]
+    ladder = [SimulatedModel(AS_IT_IS, (), kept)]
     for effect in lacking:
         rest = {name: each for name, each in kept.items() if name != effect.name}
-        ladder.append(Model(f"with {effect.name}", (effect,), rest))
+        ladder.append(SimulatedModel(f"with {effect.name}", (effect,), rest))
     if len(lacking) != 1 or set(vehicle) != set(lacking) or kept:
-        ladder.append(Model(ALL, tuple(vehicle), {}))
-    return [*ladder, Model(NOISE, tuple(vehicle), {}, vehicle_noise=True)]
+        ladder.append(SimulatedModel(ALL, tuple(vehicle), {}))
+    return [*ladder, SimulatedModel(NOISE, tuple(vehicle), {}, vehicle_noise=True)]
 
 
 def _always(effect: Effect) -> bool:
@@ -90,7 +91,7 @@ class Shrunk:
     recording_of: NDArray[np.intp]
 
 
-def shrink(vehicle: Log, simulator: Log, ladder: Sequence[Model], seed: int = 0) -> Shrunk:
+def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed: int = 0) -> Shrunk:
     """Climb the ladder on the vehicle's recordings."""
     selection = vehicle.selection
     if selection is None:
@@ -101,7 +102,7 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[Model], seed: int = 0)
     time = np.concatenate([each.dvl.time for each in problem.recordings])
     recording_of = np.repeat(np.arange(len(truth), dtype=np.intp), [len(each) for each in truth])
     windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
-    ideal = _held_out(selection, Model("", (), {}))
+    ideal = _held_out(selection, SimulatedModel("", (), {}))
     everything = _held_out(selection, ladder[-1])
     own = [
         _drawn([a - b], a, _fold_of(problem, index), rng)
@@ -143,7 +144,7 @@ def _floor(values: Array, recording_of: NDArray[np.intp]) -> float:
     return _rms(second[np.isfinite(second).all(axis=1)]) / float(np.sqrt(6.0))
 
 
-def _held_out(selection: Selection, model: Model) -> list[Array]:
+def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     """(N, 3) m/s per recording: what a model, fitted without the fold that a sample is in, says the DVL measures.
 
     Of several recordings stretches are held out as well: the model's days must have been seen for their own delays.

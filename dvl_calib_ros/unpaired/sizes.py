@@ -18,7 +18,7 @@ from scipy.stats import norm, t
 from ..calibration.frames import Array
 from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
 from ..diagnosis.fitting import Fit
-from ..diagnosis.selection import CLOCKS, Selection, blocks_of
+from ..diagnosis.selection import CLOCKS, EffectSelection, blocks_of
 from ..diagnosis.where import BANDS_HZ, regimes
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
@@ -136,7 +136,7 @@ def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]
     return [name for name in EFFECTS if name in both] + sorted(both - set(EFFECTS))
 
 
-def fitted(selection: Selection, names: Sequence[str], effects: Mapping[str, Effect]) -> Fit:
+def fitted(selection: EffectSelection, names: Sequence[str], effects: Mapping[str, Effect]) -> Fit:
     """All effects of these names that the recordings can be tested for, fitted together."""
     fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
@@ -149,7 +149,7 @@ def fitted(selection: Selection, names: Sequence[str], effects: Mapping[str, Eff
     return fitter.fit(fit.hypothesis.with_effects(chosen, n, start), fit.noise)
 
 
-def is_testable(effect: Effect, selection: Selection) -> bool:
+def is_testable(effect: Effect, selection: EffectSelection) -> bool:
     """Whether recordings hold what an effect needs."""
     problem = selection.fitter.problem
     return effect.needs <= problem.available and not (effect.relative_to_first and len(problem.recordings) < 2)
@@ -161,7 +161,7 @@ def _some_time(effect: Effect, seconds: float) -> Values:
     return effect.defaults | ({times[0]: 0.5 * seconds} if len(times) == 1 else {})
 
 
-def sizes(selection: Selection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
+def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
     """Every effect of a fit by name. found: names (as compared) that the side's own diagnosis has."""
     block = blocks_of(selection.fitter.problem)
     covariance = fit.covariance(block)
@@ -183,14 +183,14 @@ def sizes(selection: Selection, fit: Fit, found: Sequence[str]) -> dict[str, Siz
 # ------------------------------------------------------------------ where it lies
 
 
-def trace_of(selection: Selection, fit: Fit, effect: Effect) -> Array:
+def trace_of(selection: EffectSelection, fit: Fit, effect: Effect) -> Array:
     """(M, A) m/s that an effect adds, without what misalignment, scale and the other effects would take in of it."""
     others = [other for other in fit.effects if other is not effect]
     without = selection.fitter.fit(fit.hypothesis.with_effects(others, len(fit.seen), {}), fit.noise, 4)
     return without.residual - fit.residual
 
 
-def lies(selection: Selection, fit: Fit, trace: Array) -> Lies:
+def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
     """Axis, regime and band that hold most of a trace (M, A); of the regimes the one where it is densest."""
     problem = selection.fitter.problem
     energy = trace**2

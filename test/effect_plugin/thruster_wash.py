@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from dvl_calib_ros.calibration.frames import Array
-from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, Needs, ParameterSpec
+from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
 
 
 class ThrusterWash(Effect):
@@ -14,9 +14,9 @@ class ThrusterWash(Effect):
     name = "thruster_wash"
     summary = "a surge error in turns to either side: coefficient · |ω_z|"
     manoeuvre = "turns to both sides, sharp ones and wide ones"
-    parameters = (ParameterSpec("coefficient_m", "m", 0.1, -5.0, 5.0, "surge error per turn rate"),)
+    parameters = (EffectParameter("coefficient_m", "m", 0.1, -5.0, 5.0, "surge error per turn rate"),)
     acts_on = ActsOn.DVL
-    needs = frozenset({Needs.ANGULAR_VELOCITY})
+    needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     confounded_with = ("lever_arm",)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import defaultdict
 
 from conftest import ROOT
 
@@ -28,3 +29,14 @@ def test_a_long_module_is_noticed_until_it_says_why():
     assert lacks_reason(f'"""About."""\n{body}')
     assert not lacks_reason(f'"""About. (Long, because it is a table.)"""\n{body}')
     assert not lacks_reason('"""About."""\n' + "x = 1\n" * (LONGEST - 1))
+
+
+def test_a_class_name_has_one_meaning():
+    """In the package two classes never share a name: a reader who searches for one finds it."""
+    places = defaultdict(list)
+    for path in (ROOT / "dvl_calib_ros").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(path.name)
+    assert len(places) > 200
+    assert {name: paths for name, paths in places.items() if len(paths) > 1} == {}

@@ -7,14 +7,14 @@ from own_models import PRIOR_STD
 
 from dvl_calib_ros.calibration.bank import ModelCounts
 from dvl_calib_ros.calibration.delay.hold_out import Terms
-from dvl_calib_ros.calibration.estimator import Estimator, Given
+from dvl_calib_ros.calibration.estimator import Estimator, EstimatorSetup
 from dvl_calib_ros.calibration.kalman import GaussianState
 
 
 class MeanRise(Estimator):
     """Extends G1's state by one."""
 
-    def __init__(self, given: Given) -> None:
+    def __init__(self, given: EstimatorSetup) -> None:
         self._given, self._taken = given, 0
         self._sum = self._count = 0.0
 

@@ -38,12 +38,14 @@ SAME_LEVEL = 1.02
 def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[float]]) -> Document:
     """What `dvl-calib diagnose VEHICLE --simulator SIMULATOR` says, as in its JSON."""
     from dvl_calib_ros.unpaired.compare import compare
-    from dvl_calib_ros.unpaired.logs import Source
+    from dvl_calib_ros.unpaired.logs import RecordedSide
     from dvl_calib_ros.unpaired.results import unpaired_document
 
-    def source(side: str, path: Path) -> Source:
+    def source(side: str, path: Path) -> RecordedSide:
         roll, pitch, yaw = mounting[side]
-        return Source(open_recording([path]), Parameters(min_speed=0.0, mounting_rpy=(roll, pitch, yaw)), Topics())
+        return RecordedSide(
+            open_recording([path]), Parameters(min_speed=0.0, mounting_rpy=(roll, pitch, yaw)), Topics()
+        )
 
     return unpaired_document(compare(source("vehicle", vehicle), source("simulator", simulator)))
 

@@ -211,7 +211,7 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     with suppress(DamagedError):  # schemas and channels once more: the chunk that introduces them may be damaged
         summary = _summary(file)
     tables = Tables(summary)
-    walk = _Walk(file, size, tables, damage, summary.chunk_indexes if summary else ())
+    walk = _FileWalk(file, size, tables, damage, summary.chunk_indexes if summary else ())
     at: int | None = len(MCAP_MAGIC)
     while at is not None and at < size:
         found, at = walk.step(at)
@@ -221,7 +221,7 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     damage.raise_if_any()
 
 
-class _Walk:
+class _FileWalk:
     """Goes through a file record by record."""
 
     def __init__(

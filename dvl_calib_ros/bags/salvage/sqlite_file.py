@@ -22,7 +22,7 @@ _INTEGER_SIZES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 _FORMATS = ("ros2msg", "ros2idl", "unknown")
 
 
-class _Row(NamedTuple):
+class _TableRow(NamedTuple):
     """A row of a table: its number and its columns, where a column that is the number is None."""
 
     number: int
@@ -94,7 +94,7 @@ def _is_message(columns: list[Any]) -> bool:
     )
 
 
-def _take_note(row: _Row, topics: dict[int, _Topic], definitions: dict[tuple[str, str], tuple[str, str]]) -> None:
+def _take_note(row: _TableRow, topics: dict[int, _Topic], definitions: dict[tuple[str, str], tuple[str, str]]) -> None:
     """Take note of a topic (id, name, type, cdr, QoS, hash) or a definition (id, type, format, text, hash)."""
     number, columns = row
     if len(columns) < 4 or columns[0] is not None or not all(isinstance(text, str) for text in columns[1:]):
@@ -126,7 +126,7 @@ class _Pages:
         (said,) = struct.unpack_from(">I", header, 28)
         self.missing = max(0, said * self.size - size) if is_sound else 0
 
-    def rows(self, number: int) -> Iterator[_Row]:
+    def rows(self, number: int) -> Iterator[_TableRow]:
         """The whole rows of a page, if it is a leaf of a table."""
         page = self._read(number)
         start = _FILE_HEADER if number == 1 else 0
@@ -149,12 +149,12 @@ class _Pages:
             return b""
         return page
 
-    def _row(self, page: bytes, at: int) -> _Row:
+    def _row(self, page: bytes, at: int) -> _TableRow:
         size, at = _varint(page, at)
         number, at = _varint(page, at)
         if size > min(LARGEST_RECORD, self.count * self.size):
             raise ValueError("longer than the file")
-        return _Row(number, _columns(self._payload(page, at, size)))
+        return _TableRow(number, _columns(self._payload(page, at, size)))
 
     def _payload(self, page: bytes, at: int, size: int) -> bytes:
         """The content of a row; what does not fit in its page is on a chain of overflow pages."""

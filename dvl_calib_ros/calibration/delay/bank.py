@@ -21,14 +21,14 @@ import numpy as np
 from ..correction_parameters import PriorOnErrors, to_correction
 from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
 from ..frames import Array, product
-from ..heading_states import Seen, all_told, heading_states, heading_terms, upwards, with_terms
+from ..heading_states import HeadingEvidence, all_told, heading_states, heading_terms, upwards, with_terms
 from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState
 from ..parameters import Parameters
 from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
-from .known import After, BlockRows, DayState, Ended, Found, Hypotheses, Known, Posterior, Sums, Told, parts
+from .known import After, BlockRows, DayState, Ended, Hypotheses, Known, Likely, Posterior, Sums, Told, parts
 from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, STEP_S, STEPS, DelayedRows
 from .told import innovation_squared, told_by
 
@@ -395,10 +395,10 @@ class DelayBank:
         kept, share = _likely(log_share)
         likely = GaussianState(found.x[kept], found.p[kept])
         place = int(np.searchsorted(kept, best))
-        seen = None if self._process_rate is not None else Seen.of(self.blocks, likely, kept, place)
+        seen = None if self._process_rate is not None else HeadingEvidence.of(self.blocks, likely, kept, place)
         return Known(likely, kept, share, best, found.information[best], self._regressor_noise, seen)
 
-    def found(self, known: Sequence[Known]) -> list[Found | None]:
+    def found(self, known: Sequence[Known]) -> list[Likely | None]:
         """What was known at times of this day, with what that makes of the heading; None where numbers ran away."""
         if not known:
             return []
@@ -407,7 +407,7 @@ class DelayBank:
         except np.linalg.LinAlgError:
             return [None] if len(known) == 1 else [self.found([each])[0] for each in known]
 
-    def _found(self, known: Sequence[Known]) -> Iterator[Found]:
+    def _found(self, known: Sequence[Known]) -> Iterator[Likely]:
         seen = [each.seen for each in known if each.seen is not None]
         deviations = heading_states(seen, self._parameters.heading_deviation_std)
         inflations: Array = np.ones((len(known), N_STATE))
@@ -422,9 +422,9 @@ class DelayBank:
             if deviations:
                 _, shift, more, drifted, _ = deviations[number]
                 likely, heading = GaussianState(likely.x + shift, likely.p + more), deviations[number].coefficients
-            yield Found(likely, each.kept, each.share, shown[number], inflations[number], heading, drifted)
+            yield Likely(likely, each.kept, each.share, shown[number], inflations[number], heading, drifted)
 
-    def posteriors(self, found: Sequence[Found]) -> list[Posterior]:
+    def posteriors(self, found: Sequence[Likely]) -> list[Posterior]:
         """The mixture of all hypotheses, as it was found on this day each time.
 
         Raises numpy.linalg.LinAlgError where one of them is a configuration so wrong that the errors have no small
@@ -443,7 +443,7 @@ class DelayBank:
             for each, end in zip(found, ends.tolist(), strict=True)
         ]
 
-    def _posterior(self, found: Found, errors: GaussianState) -> Posterior:
+    def _posterior(self, found: Likely, errors: GaussianState) -> Posterior:
         state = _one(errors, self.delays_s[found.kept], found.share)
         raised = state.raised(found.inflation).turned(self._up, found.drifted)
         p = state.p
@@ -521,7 +521,7 @@ class DelayBank:
         if self._process_rate is not None:
             return np.ones(N_STATE)
         of_one = np.array([best])
-        seen = Seen.of(self.blocks, GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
+        seen = HeadingEvidence.of(self.blocks, GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
         return heading_states([seen], self._parameters.heading_deviation_std)[0].inflation
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:

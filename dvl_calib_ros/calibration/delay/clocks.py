@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from ..frames import Array
 from ..heading_deviation import HeadingDeviation, heading_deviation
-from ..left_over import Followed, left_over
+from ..left_over import LeftOver, left_over
 from ..parameters import Parameters
 from ..register.configuration import fitting_configuration
-from ..register.motion import Motion, make_motion
+from ..register.motion import MotionStreams, make_motion
 from ..register.registration import Registration, register
 from ..samples import FRAMES, Codes, Mask
-from ..tables import Table
-from .hold_out import KEPT_EVERY_S, MEASURED_BELOW, NOT_MEASURED, Kept, Recording, Terms
+from ..tables import RowTable
+from .hold_out import KEPT_EVERY_S, MEASURED_BELOW, NOT_MEASURED, Terms, ThinnedBlock, ThinnedRecording
 from .known import Posterior
 from .rows import DvlColumns, ImuColumns, ReferenceColumns
 
@@ -34,7 +34,7 @@ ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
 MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
 
-class _Dvl(Table):
+class _DvlVelocities(RowTable):
     """times s and velocities m/s of the DVL."""
 
     IS_REUSED = True  # a motion has copies
@@ -43,18 +43,18 @@ class _Dvl(Table):
     velocity: Array
 
 
-class _Reference(Table):
+class _Reference(RowTable):
     """The same of references, whether they are in the body and which axes they measure."""
 
     IS_REUSED = True  # a motion has copies
-    LAYOUT: ClassVar = {**_Dvl.LAYOUT, "in_body": (np.bool_, ()), "is_measured": (np.bool_, (3,))}
+    LAYOUT: ClassVar = {**_DvlVelocities.LAYOUT, "in_body": (np.bool_, ()), "is_measured": (np.bool_, (3,))}
     times: Array
     velocity: Array
     in_body: Mask
     is_measured: NDArray[np.bool_]
 
 
-class _Imu(Table):
+class _Imu(RowTable):
     """times s, attitudes and rates of the IMU, as of `ImuColumns`."""
 
     IS_REUSED = True  # a motion has copies
@@ -68,11 +68,11 @@ class _Imu(Table):
     angular_velocity: Array
 
 
-class _Seen:
+class _Registered:
     """What is registered of the newest blocks, without what is of no use here: covariances alone are half of it."""
 
     def __init__(self) -> None:
-        self._streams = _Dvl(), _Reference(), _Imu()
+        self._streams = _DvlVelocities(), _Reference(), _Imu()
         self._blocks: deque[tuple[int, ...]] = deque()  # rows of each in the streams
 
     def __len__(self) -> int:
@@ -83,7 +83,7 @@ class _Seen:
         for stream in self._streams:
             stream.reserve((MOST + 1) * MOST_OF_A_BLOCK)
 
-    def add(self, kept: Kept) -> None:
+    def add(self, kept: ThinnedBlock) -> None:
         """Take a block; of more than `MOST` the oldest is forgotten."""
         r = kept.reference
         is_measured = np.diagonal(r.noise, axis1=1, axis2=2) < MEASURED_BELOW
@@ -103,7 +103,7 @@ class _Seen:
         for stream in self._streams:
             stream.clear()
 
-    def recording(self) -> Recording:
+    def recording(self) -> ThinnedRecording:
         """All that is there, as for verification; of noise it says which axes are measured."""
         dvl, reference, imu = (
             [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
@@ -112,9 +112,9 @@ class _Seen:
         noise = np.where(is_measured, 1.0, NOT_MEASURED)[:, :, None] * np.eye(3)
         claimed = np.zeros(len(times), dtype=bool)
         of_reference = ReferenceColumns(times, velocity, noise, in_body, claimed)
-        return Recording(DvlColumns(*dvl), np.zeros(len(dvl[0])), of_reference, ImuColumns(*imu))
+        return ThinnedRecording(DvlColumns(*dvl), np.zeros(len(dvl[0])), of_reference, ImuColumns(*imu))
 
-    def motion(self) -> Motion | None:
+    def motion(self) -> MotionStreams | None:
         """All that is there, without references that are not like most; None where that is too little."""
         dvl, reference, imu = (
             [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
@@ -135,7 +135,7 @@ class Rest(NamedTuple):
     """What a calibration leaves: what the velocity that is left follows, how the heading deviates, and whether the
     reference is in the earth's frame."""
 
-    followed: Followed
+    followed: LeftOver
     deviation: HeadingDeviation | None
     in_earth: bool
 
@@ -156,7 +156,7 @@ class KeptClocks:
     def __init__(self, parameters: Parameters, live: bool) -> None:
         """live: they go on for hours."""
         self._parameters, self._is_live = parameters, live
-        self._seen = _Seen()
+        self._seen = _Registered()
         if live:
             self._seen.take_room()
         self._blocks = 0  # of this day
@@ -164,7 +164,7 @@ class KeptClocks:
         self._over: Looked | None = None  # of a day that is over, where something was off
         self._latest = Looked()
 
-    def add(self, kept: Kept, frames: Codes, from_ns: int) -> None:
+    def add(self, kept: ThinnedBlock, frames: Codes, from_ns: int) -> None:
         """Take a block's streams, which begins at a stamp. frames: (J,) codes of those that its references are said to
         be in."""
         self._seen.add(kept)

@@ -19,21 +19,21 @@ import numpy as np
 
 from ..assembly import gate_of, prior
 from ..bank import ModelCounts
-from ..estimator import Estimator, Given
+from ..estimator import Estimator, EstimatorSetup
 from ..folds import Moments
 from ..frames import Array
 from ..history import Counts, Numbers, StateTrace
 from ..kalman import GaussianState
 from ..register.registration import Registration
 from ..results import Day
-from ..samples import Index, Stamps, Verdict
+from ..samples import Index, SampleUse, Stamps
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..streams import LONG_AGO_NS, LONGEST_NS
-from ..tables import Table
+from ..tables import RowTable
 from ..verification import HeldOutError
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .clocks import Rest
-from .hold_out import Kept, Recording, Terms, held_out_error
+from .hold_out import Terms, ThinnedBlock, ThinnedRecording, held_out_error
 from .known import DayState, Posterior
 from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
 from .solver import BlockSolver, Outcome
@@ -53,7 +53,7 @@ AXES = ("x", "y", "z")
 NAMED_FROM = 4.0
 
 
-class _Dvl(Table):
+class _PendingDvl(RowTable):
     """Usable DVL samples that blocks to come need."""
 
     IS_REUSED = True  # blocks have copies
@@ -70,7 +70,7 @@ class _Dvl(Table):
 class DelayFilter(Estimator):
     """Feeds a `BlockSolver` from an aligner; tells the aligner which past of its tracks is still wanted."""
 
-    def __init__(self, given: Given) -> None:
+    def __init__(self, given: EstimatorSetup) -> None:
         """Start from the prior of G2's states."""
         assert given.base is not None  # its entry says what it extends
         model, parameters, aligner = given.model, given.parameters, given.aligner
@@ -86,7 +86,7 @@ class DelayFilter(Estimator):
         self._state_names = model.state_names
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
-        self._dvl = _Dvl()
+        self._dvl = _PendingDvl()
         self._has_room = False
         self._n_taken = 0  # rows of the aligner that have been looked at
         self._block_ns: int | None = None  # start of the next block
@@ -98,7 +98,7 @@ class DelayFilter(Estimator):
         self._coming: deque[tuple[int, Solved, int]] = deque()
         self._gathered_ns: list[int] = []  # the same of those that are not
         self._is_telling = self._is_settled = False
-        self._recording: tuple[Kept, Recording] | None = None  # asked for by each model's verification
+        self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # asked for by each model's verification
         # asked for with each message
         self._of_recording: tuple[Posterior, Registration | None, GaussianState] | None = None
         self._suggested: tuple[Outcome, str] | None = None
@@ -431,7 +431,7 @@ class DelayFilter(Estimator):
         first, end = self._n_taken - rows.base, aligner.partners.n_judged - rows.base
         if end <= first:
             return
-        at = np.flatnonzero((rows.verdict[first:end] != Verdict.FROZEN) & ~rows.late[first:end]) + first
+        at = np.flatnonzero((rows.verdict[first:end] != SampleUse.FROZEN) & ~rows.late[first:end]) + first
         slots = self._dvl.extend(len(at))
         self._dvl.stamps_ns[slots] = rows.stamps_ns[at]
         self._dvl.velocity[slots] = rows.velocity_dvl[at]
@@ -463,14 +463,14 @@ class DelayFilter(Estimator):
         return self._told.claims > 0
 
     @property
-    def recording(self) -> tuple[Recording, int] | None:
+    def recording(self) -> tuple[ThinnedRecording, int] | None:
         """All that was kept for verification, and the stamp (ns) of its time 0; None for nothing."""
         solver = self._idle_solver()
         if not solver.kept:
             return None
         newest = solver.kept[-1]  # another one once anything is kept or left out
         if self._recording is None or self._recording[0] is not newest:
-            self._recording = newest, Recording.of(solver.kept)
+            self._recording = newest, ThinnedRecording.of(solver.kept)
         return self._recording[1], solver.epoch_ns
 
     @property

@@ -23,7 +23,7 @@ KEPT_EVERY_S = 0.19
 NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
 
 
-class Kept(NamedTuple):
+class ThinnedBlock(NamedTuple):
     """Thinned columns of one block, for verification; times in s since the epoch of `DelayFilter`."""
 
     dvl: DvlColumns
@@ -34,7 +34,7 @@ class Kept(NamedTuple):
     @staticmethod
     def between(
         from_s: float, to_s: float, dvl: DvlColumns, noise_dvl: Array, reference: ReferenceColumns, imu: ImuColumns
-    ) -> Kept:
+    ) -> ThinnedBlock:
         """A block's own columns, thinned. noise_dvl: (3, 3) (m/s)²."""
         first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
         at = first + _thinned_seconds(dvl.times[first:last])
@@ -47,11 +47,11 @@ class Kept(NamedTuple):
         rates = _mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
         turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
         # what is a part of larger arrays would keep these
-        return Kept(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
+        return ThinnedBlock(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
 
 
 def held_out_error(
-    recording: Recording, stamps_ns: Stamps, days: Index, bank: DelayBank, p: Parameters
+    recording: ThinnedRecording, stamps_ns: Stamps, days: Index, bank: DelayBank, p: Parameters
 ) -> HeldOutError | None:
     """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
 
@@ -134,7 +134,7 @@ class Compared(NamedTuple):
     rates: Array
 
 
-class Recording(NamedTuple):
+class ThinnedRecording(NamedTuple):
     """All that was kept, times in s since an epoch."""
 
     dvl: DvlColumns
@@ -143,13 +143,13 @@ class Recording(NamedTuple):
     imu: ImuColumns
 
     @staticmethod
-    def of(kept: Sequence[Kept]) -> Recording:
+    def of(kept: Sequence[ThinnedBlock]) -> ThinnedRecording:
         """Blocks one after the other."""
         dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
         noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
         reference = zip(*(each.reference for each in kept), strict=True)
         imu = zip(*(each.imu for each in kept), strict=True)
-        return Recording(
+        return ThinnedRecording(
             dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
         )
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..frames import Array
-from ..heading_states import Seen
+from ..heading_states import HeadingEvidence
 from ..kalman import GaussianState
 from ..samples import Index, Mask, Stamps
 from .rows import DelayedRows
@@ -74,7 +74,7 @@ def parts(told: Array) -> tuple[Array, Array, Array]:
 class Known(NamedTuple):
     """What is known at some time, before the heading is looked at.
 
-    likely, kept, share: as of `Found`. best: which of the K is most likely, and its information (n, n).
+    likely, kept, share: as of `Likely`. best: which of the K is most likely, and its information (n, n).
     regressor_noise: (4,). seen: by blocks of time; None under a random walk.
     """
 
@@ -84,7 +84,7 @@ class Known(NamedTuple):
     best: int
     information: Array
     regressor_noise: Array
-    seen: Seen | None
+    seen: HeadingEvidence | None
 
 
 class After(NamedTuple):
@@ -97,7 +97,7 @@ class After(NamedTuple):
     known: Known | None = None
 
 
-class Found(NamedTuple):
+class Likely(NamedTuple):
     """What is known at some time: the likely hypotheses x (M, n), P (M, n, n), on ψ and κ, the numbers kept (M,) of
     their delays, and the share (M,) of each; shown, inflation and heading as of `Posterior`;
     drifted as of `HeadingStates`."""

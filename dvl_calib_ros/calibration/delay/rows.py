@@ -131,7 +131,7 @@ class DelayedRows:
     standing: Array
     weight: Array
     regressor_noise: Array
-    motion: Motion
+    motion: MotionAtReferences
     body_from_dvl: Array
 
     def __len__(self) -> int:
@@ -166,7 +166,7 @@ class DelayedRows:
         return row
 
 
-class Motion(NamedTuple):
+class MotionAtReferences(NamedTuple):
     """What J references are compared with.
 
     velocity, slope: (3, K, J) of the DVL at every delay, m/s and m/s², in its own frame. body: (J, 3) m/s, the
@@ -181,10 +181,10 @@ class Motion(NamedTuple):
     lever: Array | None
     earth: Array
 
-    def part(self, at: Mask | slice) -> Motion:
+    def part(self, at: Mask | slice) -> MotionAtReferences:
         """Of some references."""
         lever = None if self.lever is None else self.lever[at]
-        return Motion(
+        return MotionAtReferences(
             self.velocity[..., at], self.slope[..., at], self.body[at], self.turning[at], lever, self.earth[at]
         )
 
@@ -199,7 +199,7 @@ class Matched:
 
     index: Index
     parts: Parts
-    motion: Motion
+    motion: MotionAtReferences
     white: Array
     weight: Array
     regressor_noise: Array
@@ -264,7 +264,7 @@ def matched(
     # references closer together than the DVL's samples share these
     weight = np.clip(interval[index] / spacing, 0.0, 1.0)
     lever = cross(turning, np.array(lever_arm)) if any(lever_arm) else None
-    motion = Motion(
+    motion = MotionAtReferences(
         read.velocity[..., index], read.slope[..., index], body[index], turning, lever, seen.earth_in_body[index]
     )
     told = uncertain.information(white.swapaxes(1, 2) @ white)
@@ -342,7 +342,7 @@ def _read(dvl: DvlColumns, dvl_parts: Parts, times: Array, parts: Parts, compare
     return _Reading(velocity, slope, known, spacing[middle], wide.slope_gain[middle])
 
 
-def _moving(motion: Motion, white: Array, body_from_dvl: Array) -> Array:
+def _moving(motion: MotionAtReferences, white: Array, body_from_dvl: Array) -> Array:
     """`DelayedRows.moving`. white: (J, 3, 3) lower triangles."""
     k, n = motion.velocity.shape[1:]
     v = motion.velocity.reshape(3, k * n)

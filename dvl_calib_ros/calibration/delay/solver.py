@@ -28,8 +28,8 @@ from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
 from .clocks import KeptClocks, Looked, Rest
 from .contradicted import without_contradicted
-from .hold_out import MEASURED_BELOW, Kept
-from .known import After, BlockRows, Found, Known, Posterior
+from .hold_out import MEASURED_BELOW, ThinnedBlock
+from .known import After, BlockRows, Known, Likely, Posterior
 from .parts import Parts
 from .rows import (
     DelayedRows,
@@ -110,7 +110,7 @@ class BlockSolver:
         self._contradicted: Stamps = np.zeros(0, dtype=np.int64)  # DVL samples, by the references of an earlier block
         self._posterior: Posterior | None = None
         self.epoch_ns = 0
-        self.kept: list[Kept] | None = [] if verified else None
+        self.kept: list[ThinnedBlock] | None = [] if verified else None
         self.restarted = 0
 
     def outcome(self, has_rows: bool = False) -> Outcome:
@@ -227,7 +227,7 @@ class BlockSolver:
         except np.linalg.LinAlgError:
             return None
 
-    def _with_posteriors(self, outcomes: list[Outcome], found: Sequence[tuple[int, Found | None]]) -> list[Outcome]:
+    def _with_posteriors(self, outcomes: list[Outcome], found: Sequence[tuple[int, Likely | None]]) -> list[Outcome]:
         """Outcomes with what was found after some of them."""
         sound = [each for _, each in found if each is not None]
         try:
@@ -250,7 +250,7 @@ class BlockSolver:
             told.append(outcome._replace(posterior=self._posterior, counts=counts))
         return told
 
-    def _posterior_of(self, found: Found) -> Posterior | None:
+    def _posterior_of(self, found: Likely) -> Posterior | None:
         try:
             return self.bank.posteriors([found])[0]
         except np.linalg.LinAlgError:
@@ -333,7 +333,7 @@ class BlockSolver:
             self._leave_out(streams.dvl_ns[~good], block.from_ns)
             dvl = DvlColumns(*(column[good] for column in dvl))
         from_s, to_s = self._seconds(np.array([block.from_ns, block.end_ns])).tolist()
-        kept = Kept.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
+        kept = ThinnedBlock.between(from_s, to_s, dvl, streams.noise_dvl, reference, streams.imu)
         self._clocks.add(kept, streams.raw.frames, block.from_ns)
         if self.kept is not None:
             self.kept.append(kept)

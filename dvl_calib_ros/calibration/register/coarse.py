@@ -15,7 +15,7 @@ import numpy as np
 from ..delay.rows import attitude_at
 from ..frames import Array
 from ..robust import median
-from .motion import Motion
+from .motion import MotionStreams
 
 # Clocks further apart than this are looked for nowhere, s.
 LONGEST_S = 60.0
@@ -30,7 +30,7 @@ OVERLAP, SHORTEST_S = 0.4, 20.0
 APART_S = 2.0
 
 
-class Place(NamedTuple):
+class ClockPlace(NamedTuple):
     """reference, dvl: how late the stamps of each are beside the IMU's, s. misfit: share of the squares left there."""
 
     reference: float
@@ -46,7 +46,7 @@ class _Series(NamedTuple):
     squares: Array
 
 
-def places(motion: Motion, rotation_body_from_dvl: Array | None, most: int = 4) -> list[Place]:
+def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: int = 4) -> list[ClockPlace]:
     """The likeliest places of the clocks, the best first, and beside these the best within 3 s.
 
     rotation_body_from_dvl: (3, 3), None where the mounting is not known. Without an attitude, or with a reference in
@@ -60,21 +60,21 @@ def places(motion: Motion, rotation_body_from_dvl: Array | None, most: int = 4) 
     return sorted(set(found), key=lambda place: place.misfit)
 
 
-def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[Place]:
+def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[ClockPlace]:
     misfit = misfit.copy()
-    found: list[Place] = []
+    found: list[ClockPlace] = []
     for _ in range(most):
         r, d = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
         if not np.isfinite(misfit[r, d]):
             break
-        place = Place(float(by_reference[r]), float(by_dvl[d]), float(misfit[r, d]))
+        place = ClockPlace(float(by_reference[r]), float(by_dvl[d]), float(misfit[r, d]))
         found.append(place)
         around = np.abs(by_reference - place.reference)[:, None] < APART_S
         misfit[around & (np.abs(by_dvl - place.dvl) < APART_S)] = np.inf
     return found
 
 
-def _misfits(motion: Motion, rotation: Array | None) -> tuple[Array, Array]:
+def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Array]:
     """Delays (L,) s, and the misfit (L or 1, L) by the delay of the reference and that of the DVL."""
     step, grid = _grid(motion)
     reach = round(LONGEST_S / step)
@@ -121,7 +121,7 @@ def _misfits(motion: Motion, rotation: Array | None) -> tuple[Array, Array]:
     return late, np.maximum(misfit, 0.0)
 
 
-def _grid(motion: Motion) -> tuple[float, Array]:
+def _grid(motion: MotionStreams) -> tuple[float, Array]:
     """Step and times (N,) s that hold all streams, of a long recording its beginning."""
     times = [motion.dvl.times, motion.reference_times]
     start, end = min(t[0] for t in times), max(t[-1] for t in times)

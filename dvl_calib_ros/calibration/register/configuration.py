@@ -18,8 +18,8 @@ from ..directions import Directions
 from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..samples import VelocityFrame
 from .curves import GAP_S, Curves
-from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, Fit, Fitted, N
-from .motion import Motion
+from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, Fitted, MotionFit, N
+from .motion import MotionStreams
 from .registration import Registration
 
 # A configuration is wrong from here on: what is left of the motion, as a share of it, is that of 10 degrees.
@@ -53,7 +53,7 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
 def fitting_configuration(
-    motion: Motion, declared: VelocityFrame, nominal: Array, lever_arm: Array, given: Registration | None
+    motion: MotionStreams, declared: VelocityFrame, nominal: Array, lever_arm: Array, given: Registration | None
 ) -> str:
     """What fits much better than what is configured, in words; '' if nothing does, or the configuration fits.
 
@@ -79,7 +79,7 @@ def fitting_configuration(
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
-        fit = Fit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
+        fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
         # the mountings that have a name, and whichever fits
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
         each = [nearest(fit, rotation) for rotation in likely]
@@ -96,7 +96,7 @@ def fitting_configuration(
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
 
-def nearest(fit: Fit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM) -> Fitted | None:
+def nearest(fit: MotionFit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM) -> Fitted | None:
     """The best with a DVL that is late by no more than a calibration finds; None without any."""
     each = (fit(0.0, late, rotation_body_from_dvl, held) for late in LATE_S)
     found = [one for one in each if one is not None and np.isfinite(one.x).all()]
@@ -117,7 +117,7 @@ def _left(left: float, scale: float, rotation: Array, nominal: Array) -> float:
     return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
 
 
-def _as_if(motion: Motion, declared: VelocityFrame, frame: VelocityFrame) -> Motion:
+def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame) -> MotionStreams:
     """The motion with its reference, said to be in one frame, as in another."""
     reference, ned = motion.reference, VelocityFrame.NED
     if (declared is ned) is not (frame is ned):
@@ -125,14 +125,14 @@ def _as_if(motion: Motion, declared: VelocityFrame, frame: VelocityFrame) -> Mot
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _flipped(motion: Motion, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration) -> str:
+def _flipped(motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration) -> str:
     """Whether y and z turned round explain more without a lever arm than the axes given do with any.
 
     A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
     its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm. registered: the axes
     given with whichever clocks; where a clock is off, neither fits with clocks in time.
     """
-    fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
+    fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
 
     def fitted(rotation: Array, held: Sequence[Array], most: float = math.inf) -> Fitted | None:
         near = nearest(quick, rotation, held)

@@ -9,7 +9,7 @@ from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at
 from ..frames import Array
 from ..robust import median
 from ..samples import Index, Mask
-from .motion import Motion
+from .motion import MotionStreams
 
 # Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.
 GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
@@ -20,7 +20,7 @@ GAP_S = 2.0
 class Curves:
     """Velocity and slope of the DVL, and turn rates, on a fine grid of time, each smoothed once for all places."""
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, motion: MotionStreams) -> None:
         """Of all streams of a motion."""
         times = motion.dvl.times
         length = float(times[-1] - times[0])

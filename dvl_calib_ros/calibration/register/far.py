@@ -15,7 +15,7 @@ from ..delay.rows import attitude_at
 from ..frames import Array
 from ..robust import median
 from .coarse import HOLE_S, LONGEST_S
-from .motion import Motion
+from .motion import MotionStreams
 
 # A delay beyond what is registered is believed if it leaves no more than this share of the squares that the best of the
 # others leaves: repeated legs are alike to a half, an effect is no reason for two series to agree elsewhere
@@ -46,7 +46,7 @@ class Far(NamedTuple):
         )
 
 
-def far_clocks(motion: Motion, rotation_dvl_from_body: Array) -> Far | None:
+def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Far | None:
     """Which stamps are too far from the others to be registered; None if that is not beyond doubt.
 
     rotation_dvl_from_body: (3, 3), the nominal mounting.

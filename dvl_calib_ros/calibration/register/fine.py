@@ -23,7 +23,7 @@ from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
 from .curves import GAP_S, Curves
-from .motion import Motion
+from .motion import MotionStreams
 
 # States: turn (rad, body), scale, lever arm (m), δ (s), ρ (s).
 TURN, SCALE, ARM, APART, LATE = slice(0, 3), 3, slice(4, 7), 7, 8
@@ -120,13 +120,13 @@ class _Rows(NamedTuple):
     speed: float
 
 
-class Fit:
+class MotionFit:
     """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
 
     times: (J,) s of the references that are looked at.
     """
 
-    def __init__(self, motion: Motion, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
+    def __init__(self, motion: MotionStreams, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
         """lever_arm: (3,) m, that is known. curves: of the motion. most: references that are looked at."""
         self._motion, self._lever_arm, self._curves = motion, lever_arm, curves
         self.is_turned = motion.in_earth and motion.has_attitude

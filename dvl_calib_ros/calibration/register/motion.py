@@ -18,7 +18,7 @@ from ..spikes import without_spikes
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionStreams:
     """Streams of one vehicle. Stamps that go back are left out.
 
     dvl: velocity in the DVL's frame. reference_times (M,) s, reference (M, 3) m/s: in the earth (ENU) if in_earth, else
@@ -40,7 +40,7 @@ class Motion:
         """Whether there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
 
-    def part(self, at: Index, margin_s: float) -> Motion:
+    def part(self, at: Index, margin_s: float) -> MotionStreams:
         """Some of the references, one after the other, and of the others what is so near to them."""
         times = self.reference_times[at]
         near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
@@ -49,12 +49,12 @@ class Motion:
         imu = ImuColumns(*(column[first:end] for column in self.imu))
         return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl, imu=imu)
 
-    def in_the_body(self) -> Motion:
+    def in_the_body(self) -> MotionStreams:
         """The same as if the reference were in the body."""
         return replace(self, in_earth=False)
 
 
-def motion_of(streams: Streams, parameters: Parameters) -> Motion | None:
+def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     """What samples say, each stream's clock corrected as the parameters have it; None where two have too little."""
     dvl, reference = (_valid(block, parameters) for block in (streams.dvl, streams.reference))
     imu = ImuAlignment(parameters).block(streams.imu.part(streams.imu.refused == 0))
@@ -93,7 +93,7 @@ def make_motion(
     in_earth: bool,
     measured: tuple[bool, bool, bool],
     imu: ImuColumns,
-) -> Motion | None:
+) -> MotionStreams | None:
     """A motion without the spikes of its velocities; None where too little is left. Times increase.
 
     dvl, reference: times (N,) s and velocities (N, 3) m/s.
@@ -102,7 +102,7 @@ def make_motion(
     reference_times, seen = _cleaned(*reference)
     if min(len(times), len(reference_times)) < 2:
         return None
-    return Motion(DvlColumns(times, velocity), reference_times, seen, in_earth, measured, imu, TurnRates.of(imu))
+    return MotionStreams(DvlColumns(times, velocity), reference_times, seen, in_earth, measured, imu, TurnRates.of(imu))
 
 
 def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:

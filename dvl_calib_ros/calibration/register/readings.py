@@ -32,8 +32,8 @@ from ..samples import VelocityFrame
 from .configuration import DRAWN, angle_between, misfit, nearest
 from .curves import GAP_S, Curves
 from .far import covered, velocity_at
-from .fine import FEW_ROWS, REFERENCE, SLOW_MPS, Fit
-from .motion import Motion
+from .fine import FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit
+from .motion import MotionStreams
 
 # Fewer samples say nothing about frames.
 ENOUGH_SAMPLES = 12
@@ -109,10 +109,10 @@ class Readings:
     whose velocity the reference is.
     """
 
-    def __init__(self, motion: Motion, position: Array) -> None:
+    def __init__(self, motion: MotionStreams, position: Array) -> None:
         self._motion, self._position = motion, position
-        self._motions: dict[Reading, Motion] = {}
-        self._fits: dict[Reading, Fit] = {}
+        self._motions: dict[Reading, MotionStreams] = {}
+        self._fits: dict[Reading, MotionFit] = {}
         times, dvl = motion.dvl
         use = covered(motion.reference_times, times) & ((dvl * dvl).sum(axis=1) > SLOW_MPS**2)
         if motion.has_attitude:
@@ -172,7 +172,7 @@ class Readings:
         if motion is None:
             return math.inf, np.eye(3)
         if reading not in self._fits:
-            self._fits[reading] = Fit(motion, self._position, Curves(motion), FEW_ROWS)
+            self._fits[reading] = MotionFit(motion, self._position, Curves(motion), FEW_ROWS)
         fit = self._fits[reading]
 
         def of(rotation: Array | None) -> tuple[float, Array]:
@@ -208,7 +208,7 @@ class Readings:
         directions.add(dvl @ found.rotation_dvl_from_body, attitude_at(motion.imu, self._at, GAP_S)[0])
         return directions.stay_in_the_body
 
-    def _read(self, reading: Reading) -> Motion | None:
+    def _read(self, reading: Reading) -> MotionStreams | None:
         """The motion as a reading has it but for the DVL; None if that needs an attitude that is not there."""
         key = replace(reading, turned=False)
         if key not in self._motions:

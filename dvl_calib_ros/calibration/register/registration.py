@@ -30,11 +30,11 @@ from .fine import (
     REFERENCE,
     SCALE,
     TURN,
-    Fit,
     Fitted,
+    MotionFit,
     N,
 )  # fmt: skip
-from .motion import Motion
+from .motion import MotionStreams
 from .steadiness import MOST_STRETCHES, STRETCH_S, Unsteady, unsteady
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
@@ -168,7 +168,7 @@ class Registration:
         return f"the data fit a reference whose stamps are {_late(self.reference)}, and a DVL {dvl} ({of_reference})"
 
 
-def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
+def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
     """Register the streams of a motion; None where they have too little in common.
 
     rotation_body_from_dvl: (3, 3) the mounting, None where it is not known. lever_arm: (3,) m, what is known of it.
@@ -177,11 +177,11 @@ def register(motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Ar
 
 
 def _registered(
-    motion: Motion, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: Unsteady | None
+    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: Unsteady | None
 ) -> Registration | None:
     """moves: what has been taken off a clock; None to look whether one moves."""
     curves = Curves(motion)
-    fit, quick = (Fit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
+    fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
     best = _placed(motion, quick, rotation_body_from_dvl)
     if best is None:
         return None
@@ -211,7 +211,7 @@ def _registered(
     return None if best is None or not _is_possible(best) else _explained(fit, best, rotation_body_from_dvl, lever_arm)
 
 
-def _placed(motion: Motion, quick: Fit, rotation: Array | None) -> Fitted | None:
+def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
     """The likeliest place of the clocks of a motion."""
     likely = places(motion, rotation)
     enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
@@ -226,21 +226,21 @@ def _placed(motion: Motion, quick: Fit, rotation: Array | None) -> Fitted | None
     return min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
 
 
-def _unsteady(motion: Motion, curves: Curves, lever_arm: Array, rotation: Array | None) -> Unsteady | None:
+def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> Unsteady | None:
     """A clock that moves, by the places of all of them in stretches of a motion."""
     times = motion.reference_times
     number = min(int((times[-1] - times[0]) / STRETCH_S), MOST_STRETCHES)
     found = []
     for at in np.array_split(np.arange(len(times)), max(number, 1)) if number > 1 else ():
         own = motion.part(at, LONGEST_S)
-        best = _placed(own, Fit(own, lever_arm, curves, ROWS_OF_STRETCH), rotation)
+        best = _placed(own, MotionFit(own, lever_arm, curves, ROWS_OF_STRETCH), rotation)
         if best is not None:
             found.append((float(times[at].mean()), best))
     is_turned = motion.in_earth and motion.has_attitude
     return unsteady(np.array([at for at, _ in found]), [each for _, each in found], is_turned)
 
 
-def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:
+def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:
     """By the fewest clocks that are off: none, one of the three, or both of DVL and reference."""
     apart = float(free.x[APART])
     early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
@@ -281,7 +281,7 @@ def _explained(fit: Fit, free: Fitted, rotation: Array | None, lever_arm: Array)
     )
 
 
-def _open(fit: Fit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
+def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
     """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
     if not fit.is_turned:
         return {"open_late": 0.0, "open_by": np.zeros(4)}
@@ -300,7 +300,7 @@ class _Off(Enum):
 
 
 def _held(
-    fit: Fit,
+    fit: MotionFit,
     free: Fitted,
     rotation: Array | None,
     reference: float,
@@ -336,7 +336,7 @@ def _late(clock: Clock) -> str:
     return f"{abs(clock.late):.2f} s {'late' if clock.late > 0.0 else 'early'}"
 
 
-def _is_as_good(motion: Motion, fit: Fit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
+def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
     """Whether a place explains the data about as well as the one that leaves least, and the same data.
 
     A delay that pushes a bad stretch of the DVL out of the overlap leaves less of the rest, as any other place does.
@@ -352,12 +352,12 @@ def _is_as_good(motion: Motion, fit: Fit, one: Fitted, closest: Fitted, rotation
     return 0.5 * grown * min(1.0, _independent(motion, again) / again.rows) < GAIN
 
 
-def _gain(motion: Motion, one: Fitted, other: Fitted) -> float:
+def _gain(motion: MotionStreams, one: Fitted, other: Fitted) -> float:
     """By how much the log evidence of the other is larger, of samples that are so far apart as to be independent."""
     return 3.0 * _independent(motion, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
 
 
-def _independent(motion: Motion, fitted: Fitted) -> float:
+def _independent(motion: MotionStreams, fitted: Fitted) -> float:
     """How many of the references that are compared are so far apart as to be independent."""
     times = motion.reference_times
     return min(float(fitted.rows), float(times[-1] - times[0]) / INDEPENDENT_S)

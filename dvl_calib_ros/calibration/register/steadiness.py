@@ -16,8 +16,8 @@ import numpy as np
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates
 from ..frames import Array
 from ..samples import Mask
-from .fine import APART, ARM, LATE, Fit, Fitted, N
-from .motion import Motion
+from .fine import APART, ARM, LATE, Fitted, MotionFit, N
+from .motion import MotionStreams
 
 # By how much (δ, ρ) of a fit are more for each second that a stream's stamps are later.
 DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference": (-1.0, 1.0), "imu": (0.0, -1.0)}
@@ -67,7 +67,7 @@ class Unsteady:
             f", or dvl_clock_drift: {self.drift:.2g}" if self.whose == "dvl" else ""
         )
 
-    def timed(self, motion: Motion, fit: Fit, x: Array, rotation: Array, level: float) -> Unsteady:
+    def timed(self, motion: MotionStreams, fit: MotionFit, x: Array, rotation: Array, level: float) -> Unsteady:
         """A leap ahead at the hole that it leaves in the stamps, if there is just one; else at the time at which the
         clocks before it and those after it explain most together.
 
@@ -102,7 +102,7 @@ class Unsteady:
             return {"dvl_clock_drift": round(self.drift, 7)}
         return {"dvl_time_jump": round(self.leap, 3), "dvl_time_jump_at": round(1e-9 * epoch_ns + self.at, 3)}
 
-    def steadied(self, motion: Motion) -> Motion:
+    def steadied(self, motion: MotionStreams) -> MotionStreams:
         """The motion without it."""
         m = motion
         if self.whose == "reference":

@@ -14,7 +14,7 @@ from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from dvl_calib_ros.bags.definitions import Definition, typestore
-from dvl_calib_ros.bags.layout import Columns, NoLayoutError, layout_of
+from dvl_calib_ros.bags.layout import MessageColumns, NoLayoutError, layout_of
 
 NUMBERS = (
     "int8",
@@ -120,7 +120,7 @@ def test_columns_hold_what_rosbags_reads_of_each_message(text, seed, is_little, 
             else:
                 found = row[path] != 0 if path in layout.flags else row[path]
                 assert np.array_equal(found, expected, equal_nan=isinstance(expected, float | np.ndarray))
-    whole = Columns(layout, rows)
+    whole = MessageColumns(layout, rows)
     assert len(whole) == len(whole.part(slice(0, 5))) == 5
 
 
@@ -185,7 +185,7 @@ def test_a_message_that_rosbags_refuses_or_that_is_not_ascii_has_no_layout_and_i
 def test_a_field_that_is_none_is_an_attribute_error_as_of_a_message():
     imu = made(JAZZY, "sensor_msgs/msg/Imu", np.random.default_rng(1), 9)
     data = bytes(JAZZY.serialize_cdr(imu, "sensor_msgs/msg/Imu"))
-    columns = Columns(layout := layout_of(JAZZY, "sensor_msgs/msg/Imu", data), layout.view(items([data])))
+    columns = MessageColumns(layout := layout_of(JAZZY, "sensor_msgs/msg/Imu", data), layout.view(items([data])))
     assert columns.orientation.x.shape == (1,)
     with pytest.raises(AttributeError, match=r"orientation\.q"):
         _ = columns.orientation.q

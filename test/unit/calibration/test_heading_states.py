@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration import heading_states as module
-from dvl_calib_ros.calibration.heading_states import BlockTerms, Seen, heading_states, heading_terms, with_terms
+from dvl_calib_ros.calibration.heading_states import (
+    BlockTerms,
+    HeadingEvidence,
+    heading_states,
+    heading_terms,
+    with_terms,
+)
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.time_blocks import TimeBlocks
 
@@ -61,7 +67,7 @@ def test_it_equals_least_squares_with_columns_of_its_own(rng, monkeypatch):
     monkeypatch.setattr(module, "_LOG_LIKELY", np.zeros(1))
     headings = rng.uniform(-math.pi, math.pi, 7)  # too few for σ to be raised
     blocks, h, z, number = blocks_of(headings, rng, np.radians([1.0, -0.5, 0.2, 0.1, 0.3]))
-    found = heading_states([Seen.of(blocks, without_deviation(h, z), np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(blocks, without_deviation(h, z), np.zeros(1, dtype=int), 0)], STD)[0]
     span, informed = DRIFT_S * 6.0, np.bincount(number, (h @ UP) ** 2)
     centre = (informed @ (DRIFT_S * np.arange(7))) / informed.sum()
     own = np.array([columns(headings[b], DRIFT_S * b, span, centre) for b in number])
@@ -86,7 +92,7 @@ ONE = np.full(24, math.radians(10.0))
 def yaw_of(headings, rng, truth, **more):
     blocks, h, z, _ = blocks_of(headings, rng, truth, **more)
     alone = without_deviation(h, z)
-    found = heading_states([Seen.of(blocks, alone, np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], STD)[0]
     x, p = alone.x[0] + found.shift[0], alone.p[0] + found.more[0]
     return x[2], math.hypot(math.sqrt(p[2, 2]) * found.inflation[2], math.sqrt(found.drifted)), found
 
@@ -122,7 +128,7 @@ def test_a_reference_in_the_body_says_nothing_of_the_heading_and_changes_nothing
     body = TimeBlocks()
     for information, vector in zip(*blocks.kept, strict=True):
         body.add(*with_terms(information[:, :N, :N], vector[:, :N], np.zeros(module.N_TERMS), UP), ROWS)
-    found = heading_states([Seen.of(body, without_deviation(h, z), np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(body, without_deviation(h, z), np.zeros(1, dtype=int), 0)], STD)[0]
     assert not found.shift.any() and not found.more.any()
 
 
@@ -150,6 +156,6 @@ def test_a_yaw_that_its_prior_does_not_expect_is_no_deviation(rng):
         terms = heading_terms(earth_in_body(np.full(ROWS, ONE[b])), np.ones(ROWS), DRIFT_S * b)
         blocks.add(*with_terms((h[own].T @ h[own])[None], (h[own].T @ z[own])[None], terms, UP), ROWS)
     alone = without_deviation(h, z, math.radians(3.0))
-    found = heading_states([Seen.of(blocks, alone, np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], STD)[0]
     assert abs(found.shift[0, 2]) < math.radians(0.7)
     assert math.sqrt(alone.p[0, 2, 2] + found.more[0, 2, 2]) < 2.0 * STD

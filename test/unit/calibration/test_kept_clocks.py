@@ -18,7 +18,7 @@ def kept():
 
 
 def test_all_that_is_registered_of_blocks_is_kept_and_no_covariance(kept):
-    seen = clocks._Seen()
+    seen = clocks._Registered()
     for each in kept:
         seen.add(each)
     motion = seen.motion()
@@ -30,7 +30,7 @@ def test_all_that_is_registered_of_blocks_is_kept_and_no_covariance(kept):
 
 def test_of_more_blocks_the_newest_are_kept_and_room_does_not_grow(kept, monkeypatch):
     monkeypatch.setattr(clocks, "MOST", 5)
-    seen = clocks._Seen()
+    seen = clocks._Registered()
     seen.take_room()
     for each in [*kept, *kept]:
         seen.add(each)

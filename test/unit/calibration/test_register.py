@@ -13,8 +13,8 @@ from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, places
 from dvl_calib_ros.calibration.register.curves import Curves
-from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, Fit
-from dvl_calib_ros.calibration.register.motion import Motion, make_motion
+from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, MotionFit
+from dvl_calib_ros.calibration.register.motion import MotionStreams, make_motion
 from dvl_calib_ros.calibration.register.registration import Registration, _is_possible, register
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
@@ -44,7 +44,7 @@ def run(trajectory: str, rate: float, mounting: tuple[float, float, float] = (0.
     )
 
 
-def motion(trajectory: str, rate: float, dvl=0.0, reference=0.0, imu=0.0, in_earth=True, **scenario) -> Motion:
+def motion(trajectory: str, rate: float, dvl=0.0, reference=0.0, imu=0.0, in_earth=True, **scenario) -> MotionStreams:
     """A run whose stamps are late by so many seconds."""
     (td, v), (tg, g), (ti, q, w) = run(trajectory, rate, **scenario)
     made = make_motion((td + dvl, v), (tg + reference, g), in_earth, (True,) * 3, ImuColumns(ti + imu, q, w))
@@ -125,7 +125,7 @@ def test_a_straight_leg_at_one_speed_shows_no_clock():
         assert found.offsets == {} and found.says(Parameters()) == ""
 
 
-def leg_in_moving_water(share: float, seed: int) -> Motion:
+def leg_in_moving_water(share: float, seed: int) -> MotionStreams:
     """A leg at about one speed, in time, whose DVL is on moving water over the last share of it."""
     times = np.arange(0.0, 400.0, 0.2)
     rng = np.random.default_rng(seed)
@@ -214,7 +214,7 @@ def test_at_one_speed_the_clock_of_a_reference_is_in_the_arm_and_the_delay():
     assert std[0] == pytest.approx(std[3] * turned.speed, rel=0.1) and std[0] > 0.08 > 10.0 * std[1]
 
 
-def _of_its_own(one: Motion) -> Motion:
+def _of_its_own(one: MotionStreams) -> MotionStreams:
     """The same where the reference is what the DVL says, with noise."""
     rng = np.random.default_rng(3)
     rotation, known = attitude_at(one.imu, one.dvl.times, 2.0)
@@ -224,7 +224,7 @@ def _of_its_own(one: Motion) -> Motion:
 
 def test_by_how_much_an_arm_is_another_for_each_second_is_no_matter_of_what_the_noise_raises(rng):
     """σ of a clock 40 times that of white noise, and of an arm twice: a boat's -0.74 m a second was told as -0.13."""
-    fitted = Fit(motion("free", 5.0), np.zeros(3), Curves(motion("free", 5.0)))(0.0, 0.0, np.eye(3))
+    fitted = MotionFit(motion("free", 5.0), np.zeros(3), Curves(motion("free", 5.0)))(0.0, 0.0, np.eye(3))
     assert fitted is not None
     white = fitted.p / np.outer(fitted.raised, fitted.raised)
     raised = rng.uniform(1.0, 40.0, len(white))
@@ -251,7 +251,7 @@ def test_what_noise_seems_to_tell_of_a_delay_leaves_a_covariance(seed):
     v, g = (each + std * rng.standard_normal(each.shape) for each, std in ((body, 0.1), (earth, 0.1)))
     made = make_motion((times, v), (times[::10], g[::10]), True, (True,) * 3, ImuColumns(times, attitude, rates))
     for in_time in ((), (REFERENCE,), (DVL,)):
-        found = Fit(made, np.zeros(3), Curves(made))(0.0, 0.0, np.eye(3), in_time)
+        found = MotionFit(made, np.zeros(3), Curves(made))(0.0, 0.0, np.eye(3), in_time)
         assert (np.diag(found.p) > 0.0).all() and np.abs(found.x).max() < LONGEST_S
 
 
@@ -262,7 +262,7 @@ def test_what_noise_seems_to_tell_of_a_delay_leaves_a_covariance(seed):
 )  # fmt: skip
 def test_a_fit_that_settles_beyond_a_minute_or_nowhere_is_none(at, value, is_possible):
     moved = motion("box", 5.0)
-    fitted = Fit(moved, np.zeros(3), Curves(moved))(0.0, 0.0, np.eye(3))
+    fitted = MotionFit(moved, np.zeros(3), Curves(moved))(0.0, 0.0, np.eye(3))
     x = fitted.x.copy()
     x[at] = value
     assert _is_possible(fitted._replace(x=x)) is is_possible

@@ -10,14 +10,14 @@ import pytest
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.clocks import MOST, MOST_OF_A_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.delay.filter import DelayFilter
-from dvl_calib_ros.calibration.delay.hold_out import KEPT_EVERY_S, Kept
+from dvl_calib_ros.calibration.delay.hold_out import KEPT_EVERY_S, ThinnedBlock
 from dvl_calib_ros.calibration.delay.rows import DvlColumns, ImuColumns, ReferenceColumns
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.calibration.tables import Table
+from dvl_calib_ros.calibration.tables import RowTable
 
 
-class Numbers(Table):
+class Numbers(RowTable):
     """One column."""
 
     LAYOUT: ClassVar = {"number": (np.int64, ())}
@@ -94,7 +94,7 @@ def test_what_is_registered_live_is_of_the_newest_blocks_in_memory_that_is_taken
     for number in range(2 * MOST + 20):
         times = 10.0 * number + KEPT_EVERY_S * np.arange(n)
         reference = ReferenceColumns(times, np.ones((n, 3)), np.ones((n, 1, 1)) * np.eye(3), times < 0.0, times > 0.0)
-        kept = Kept(
+        kept = ThinnedBlock(
             DvlColumns(times, np.ones((n, 3))),
             np.eye(3),
             reference,

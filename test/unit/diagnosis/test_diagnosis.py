@@ -22,8 +22,8 @@ from dvl_calib_ros.diagnosis.diagnose import _sentence, _verdict, diagnose_recor
 from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
-from dvl_calib_ros.diagnosis.recordings import Recording, load_recordings, make_recording
-from dvl_calib_ros.diagnosis.results import FoundEffect, Verdict, diagnosis_document
+from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -35,7 +35,7 @@ from dvl_calib_ros.simulation.waves import Waves
 
 pytestmark = pytest.mark.slow
 
-CLAIMS = (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
+CLAIMS = (DiagnosisVerdict.KNOWN, DiagnosisVerdict.AMBIGUOUS, DiagnosisVerdict.UNKNOWN)
 LEVER = "lever_arm:x_m=-1.9,y_m=0.4,z_m=-0.3"
 
 
@@ -45,7 +45,7 @@ def scenario(trajectory="free", effects=(), **changes) -> Scenario:
     return Scenario(trajectory, effects=tuple(map(injection, effects)), **{**values, **changes})
 
 
-def recording_of(run: Run, frame=VelocityFrame.ENU, name="run", axes="auto") -> Recording:
+def recording_of(run: Run, frame=VelocityFrame.ENU, name="run", axes="auto") -> RecordedStreams:
     first_ns = run.dvl[0].stamp_ns
 
     def stream(samples, field):
@@ -87,7 +87,7 @@ def assert_within(diagnosis, name, **values):
 
 def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
     diagnosis = diagnosed()
-    assert diagnosis.verdict is Verdict.NO_GAP
+    assert diagnosis.verdict is DiagnosisVerdict.NO_GAP
     assert diagnosis.effects == () and diagnosis.where == ()
     assert {"mounting_moved", "sound_speed_moved"} == set(diagnosis.untestable)
     assert set(diagnosis.minimum_detectable) == set(EFFECTS) - set(diagnosis.untestable)
@@ -168,7 +168,7 @@ def test_two_late_streams_are_told_by_the_two_differences_that_matter_and_the_th
     assert_within(diagnosis, "dvl_time_offset", seconds=-0.3)
     assert_within(diagnosis, "reference_time_offset", seconds=0.3)
     assert all("attitude_time_offset" in effect.equivalent_to for effect in diagnosis.effects)
-    assert diagnosis.verdict is Verdict.AMBIGUOUS
+    assert diagnosis.verdict is DiagnosisVerdict.AMBIGUOUS
 
 
 def test_a_horizontal_reference_gives_the_same_answer_and_its_vertical_is_not_compared():
@@ -192,7 +192,7 @@ def test_a_late_body_frame_reference_and_an_early_dvl_are_one_answer_with_two_na
     diagnosis = diagnosed(effects=["reference_time_offset:seconds=0.5"], gnss_frame=VelocityFrame.BODY)
     (effect,) = diagnosis.effects
     assert {effect.name, *effect.equivalent_to} >= {"dvl_time_offset", "reference_time_offset"}
-    assert diagnosis.verdict is Verdict.AMBIGUOUS
+    assert diagnosis.verdict is DiagnosisVerdict.AMBIGUOUS
 
 
 def test_outliers_do_not_bend_a_large_effect_and_are_told_beside_it():
@@ -216,10 +216,10 @@ def test_what_comes_and_goes_with_a_period_of_its_own_is_unknown():
         replace_velocity(s, tuple(np.array(s.velocity) + (0.06 if i % 55 < 22 else 0.0))) for i, s in enumerate(run.dvl)
     ]
     diagnosis = diagnose_recordings([recording_of(Run(bursts, run.gnss, run.imu))], Parameters())
-    assert diagnosis.verdict is Verdict.UNKNOWN and "no effect of the library" in diagnosis.sentence
+    assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and "no effect of the library" in diagnosis.sentence
 
 
-def with_added(run: Run, added) -> Recording:
+def with_added(run: Run, added) -> RecordedStreams:
     """A run whose DVL measures more than it does: added (N, 3) m/s of times (N,) s and turn rates (N,) rad/s."""
     first = run.dvl[0].stamp_ns
     time, imu_time = (np.array([1e-9 * (s.stamp_ns - first) for s in stream]) for stream in (run.dvl, run.imu))
@@ -241,7 +241,7 @@ def last_side(time, turning):
 def test_what_is_unknown_is_so_beside_a_lever_arm_and_a_delay_a_hundred_times_as_large():
     given = scenario(effects=[LEVER, "dvl_time_offset:seconds=1.2"], gnss_std=0.02, seconds=600.0)
     diagnosis = diagnose_recordings([with_added(simulate(given), last_side)], Parameters())
-    assert diagnosis.verdict is Verdict.UNKNOWN and "follows turns before" in diagnosis.sentence
+    assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and "follows turns before" in diagnosis.sentence
     assert {"lever_arm", "dvl_time_offset"} <= set(found(diagnosis))
 
 
@@ -249,7 +249,7 @@ def test_a_step_in_a_bias_is_unknown_and_no_drift():
     given = scenario(gnss_std=0.03, seconds=600.0)
     stepped = with_added(simulate(given), lambda time, _: 0.03 * np.outer(time > 400.0, [0.0, 1.0, 0.0]))
     diagnosis = diagnose_recordings([stepped], Parameters())
-    assert diagnosis.verdict is Verdict.UNKNOWN and "follows a step in time" in diagnosis.sentence
+    assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and "follows a step in time" in diagnosis.sentence
 
 
 def test_an_effect_in_part_of_the_run_is_found_with_its_times():
@@ -302,19 +302,19 @@ def test_a_mounting_that_moved_between_days_is_named_with_its_size():
 
 def test_a_straight_run_at_one_speed_makes_no_confident_claim_about_a_bias():
     diagnosis = diagnosed("straight", effects=["velocity_bias:x_mps=0.1"])
-    assert diagnosis.verdict not in (Verdict.KNOWN, Verdict.NO_GAP)
+    assert diagnosis.verdict not in (DiagnosisVerdict.KNOWN, DiagnosisVerdict.NO_GAP)
 
 
 def test_a_run_that_is_too_short_says_so():
     diagnosis = diagnosed(seconds=30.0)
-    assert diagnosis.verdict is Verdict.INSUFFICIENT_EXCITATION and "too few" in diagnosis.sentence
+    assert diagnosis.verdict is DiagnosisVerdict.INSUFFICIENT_EXCITATION and "too few" in diagnosis.sentence
 
 
 def test_a_constant_reference_is_insufficient():
     run = simulate(scenario())
     still = [replace_velocity(sample, (1.0, 0.0, 0.0)) for sample in run.gnss]
     diagnosis = diagnose_recordings([recording_of(Run(run.dvl, still, run.imu))], Parameters())
-    assert diagnosis.verdict is Verdict.INSUFFICIENT_EXCITATION and "constant" in diagnosis.sentence
+    assert diagnosis.verdict is DiagnosisVerdict.INSUFFICIENT_EXCITATION and "constant" in diagnosis.sentence
 
 
 # ------------------------------------------------------------------ its parts
@@ -510,7 +510,9 @@ def test_no_bag_is_refused(capsys):
     assert "required: BAG" in fail(capsys, "diagnose")
 
 
-@pytest.mark.parametrize(("not_explained", "verdict"), [(0.0139, Verdict.KNOWN), (0.0141, Verdict.UNKNOWN)])
+@pytest.mark.parametrize(
+    ("not_explained", "verdict"), [(0.0139, DiagnosisVerdict.KNOWN), (0.0141, DiagnosisVerdict.UNKNOWN)]
+)
 def test_effects_that_leave_more_than_the_noise_on_held_out_data_are_no_explanation(not_explained, verdict):
     """A step of a bias that a drift, a lag and an offset stood in for: 85 mm/s became 51, over noise of 14."""
     selection: Any = SimpleNamespace(selected=[SimpleNamespace(equivalent=())], fit=None, fitter=Mock())
@@ -521,4 +523,4 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_are_no_explanat
     assert found is verdict
     effect = FoundEffect("scale_drift", (), {}, 0.7, 1e-9)
     sentence = _sentence(found, gap, [effect], nothing_left, [], 1)
-    assert ("what it follows does not show" in sentence) == (verdict is Verdict.UNKNOWN)
+    assert ("what it follows does not show" in sentence) == (verdict is DiagnosisVerdict.UNKNOWN)

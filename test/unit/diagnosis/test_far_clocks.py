@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.far import STEP_S, lag
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.recordings import Recording, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.registered import check_clocks
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.recordings.topics import Topics
@@ -22,7 +22,7 @@ from dvl_calib_ros.simulation.sensors import DvlErrors
 
 
 @pytest.fixture(scope="module", params=["free", "figure8"])
-def recording(request) -> Recording:
+def recording(request) -> RecordedStreams:
     errors = DvlErrors((0.02, -0.02, 0.03), (0.005,) * 3, beam_std=0.005)
     run = simulate(Scenario(request.param, 300.0, 3, errors, gnss_std=0.05, effects=(injection("lever_arm:x_m=-1.9"),)))
     first_ns = run.dvl[0].stamp_ns
@@ -37,7 +37,7 @@ def recording(request) -> Recording:
     )  # fmt: skip
 
 
-def late(recording: Recording, stream: str, seconds: float) -> Recording:
+def late(recording: RecordedStreams, stream: str, seconds: float) -> RecordedStreams:
     curve = getattr(recording, stream)
     return replace(recording, **{stream: Curve(curve.time + seconds, curve.values)})
 

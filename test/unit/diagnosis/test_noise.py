@@ -14,14 +14,14 @@ from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.contradicted import without_contradicted
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.recordings import Recording, make_recording
-from dvl_calib_ros.diagnosis.results import Verdict
+from dvl_calib_ros.diagnosis.recordings import RecordedStreams, make_recording
+from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.selection import blocks_of
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
-CLAIMS = (Verdict.KNOWN, Verdict.AMBIGUOUS, Verdict.UNKNOWN)
+CLAIMS = (DiagnosisVerdict.KNOWN, DiagnosisVerdict.AMBIGUOUS, DiagnosisVerdict.UNKNOWN)
 # A receiver that floats for a third of the run, m/s
 FIXED, FLOATING, FROM_S, TO_S = 0.03, 0.3, 120.0, 250.0
 Streams = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -58,7 +58,7 @@ def floating(given: Streams, seed: int = 1) -> tuple[Streams, np.ndarray]:
     return given | {"reference": (time, velocity + noise)}, std
 
 
-def recorded(given: Streams, std: np.ndarray | None = None) -> Recording:
+def recorded(given: Streams, std: np.ndarray | None = None) -> RecordedStreams:
     dvl_std = None if std is None else np.full((len(given["dvl"][0]), 3), 0.004)
     return make_recording("run", frame=VelocityFrame.ENU, dvl_std=dvl_std, reference_std=std, **given)
 

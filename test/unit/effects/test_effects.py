@@ -17,7 +17,7 @@ from documentation import section
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.effects import registry
-from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, Needs
+from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, EffectNeeds
 from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS, OWN
 from dvl_calib_ros.effects.table import effect_table
 from dvl_calib_ros.effects.timing import lag_error
@@ -166,7 +166,7 @@ def test_the_trace_is_linear_in_the_parameters_that_are_called_linear(name, rng)
 @pytest.mark.parametrize("name", OWN_EFFECTS)
 def test_an_effect_works_without_what_it_does_not_need_and_refuses_without_what_it_does(name):
     effect = EFFECTS[name]
-    lacking = {Needs.ATTITUDE: "rotation_enu_from_body", Needs.ANGULAR_VELOCITY: "angular_velocity"}
+    lacking = {EffectNeeds.ATTITUDE: "rotation_enu_from_body", EffectNeeds.ANGULAR_VELOCITY: "angular_velocity"}
     unneeded = {field: None for need, field in lacking.items() if need not in effect.needs}
     trace = effect.trace(replace(some_motion(), **unneeded), typical(effect))
     assert trace.shape == (200, 3) and np.isfinite(trace).all() and trace.any()

@@ -14,7 +14,7 @@ from runs import feed
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import Verdict
+from dvl_calib_ros.calibration.samples import SampleUse
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned, estimate, streams_of, true_prior
 from dvl_calib_ros.evaluation.procedure import sensor_data
 from dvl_calib_ros.evaluation.trajectories import own_trajectories
@@ -92,6 +92,6 @@ def test_evaluation_and_calibration_use_gate_and_refuse_the_same_samples(data, o
 def test_of_five_equal_samples_max_repeats_1_uses_2_everywhere(data):
     variants = check(data, Parameters(max_repeats=1.0, gate_probability=0.0))
     verdict = variants.rows.verdict[:N_SAMPLES][HELD]
-    assert verdict.tolist() == [Verdict.USED, Verdict.USED, *[Verdict.FROZEN] * 3]
+    assert verdict.tolist() == [SampleUse.USED, SampleUse.USED, *[SampleUse.FROZEN] * 3]
     assert variants.has[Needs.NOTHING][0, HELD].sum() == 2
     assert math.isclose(variants.rows.weight[HELD].min(), 1.0)

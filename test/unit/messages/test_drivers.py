@@ -45,7 +45,7 @@ from dvl_calib_ros.messages.recognised import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay
-from dvl_calib_ros.simulation.recorded import Recording, recorded_motion
+from dvl_calib_ros.simulation.recorded import MotionSource, recorded_motion
 
 SECOND = 10**9
 MAKERS = {version: Maker(version) for version in A50_DEFINITIONS}
@@ -445,7 +445,7 @@ def test_evaluation_and_diagnosis_read_the_same_from_a_drivers_bag(bare, tmp_pat
 
 def test_a_motion_is_taken_from_an_odometry_reference_too(tmp_path):
     bags = [write_driver_bag(tmp_path / kind[:5], run(), TWIST, kind) for kind in (TWIST, ODOMETRY)]
-    motions = [recorded_motion(Recording(bag), 10.0) for bag in bags]
+    motions = [recorded_motion(MotionSource(bag), 10.0) for bag in bags]
     np.testing.assert_array_equal(motions[0].velocity_body, motions[1].velocity_body)
 
 

@@ -15,7 +15,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.diagnosis.followed import Followed
-from dvl_calib_ros.diagnosis.results import Diagnosis, Verdict
+from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.reports import write_report
 from dvl_calib_ros.present.twin_section import spectrum
@@ -87,7 +87,7 @@ def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page
     assert "Nothing in it follows motion or time" in page.text
     found = diagnosis()
     rest = replace(found.series.rest, log_p=-50.0)
-    unknown = replace(found, verdict=Verdict.UNKNOWN, series=replace(found.series, rest=rest))
+    unknown = replace(found, verdict=DiagnosisVerdict.UNKNOWN, series=replace(found.series, rest=rest))
     assert "still follows turn rate (p = 1.9e-22)" in page_of(tmp_path, unknown).text
 
 
@@ -95,7 +95,7 @@ def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_pat
     found = diagnosis()
     series = replace(found.series, traces={})
     nothing = replace(
-        found, verdict=Verdict.NO_GAP, sentence="No gap.", effects=(), where=(), series=series,
+        found, verdict=DiagnosisVerdict.NO_GAP, sentence="No gap.", effects=(), where=(), series=series,
         gap=Gap(0.001, 0.001, 0.03, float("nan"), (float("nan"), float("nan"))),
     )  # fmt: skip
     page = page_of(tmp_path, nothing)
@@ -109,7 +109,8 @@ def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_pat
 def test_data_that_says_nothing_gives_a_page_without_numbers_and_pictures(tmp_path):
     nan = float("nan")
     found = diagnosis(
-        verdict=Verdict.INSUFFICIENT_EXCITATION, sentence="Too short.", gap=Gap(nan, nan, nan, nan, (nan, nan)),
+        verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION, sentence="Too short.",
+        gap=Gap(nan, nan, nan, nan, (nan, nan)),
         effects=(), noise=(), where=(), untestable={}, minimum_detectable={}, series=None,
     )  # fmt: skip
     page = page_of(tmp_path, found)

@@ -21,8 +21,8 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.present.exploring import Track, explorable
-from dvl_calib_ros.present.replay_figures import Line, estimate_over_time, held_out_errors
+from dvl_calib_ros.present.exploring import MapTrack, explorable
+from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
 from dvl_calib_ros.present.reports import write_replay_report, write_report
 from dvl_calib_ros.present.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.time_axis import TimeAxis
@@ -198,7 +198,7 @@ def test_the_data_of_an_explorable_figure_is_what_the_figure_draws():
     seconds = np.arange(3000)
     time = TimeAxis(SECOND * seconds)
     value = np.where(seconds == 7, np.nan, np.sin(seconds / 300.0))
-    figure = estimate_over_time(time, SECOND * seconds, [Line("G1", value, 0.5 + 0.0 * value)], "G1", "roll, °")
+    figure = estimate_over_time(time, SECOND * seconds, [ModelLine("G1", value, 0.5 + 0.0 * value)], "G1", "roll, °")
     plot = json.loads(zlib.decompress(base64.b64decode(explorable(figure))))
     (line,), (sleeve,) = plot["lines"], plot["sleeves"]
     assert (line["name"], plot["y_label"], plot["x_label"]) == ("G1", "roll, °", "time from the start, min")
@@ -211,7 +211,7 @@ def test_the_data_of_an_explorable_figure_is_what_the_figure_draws():
 def test_the_points_of_a_track_lie_where_the_map_shows_them():
     figure, axes = new_figure()
     (line,) = axes.plot([0.0, 4.0, 8.0], [0.0, 2.0, 2.0], color="#1f6fb2")
-    axes.add_line(Track(line, "a run", np.array([0.0, 1.0, 2.0])))
+    axes.add_line(MapTrack(line, "a run", np.array([0.0, 1.0, 2.0])))
     axes.set_xlim(0.0, 8.0)
     axes.set_ylim(0.0, 4.0)
     plot = json.loads(zlib.decompress(base64.b64decode(explorable(figure))))

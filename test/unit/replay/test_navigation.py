@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.delay.hold_out import NO_TERMS, Recording, Terms
+from dvl_calib_ros.calibration.delay.hold_out import NO_TERMS, Terms, ThinnedRecording
 from dvl_calib_ros.calibration.delay.rows import DvlColumns, ImuColumns, ReferenceColumns
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -22,7 +22,7 @@ YAW = math.radians(1.0)
 def recording(
     seconds: float, *, turn_rate=0.0, speed=2.0, phi=(0.0, 0.0, 0.0), arm=(0.0, 0.0, 0.0), late=0.0, attitude=True,
     noise=0.0, rate_hz=5.0,
-) -> Recording:  # fmt: skip
+) -> ThinnedRecording:  # fmt: skip
     """A vehicle that goes ahead and turns steadily, and changes its speed; the reference is exact but for noise."""
     n = int(seconds * rate_hz)
     rng = np.random.default_rng(1)
@@ -39,7 +39,7 @@ def recording(
     heading = turn_rate * fine
     quaternions = np.column_stack([0 * heading, 0 * heading, np.sin(heading / 2), np.cos(heading / 2)])
     given = quaternions if attitude else np.full_like(quaternions, np.nan)
-    return Recording(
+    return ThinnedRecording(
         DvlColumns(times, measured),
         np.zeros(n),
         ReferenceColumns(
@@ -51,7 +51,7 @@ def recording(
     )  # fmt: skip
 
 
-def navigated(data: Recording, terms: Terms = NO_TERMS) -> Navigation | None:
+def navigated(data: ThinnedRecording, terms: Terms = NO_TERMS) -> Navigation | None:
     folds = np.zeros(len(data.dvl.times), dtype=np.int64)
     return dead_reckoned(data, folds, [terms], Parameters())
 

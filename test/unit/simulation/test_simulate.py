@@ -23,7 +23,7 @@ from dvl_calib_ros.effects.registry import EFFECTS, OWN
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
-from dvl_calib_ros.simulation.recorded import Recording, recorded_motion
+from dvl_calib_ros.simulation.recorded import MotionSource, recorded_motion
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors, ImuErrors, equivalent_error_terms
 from dvl_calib_ros.simulation.trajectories import FREE_SPEEDS_MPS, TRAJECTORIES, make_motion
@@ -272,7 +272,7 @@ def test_the_motion_of_a_bag_is_the_motion_that_made_it(tmp_path, source, frame)
     elif frame is VelocityFrame.BODY:
         options = {"trajectory": "figure8", "seconds": 60.0, "gnss_std": 0.0, "gnss_rate": 10.0}
         gnss = simulate(Scenario(**options, gnss_frame=frame)).gnss
-    motion = recorded_motion(Recording(written(tmp_path, [*gnss, *source.imu]), smoothing=0.0), 100.0)
+    motion = recorded_motion(MotionSource(written(tmp_path, [*gnss, *source.imu]), smoothing=0.0), 100.0)
     first = round(100 * 0.037)  # GNSS begins that much later, on the motion's grid up to 3 ms
     part = slice(first, first + len(motion.time))
     np.testing.assert_allclose(motion.velocity_body, truth.velocity_body[part], atol=5e-3)
@@ -288,7 +288,7 @@ def test_smoothing_takes_the_receivers_noise_off_the_motion_and_leaves_turns_the
     truth = make_motion("figure8", 101.0, 100.0).velocity_body[4:]
     error = {}
     for smoothing in (0.0, 1.0):
-        motion = recorded_motion(Recording(bag, smoothing=smoothing), 100.0)
+        motion = recorded_motion(MotionSource(bag, smoothing=smoothing), 100.0)
         error[smoothing] = motion.velocity_body - truth[: len(motion.time)]
     assert error[1.0].std() < 0.5 * error[0.0].std()
     assert np.abs(error[1.0].mean(axis=0)).max() < 0.01
@@ -297,8 +297,8 @@ def test_smoothing_takes_the_receivers_noise_off_the_motion_and_leaves_turns_the
 def test_a_bag_with_an_outage_gives_its_longest_stretch(tmp_path, source):
     gnss = [s for s, t in zip(source.gnss, times(source.gnss), strict=True) if not 10.0 < t < 25.0]
     bag = written(tmp_path, [*gnss, *source.imu])
-    assert abs(recorded_motion(Recording(bag), 100.0).time[-1] - 34.9) < 0.2
-    assert abs(recorded_motion(Recording(bag), 100.0, seconds=12.0).time[-1] - 11.99) < 1e-9
+    assert abs(recorded_motion(MotionSource(bag), 100.0).time[-1] - 34.9) < 0.2
+    assert abs(recorded_motion(MotionSource(bag), 100.0, seconds=12.0).time[-1] - 11.99) < 1e-9
 
 
 def test_sensors_are_simulated_anew_on_the_motion_of_a_bag(capsys, tmp_path, source):
@@ -334,7 +334,7 @@ def without_attitude(samples):
 def test_a_bag_without_a_motion_is_refused_saying_what_it_lacks(tmp_path, source, change, said):
     bag = written(tmp_path, change(source))
     with pytest.raises(InputError) as caught:
-        recorded_motion(Recording(bag), 100.0)
+        recorded_motion(MotionSource(bag), 100.0)
     assert str(bag) in str(caught.value) and said in str(caught.value) and "\n" not in str(caught.value)
 
 

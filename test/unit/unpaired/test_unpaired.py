@@ -22,9 +22,9 @@ from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.unpaired.compare import compare
-from dvl_calib_ros.unpaired.logs import Source, is_copied
+from dvl_calib_ros.unpaired.logs import RecordedSide, is_copied
 from dvl_calib_ros.unpaired.noise import Scatter, at_one_motion, block_levels, slopes_of
-from dvl_calib_ros.unpaired.results import Status, Verdict, unpaired_document
+from dvl_calib_ros.unpaired.results import ComparisonStatus, SimulatorVerdict, unpaired_document
 from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, two_samples
 from dvl_calib_ros.unpaired.sizes import Size, is_there, p_alike
 from dvl_calib_ros.unpaired.stream_facts import facts_of
@@ -32,8 +32,8 @@ from dvl_calib_ros.unpaired.stream_facts import facts_of
 SECOND_NS = 1_000_000_000
 
 
-def source(*paths: Path) -> Source:
-    return Source(open_recording(paths), Parameters(min_speed=0.0), Topics())
+def source(*paths: Path) -> RecordedSide:
+    return RecordedSide(open_recording(paths), Parameters(min_speed=0.0), Topics())
 
 
 def bag(path: Path, effects: tuple[str, ...] = (), **fields) -> Path:
@@ -68,7 +68,7 @@ def compared(bags):
 
 @pytest.mark.slow
 def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_sides(compared):
-    assert compared.verdict is Verdict.DIFFERENT
+    assert compared.verdict is SimulatorVerdict.DIFFERENT
     assert [each.name for each in compared.missing] == ["lever_arm"]
     arm = compared.missing[0]
     value, low, high = arm.vehicle["x_m"]
@@ -127,8 +127,8 @@ def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_sai
         errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.005),
     )  # fmt: skip
     found = {each.name: each.status for each in compare(source(bags["vehicle"]), source(made)).effects}
-    assert found["lever_arm"] is Status.ALIKE
-    assert found["velocity_bias"] is Status.ONLY_SIMULATOR
+    assert found["lever_arm"] is ComparisonStatus.ALIKE
+    assert found["velocity_bias"] is ComparisonStatus.ONLY_SIMULATOR
 
 
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(bags, t
     )  # fmt: skip
     found = compare(source(bags["vehicle"]), source(made))
     leak = next(each for each in found.noise if each.name == "truth_leaks")
-    assert leak.status is Status.ONLY_SIMULATOR and "without any noise" in leak.note
+    assert leak.status is ComparisonStatus.ONLY_SIMULATOR and "without any noise" in leak.note
     assert [each.name for each in found.effects if each.status.is_claim] == ["lever_arm"]
 
 
@@ -149,7 +149,7 @@ def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags,
     made = bag(tmp_path / "sim", trajectory="straight", gnss_rate=10.0, gnss_std=0.0, errors=loud)
     found = compare(source(bags["vehicle"]), source(made))
     arm = next(each for each in found.effects if each.name == "lever_arm")
-    assert arm.status is Status.CANNOT_TELL and "with the simulator" in arm.needs
+    assert arm.status is ComparisonStatus.CANNOT_TELL and "with the simulator" in arm.needs
 
 
 @pytest.mark.parametrize("option", ["--apply", "--twin"])
