@@ -18,7 +18,7 @@ from ..errors import InputError
 from .batches import Batch, batched
 from .channels import Channel, definition_of
 from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
-from .raw_file import open_raw, unreadable
+from .raw_file import open_raw
 from .salvage.damage import DamagedError, Salvaged
 from .salvage.mcap_file import MCAP_MAGIC, bytes_at_once, indexed_messages, read_summary, salvage_mcap
 from .salvage.sqlite_file import SQLITE_MAGIC, salvage_sqlite
@@ -75,17 +75,17 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
         raise InputError(f"{shown}: the file is empty; nothing was recorded")
     with open_raw(path) as file:
         magic = file.read(16)
-        is_known = magic != bytes(16) and not unreadable(file)
     if magic.startswith(ZSTD_MAGIC) and path == shown:
         return open_source(decompressed(path, new_folder, notes), new_folder, notes, shown)
-    # of a file whose first block was never written, the name has to do
-    kind = "" if is_known else storage_suffix(shown)
-    if magic.startswith(MCAP_MAGIC) or kind == ".mcap":
-        return _opened(path, shown, _mcap, salvage_mcap, notes)
-    if magic.startswith(SQLITE_MAGIC) or kind == ".db3":
-        return _opened(with_journal(path, new_folder, notes), shown, _sqlite, salvage_sqlite, notes)
     if magic.startswith(ROS1_MAGIC):
         raise InputError(f"{shown}: a ROS 1 bag; convert it first: rosbags-convert --src {shown.name} --dst NEW")
+    # of a file whose first bytes were never written, or are lost, the name has to do
+    kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
+    kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
+    if kind == ".mcap":
+        return _opened(path, shown, _mcap, salvage_mcap, notes)
+    if kind == ".db3":
+        return _opened(with_journal(path, new_folder, notes), shown, _sqlite, salvage_sqlite, notes)
     raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap or .db3 file")
 
 

@@ -9,7 +9,6 @@ the records that it is in.
 from __future__ import annotations
 
 import os
-import re
 import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -31,6 +30,7 @@ from ..raw_file import holes_in, open_raw
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 from .mcap_chunks import RECORD_HEAD, is_chunk, open_chunk
 from .mcap_records import (
+    CHANNEL,
     MESSAGE,
     PARSING,
     SCHEMA,
@@ -47,9 +47,10 @@ from .mcap_records import (
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 FIRST_PRIVATE = 0x80
-# How a chunk begins: its opcode, a length below 4 GB, 28 bytes of times, size and checksum, the compression, a length
-_CHUNK_BEGIN = re.compile(rb"(?=\x06.{4}\0{4}.{28}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd).{4}\0{4})", re.DOTALL)
 _CHUNK_BEGIN_SIZE = 64
+# Before a summary the data end: opcode and length
+_DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
+_LARGEST_SUMMARY = 16 << 20
 # Of an index of messages: opcode, length, channel, bytes of its pairs of log time and place
 _INDEX_HEAD = struct.Struct("<BQHI")
 # At the very end: where the summary begins, where its offsets do, CRC, magic
@@ -92,9 +93,11 @@ def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
     at = start
     while 0 < at < size - _FOOTER.size:
         opcode, length = record_head(file, at)
-        if opcode == Opcode.CHUNK:
-            raise DamagedError(f"its index would begin at byte {start}, before messages")
+        if opcode in (0, Opcode.CHUNK):
+            raise DamagedError(f"its index would begin at byte {start}, before {'messages' if opcode else 'zeros'}")
         if opcode == Opcode.FOOTER:
+            if at != size - _FOOTER.size - RECORD_HEAD.size:
+                raise DamagedError("its index is of another part of it: recordings joined in one file")
             return
         at += RECORD_HEAD.size + length
 
@@ -210,15 +213,52 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     damage, summary = Damage(), None
     with suppress(DamagedError):  # schemas and channels once more: the chunk that introduces them may be damaged
         summary = _summary(file)
-    tables = Tables(summary)
-    walk = _FileWalk(file, size, tables, damage, summary.chunk_indexes if summary else ())
-    at: int | None = len(MCAP_MAGIC)
-    while at is not None and at < size:
-        found, at = walk.step(at)
-        yield from map(tables.salvaged, found)
-    if at is not None and not damage:
-        damage.note(f"it stops at byte {size} without the end of the data", 0)
+    repeated = Tables(summary) if summary else _repeated(file, size)
+    file.seek(0)
+    is_cut = file.read(len(MCAP_MAGIC)) != MCAP_MAGIC and not holes_in(file, 0, len(MCAP_MAGIC))
+    if is_cut:
+        damage.note("its first bytes are lost or damaged", 0)
+    begins: int | None = 0 if is_cut else len(MCAP_MAGIC)
+    while begins is not None:  # more than once where recordings were joined by `cat`
+        tables = repeated.copy()
+        walk = _FileWalk(file, size, tables, damage, summary.chunk_indexes if summary else ())
+        at = begins
+        while at < size and not walk.has_ended:
+            found, at = walk.step(at)
+            yield from map(tables.salvaged, found)
+        if not walk.has_ended and not damage:
+            damage.note(f"it stops at byte {size} without the end of the data", 0)
+        begins = _joined(file, at, size)
     damage.raise_if_any()
+
+
+def _repeated(file: BinaryIO, size: int) -> Tables:
+    """The schemas and channels of a summary that the end of the file does not lead to: bytes before it are lost."""
+    tables = Tables(None)
+    first = max(size - _LARGEST_SUMMARY, 0)
+    file.seek(first)
+    content = file.read(_LARGEST_SUMMARY)
+    at = content.rfind(_DATA_END)
+    with suppress(DamagedError, struct.error):
+        while 0 <= at < len(content):
+            opcode, length = RECORD_HEAD.unpack_from(content, at)
+            if opcode in (SCHEMA, CHANNEL):
+                tables.note(first + at, opcode, content[at + RECORD_HEAD.size : at + RECORD_HEAD.size + length])
+            at += RECORD_HEAD.size + length
+    return tables
+
+
+def _joined(file: BinaryIO, at: int, size: int) -> int | None:
+    """Where the records of another recording begin, behind one whose summary is at `at`; None if there is none."""
+    with suppress(DamagedError):
+        while at < size:
+            opcode, length = record_head(file, at)
+            at += RECORD_HEAD.size + length
+            if opcode == Opcode.FOOTER:
+                file.seek(at)
+                begins = file.read(2 * len(MCAP_MAGIC)) == 2 * MCAP_MAGIC
+                return at + 2 * len(MCAP_MAGIC) if begins else None
+    return None
 
 
 class _FileWalk:
@@ -231,9 +271,10 @@ class _FileWalk:
         self._indexes = {index.chunk_start_offset: index for index in indexes}
         self._may_hold_chunks = True
         self._holds_chunks = False
+        self.has_ended = False
 
-    def step(self, at: int) -> tuple[list[Found], int | None]:
-        """Messages of the record at `at`, and where to go on: None at the end of the data."""
+    def step(self, at: int) -> tuple[list[Found], int]:
+        """Messages of the record at `at`, and where to go on; `has_ended` behind the last of the data."""
         try:
             if index := self._index_instead_of_head(at):
                 return self._chunk(at, 0, index)
@@ -247,8 +288,7 @@ class _FileWalk:
                 raise DamagedError(f"no record at byte {at}")
             if end > self._size or (SCHEMA <= opcode <= MESSAGE and length > LARGEST_RECORD):
                 raise DamagedError(f"the record at byte {at} is cut off or damaged")
-            if opcode == Opcode.DATA_END:
-                return [], None
+            self.has_ended = opcode == Opcode.DATA_END
             found: list[Found] = []
             if SCHEMA <= opcode <= MESSAGE:
                 self._file.seek(at)
@@ -297,7 +337,7 @@ class _FileWalk:
 
     def _searched(self, at: int) -> int:
         if self._may_hold_chunks:
-            place = search(self._file, at + 1, self._size, _CHUNK_BEGIN, self._is_chunk_at)
+            place = search(self._file, at + 1, self._size, (Opcode.CHUNK, Opcode.CHUNK), self._is_chunk_at)
             if place is not None:
                 return place
             self._may_hold_chunks = False

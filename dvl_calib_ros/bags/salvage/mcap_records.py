@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
@@ -25,8 +24,7 @@ from .mcap_chunks import RECORD_HEAD
 # plain numbers: they are compared for every message
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_RECORD_BEGIN = re.compile(rb"(?=[\x03-\x05].{4}\0{4})", re.DOTALL)
-_WINDOW, _OVERLAP = 1 << 20, 64
+_WINDOW = 1 << 20
 # Damaged offsets lead beyond what can be sought in a file
 _LARGEST_FILE = 1 << 62
 # What damaged bytes make the mcap library raise when it parses records
@@ -62,6 +60,12 @@ class Tables:
         self.schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
         self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
         self._made: dict[int, tuple[str, str, str, str]] = {}
+
+    def copy(self) -> Tables:
+        """The same, to go on from."""
+        copied = Tables(None)
+        copied.schemas, copied.channels = dict(self.schemas), dict(self.channels)
+        return copied
 
     def note(self, at: int, opcode: int, content: bytes) -> None:
         """Take note of a schema or channel; DamagedError if it is none."""
@@ -103,15 +107,22 @@ def record_head(file: BinaryIO, at: int) -> tuple[int, int]:
 
 
 def search(
-    file: BinaryIO, start: int, size: int, pattern: re.Pattern[bytes], accept: Callable[[int], bool]
+    file: BinaryIO, start: int, size: int, opcodes: tuple[int, int], accept: Callable[[int], bool]
 ) -> int | None:
-    """The first place from `start` on where the pattern matches and accept(place) agrees."""
+    """The first place from `start` on that accept(place) agrees to, and where a record may begin.
+
+    That is an opcode between the two given, and a length below 4 GB.
+    """
     for window in range(start, size, _WINDOW):
         file.seek(window)
-        data = file.read(_WINDOW + _OVERLAP)
-        for match in pattern.finditer(data):
-            if match.start() < _WINDOW and accept(window + match.start()):
-                return window + match.start()
+        data = np.frombuffer(file.read(_WINDOW + RECORD_HEAD.size - 1), dtype=np.uint8)
+        here = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
+        places = np.flatnonzero((here >= opcodes[0]) & (here <= opcodes[1]))
+        for high in range(5, RECORD_HEAD.size):  # the upper half of the length
+            places = places[data[places + high] == 0]
+        for place in places.tolist():
+            if accept(window + place):
+                return window + int(place)
     return None
 
 
@@ -132,7 +143,7 @@ def _next_record(file: BinaryIO, at: int, size: int, tables: Tables) -> int:
 
 def search_records(file: BinaryIO, at: int, size: int, tables: Tables) -> int:
     """As `_next_record`, of a record whose own end is known to lead nowhere."""
-    place = search(file, at + 1, size, _RECORD_BEGIN, lambda place: _records_follow(file, place, size, tables))
+    place = search(file, at + 1, size, (SCHEMA, MESSAGE), lambda place: _records_follow(file, place, size, tables))
     return size if place is None else place
 
 

@@ -27,6 +27,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from dvl_calib_ros.bags import files
+from dvl_calib_ros.bags.salvage import mcap_file
 from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
@@ -438,6 +439,62 @@ def test_a_database_whose_journal_is_lost_gives_what_the_database_holds(tmp_path
         (tmp_path / "lost.db3").write_bytes(file.read_bytes())
     connection.close()
     assert raw(tmp_path / "lost.db3") == expected
+
+
+@pytest.mark.parametrize("compression", [NONE, ZSTD])
+@pytest.mark.parametrize("second", ["the same", "shorter", "of other channels", "cut off"])
+def test_recordings_joined_by_cat_give_all_of_their_messages(tmp_path, compression, second):
+    """`cat a.mcap b.mcap`: the index at the end knows the last one alone, in places that are another's."""
+    options = {"compression": compression}
+    last = list(messages())
+    if second == "shorter":
+        last = last[: len(last) // 3]
+    elif second == "of other channels":
+        last = [(topic, log_ns, data) for topic, log_ns, data in reversed(last)]
+    joined = mcap_bytes(last, **options)
+    whole = mcap_bytes(messages(), **options) + joined
+    if second == "cut off":
+        whole, last = whole[: -len(joined) // 2], None
+    found, notes = read(tmp_path, whole)
+    if last is None:
+        assert len(found) > 1.2 * len(messages()) and set(found) == set(messages())
+    else:
+        assert sorted(found) == sorted([*messages(), *last])
+    assert len(notes) == 1 and f"{len(found)} whole messages" in notes[0]
+
+
+@pytest.mark.parametrize("kind", ["cut off", "0xff", "other bytes"])
+@pytest.mark.parametrize("n", [5, 8, 600])
+def test_a_file_whose_first_bytes_are_lost_gives_the_chunks_behind(tmp_path, kind, n):
+    whole = content(ZSTD)
+    begin = {"cut off": b"", "0xff": b"\xff" * n, "other bytes": b"x" * n}[kind]
+    index = make_reader(BytesIO(whole)).get_summary().chunk_indexes
+    lost_until_ns = max((chunk.message_end_time for chunk in index if chunk.chunk_start_offset < n), default=0)
+    found, notes = read(tmp_path, begin + whole[n:])
+    assert found == [message for message in messages() if message[1] > lost_until_ns]
+    assert len(found) > 0.9 * len(messages())
+    assert len(notes) == 1 and f"{len(found)} whole messages" in notes[0]
+
+
+@pytest.mark.parametrize("place", ["hole", "tail"])
+def test_zeros_are_passed_without_looking_at_each(tmp_path, place, monkeypatch):
+    """Of a file that was grown before it was written, or lost blocks: gigabytes, passed as fast as they are read."""
+    looked = 0
+    begins = mcap_file.is_chunk
+
+    def counted(*arguments):
+        nonlocal looked
+        looked += 1
+        return begins(*arguments)
+
+    monkeypatch.setattr(mcap_file, "is_chunk", counted)
+    whole = content(ZSTD)
+    end, count = chunks(ZSTD)[len(chunks(ZSTD)) // 2]
+    zeros = bytes(4 << 20)
+    data = whole[:end] + zeros + (whole[end:] if place == "hole" else b"")
+    found, notes = read(tmp_path, data)
+    assert found == list(messages() if place == "hole" else messages()[:count])
+    assert looked < 1000 and len(notes) == 1
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
