@@ -120,7 +120,7 @@ def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float)
 
 
 def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
-    """Whether its clock leaves the lever arm open, and whether it is wrong by a constant, on each of several days.
+    """Whether its clock leaves lever arm or yaw open, and whether it is wrong by a constant, on each of several days.
 
     days: that the model found something of, if there are several.
     """
@@ -132,7 +132,8 @@ def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reaso
     if open_std.any():
         at = [estimate.state_names.index(name) for name in ARM]
         delay = open_std[estimate.state_names.index("time_offset")]
-        said.append(finding("CLOCK_OR_ARM", metres=np.linalg.norm(open_std[at]), seconds=delay))
+        turn = math.degrees(float(np.linalg.norm(open_std[:3])))
+        said.append(finding("CLOCK_OR_ARM", metres=np.linalg.norm(open_std[at]), degrees=turn, seconds=delay))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days

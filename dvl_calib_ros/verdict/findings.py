@@ -358,11 +358,12 @@ FINDINGS = (
     ),
     Kind(
         "CLOCK_OR_ARM",
-        "a reference that is late looks like a lever arm at this speed: {metres:.1f} m of it and {seconds:.1f} s of "
-        "the DVL's delay are open, and in σ",
+        "a reference that is late looks like a lever arm at one speed, and like a yaw in a steady turn: {metres:.1f} "
+        "m, {degrees:.1f}° and {seconds:.1f} s of the DVL's delay are open, and in σ",
         "A velocity that is turned into the body by an attitude of another time turns as one of a DVL elsewhere does, "
-        "by speed times delay. Only turns at two speeds tell them apart. A reference is taken to be in time to 0.5 s.",
-        "drive turns at two speeds",
+        "by speed times delay. Only turns at two speeds, to both sides, tell them apart. A reference is taken to be in "
+        "time to 0.5 s.",
+        "drive turns to both sides at two speeds",
     ),
     Kind(
         "REFERENCE_OFFSET",

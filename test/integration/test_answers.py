@@ -144,6 +144,16 @@ def test_a_late_reference_that_only_the_usual_tells_from_a_late_dvl_is_calibrate
 
 
 @pytest.mark.slow
+def test_waves_over_the_window_of_positions_are_no_late_reference_on_a_circle(tmp_path):
+    """Survey 30860: less of a wave in a window than in its middle was 0.18 s, 1.25 ± 0.19 degrees of yaw, accepted."""
+    truth = write_survey(draw(30860), tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    late = run.discovery.parameters.reference_time_offset
+    assert late == pytest.approx(truth["drawn"]["reference_late"], abs=0.08) and run.verdict != "reject", run.reasons
+    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < min(2.5 * run.mounting.std_deg[2], 0.4)
+
+
+@pytest.mark.slow
 def test_a_delay_that_moves_from_between_the_samples_of_a_noisy_reference_to_them_makes_nothing_worse(tmp_path):
     """Survey 32087: an interpolated reference is quieter between its samples, so 0.130 became 0.164 m/s: rejected."""
     truth = write_survey(draw(32087), tmp_path / "bag")

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..frames import ENU_FROM_NED, Array
 from ..parameters import Parameters
+from ..positions import are_positions, of_moments
 from ..robust import median, steps
 from ..samples import FRAME_CODES, Index, Mask, Stamps, VelocityFrame
 from ..spikes import without_spikes
@@ -62,6 +63,7 @@ class Cleaned(NamedTuple):
 
 def cleaned(block: Block, parameters: Parameters, epoch_ns: int, contradicted: Stamps) -> Cleaned:
     """A block's samples. epoch_ns: stamp of time 0. contradicted: stamps of DVL samples that are left out already."""
+    block = block._replace(reference=_of_moments(block.reference, parameters))
     own = _own(block)
     raw = block.reference.part(own)
     reference, good = _reference(block, own, raw, parameters, epoch_ns)
@@ -150,6 +152,14 @@ def _reference(
         velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
         noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
     return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given), good
+
+
+def _of_moments(around: ReferenceSamples, p: Parameters) -> ReferenceSamples:
+    """A block's references at the moments of their stamps."""
+    if not are_positions(p):
+        return around
+    velocity = of_moments(1e-9 * (around.stamps_ns - around.stamps_ns[:1]), around.values[:, :3], p.position_window)
+    return around._replace(values=np.hstack([velocity, around.values[:, 3:]]))
 
 
 def _own(block: Block) -> Index:

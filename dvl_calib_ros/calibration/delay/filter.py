@@ -47,7 +47,8 @@ LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
 # recording that is played fast come sooner, and then the node waits for the worker.
 SOLVED_WITHIN_NS = 1_000_000_000
 _BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
-_OPEN = (BEYOND, BEYOND)
+# What a clock leaves open: angles, lever arm, delay.
+_OPEN = np.r_[0:3, BEYOND]
 AXES = ("x", "y", "z")
 # What is less than so many σ from nothing is not worth a word.
 NAMED_FROM = 4.0
@@ -187,12 +188,14 @@ class DelayFilter(Estimator):
 
     @property
     def left_open(self) -> Array:
-        """(n, n) of what is shown of lever arm and delay, what the reference's clock leaves open."""
+        """(n, n) of what is shown of angles, lever arm and delay, what the reference's clock leaves open."""
         found: Array = np.zeros((N_STATE, N_STATE))
         posterior, registration = self.posterior, self._registration_told
         if posterior is not None and self.claims and registration is not None:
-            shown = posterior.shown[BEYOND]
-            found[_OPEN] = registration.left_open * np.outer(shown, shown)
+            own = np.eye(len(_OPEN))
+            own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
+            own *= posterior.shown[_OPEN, None]
+            found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
         return found
 
     def extended(self, base: GaussianState) -> GaussianState:

@@ -12,6 +12,7 @@ from ..delay.rows import DvlColumns, ImuColumns, TurnRates, binned
 from ..frames import ENU_FROM_NED, Array
 from ..imu_alignment import ImuAlignment
 from ..parameters import Parameters
+from ..positions import are_positions, of_moments
 from ..samples import FRAME_CODES, Index, SampleBlock, Streams, VelocityFrame
 from ..screening import measured_axes, screen_columns, unit_quaternions
 from ..spikes import without_spikes
@@ -67,6 +68,8 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     times = 1e-9 * (clocks.dvl(dvl.stamps_ns, first_ns) - first_ns)
     dvl_times, velocity = in_order(times, dvl.values)
     reference_times, seen = in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
+    if are_positions(parameters):
+        seen = of_moments(reference_times, seen, parameters.position_window)
     imu_times, numbers = in_order(
         1e-9 * (imu.stamps_ns - clocks.imu_ns - first_ns),
         np.hstack([unit_quaternions(imu.orientation), imu.angular_velocity]),

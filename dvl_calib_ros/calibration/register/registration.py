@@ -71,6 +71,8 @@ IN_TIME_STD_S = 0.5
 FAR_OPEN = 2.0
 # What it leaves open of a lever arm is none to speak of below this, m (σ).
 OPEN_FROM_M = 0.08
+# ... and of the DVL's yaw, rad (σ).
+OPEN_FROM_RAD = math.radians(0.1)
 
 
 @dataclass(frozen=True)
@@ -93,8 +95,8 @@ class Registration:
     point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
     speed; spread: the same, m/s per axis; speed: RMS, m/s.
     unsteady: a clock that drifts or leaps beside the others; all else is what holds with that taken off.
-    open_late: σ (s) of the reference's clock by the data alone; open_by: (4,) by how much the lever arm (m) and the
-    DVL's delay (s) are others for each second of it.
+    open_late: σ (s) of the reference's clock by the data alone; open_by: (7,) by how much the DVL's turn (rad, body),
+    the lever arm (m) and the DVL's delay (s) are others for each second of it.
     """
 
     dvl: Clock
@@ -118,14 +120,16 @@ class Registration:
 
     @property
     def left_open(self) -> Array:
-        """What the reference's clock leaves open of the lever arm (m) and the DVL's delay (s): their covariance (4, 4).
+        """Covariance (7, 7) of what its clock leaves open of turn (rad, body), lever arm (m) and the DVL's delay (s).
 
-        At one speed a clock looks like a lever arm, and then neither is known. Zero where that is nothing to speak of.
+        At one speed a clock looks like a lever arm, at one rate of turn like a yaw, and then none is known. Zero where
+        that is nothing to speak of.
         """
         std = 1.0 / math.hypot(1.0 / max(self.open_late, 1e-9), 1.0 / IN_TIME_STD_S)
         open_by = self.open_by * std
-        is_little = float(np.linalg.norm(open_by[:3])) < OPEN_FROM_M
-        return np.zeros((4, 4)) if is_little else np.outer(open_by, open_by)
+        turn, arm = (float(np.linalg.norm(part)) for part in (open_by[:3], open_by[3:6]))
+        is_little = arm < OPEN_FROM_M and turn < OPEN_FROM_RAD
+        return np.zeros((7, 7)) if is_little else np.outer(open_by, open_by)
 
     @property
     def offsets(self) -> dict[str, float]:
@@ -284,13 +288,13 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
 def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
     """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
     if not fit.is_turned:
-        return {"open_late": 0.0, "open_by": np.zeros(4)}
+        return {"open_late": 0.0, "open_by": np.zeros(7)}
     std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
     if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
         # as good as in time, and so far away that it turns another arm there
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
         std, by = max(std, off), by if near is None else near.by(LATE)
-    return {"open_late": std, "open_by": np.append(by[ARM], 1.0 + by[APART])}
+    return {"open_late": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]])}
 
 
 class _Off(Enum):

@@ -210,8 +210,26 @@ def test_at_one_speed_the_clock_of_a_reference_is_in_the_arm_and_the_delay():
     assert at_one_speed is not None
     turned = register(_of_its_own(at_one_speed), np.eye(3), np.zeros(3))
     assert turned is not None
-    std = np.sqrt(np.diag(turned.left_open))
+    std = np.sqrt(np.diag(turned.left_open))[3:]
     assert std[0] == pytest.approx(std[3] * turned.speed, rel=0.1) and std[0] > 0.08 > 10.0 * std[1]
+
+
+def test_on_a_circle_the_clock_of_a_reference_is_in_the_yaw():
+    """At one rate of turn a reference that is late is turned by as much: what is open of one is open of the other."""
+    times = np.arange(0.0, 300.0, 0.2)
+    yaw, zero = 0.1 * times, np.zeros(len(times))
+    quaternions = np.stack([np.cos(0.5 * yaw), zero, zero, np.sin(0.5 * yaw)], axis=1)
+    rates, ahead = np.tile([0.0, 0.0, 0.1], (len(times), 1)), np.tile([1.0, 0.0, 0.0], (len(times), 1))
+    circle = make_motion(
+        (times, ahead * (1.0 + 0.1 * np.sin(times / 9.0))[:, None]), (times, ahead), True, (True, True, False),
+        ImuColumns(times, quaternions, rates),
+    )  # fmt: skip
+    assert circle is not None
+    found = register(_of_its_own(circle), np.eye(3), np.zeros(3))
+    assert found is not None
+    std = np.sqrt(np.diag(found.left_open))
+    assert std[2] == pytest.approx(0.1 * std[6], rel=0.15) and std[6] > 0.4
+    assert max(std[0], std[1]) < 0.01 * std[2]
 
 
 def _of_its_own(one: MotionStreams) -> MotionStreams:

@@ -93,8 +93,8 @@ def test_the_page_that_says_more_is_there_with_its_heading():
 
 
 def test_json_has_the_numbers_as_numbers():
-    found = finding("CLOCK_OR_ARM", metres=np.float64(0.25), seconds=0.5).as_dict()
-    assert json.loads(json.dumps(found))["numbers"] == {"metres": 0.25, "seconds": 0.5}
+    found = finding("CLOCK_OR_ARM", metres=np.float64(0.25), degrees=1.0, seconds=0.5).as_dict()
+    assert json.loads(json.dumps(found))["numbers"] == {"metres": 0.25, "degrees": 1.0, "seconds": 0.5}
     assert found["page"] == "troubleshooting.md#all-warnings"
     assert finding("RESULT_NOT_SAVED", reason=OSError("disk full")).as_dict()["numbers"] == {"reason": "disk full"}
 
