@@ -25,7 +25,7 @@ from ..calibration.mounting_pose import position_in_body, scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
 from ..calibration.verification import use_findings
-from ..errors import InputError
+from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from ..verdict.reasons import finding
 from .parameter_edit import as_yaml, new_file, with_parameters
@@ -131,9 +131,6 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     except ParameterError as error:
         raise InputError(f"{path}: parameters: {error}") from error
-    for frame in frames:
-        if not re.fullmatch(r"[\w./-]+", frame, re.ASCII):  # a launch file would evaluate $(...) in it
-            raise InputError(f"{path}: {frame!r} is no name of a frame; letters, digits and _ . / - make one")
     errors = model.error_terms_from_state @ state.x
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
     arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
@@ -277,7 +274,7 @@ def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -
   ros__parameters:
     base_frame: {as_yaml(base)}
     mounting_rpy: {as_yaml([float(word) for word in numbers(rpy).split()])}
-    # if the reference velocity is that of {base}'s origin:
+    # if the reference velocity is that of {printable(base)}'s origin:
     # lever_arm: {as_yaml([float(word) for word in numbers(mounting.position).split()])}
 """
 
@@ -286,9 +283,18 @@ def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -
 
 
 def launch_file(calibrated: CalibratedMounting) -> str:
-    """A launch file (XML) that publishes the calibrated mounting as a static transform."""
+    """A launch file (XML) that publishes the calibrated mounting as a static transform.
+
+    Raises InputError where a frame's name would be evaluated in it.
+    """
     from xml.sax.saxutils import quoteattr  # imports what reads files over the net
 
+    for frame in (calibrated.base_frame, calibrated.dvl_frame):
+        if "$" in frame:
+            raise InputError(
+                f"{calibrated.path}: the frame {frame!r} cannot be named in a launch file, which would run what "
+                "stands behind a $; name it otherwise in the driver, or run static_transform_publisher yourself"
+            )
     arguments = quoteattr(calibrated.static_transform)
     return f"""<launch>
   <!-- {_origin(calibrated)}. A transform holds no scale. Not beside a robot_state_publisher with the same joint. -->
@@ -319,7 +325,7 @@ def scale_advice(calibrated: CalibratedMounting) -> str:
 
 def fusion_file(calibrated: CalibratedMounting) -> str:
     """Parameters for robot_localization and for our node beside it, as one ROS 2 parameter file."""
-    base, dvl, name = calibrated.base_frame, calibrated.dvl_frame, calibrated.model.name
+    base, dvl, name = printable(calibrated.base_frame), printable(calibrated.dvl_frame), calibrated.model.name
     used = [index in (6, 7, 8) for index in range(15)]  # x y z, roll pitch yaw, vx vy vz, their rates, accelerations
     own = {
         **{key: value for key, value in changed_parameters(calibrated.parameters).items() if key != "result_file"},

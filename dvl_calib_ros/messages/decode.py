@@ -28,6 +28,8 @@ NO_FIX, FIRST_FIX = "no_fix", "first_fix"
 NO_DATA = -1.0
 # Different frame_ids of the reference that are remembered.
 MAX_FRAMES = 64
+# What is kept of a name that garbage may make megabytes long: results and messages repeat it.
+LONGEST_FRAME_ID = 255
 
 EARTH_FRAMES = {
     "enu": VelocityFrame.ENU,
@@ -56,6 +58,11 @@ DECLARED_FRAMES = {
 }
 # by the end of a frame's name
 _SUFFIXES = {"enu": "enu", "ned": "ned", "flu": "body", "frd": FRD}
+
+
+def frame_name(frame_id: str) -> str:
+    """A frame_id as it is kept, with its end left out where it is of no use as a name."""
+    return frame_id if len(frame_id) <= LONGEST_FRAME_ID else f"{frame_id[: LONGEST_FRAME_ID - 1]}…"
 
 
 def frame_named(frame_id: str, base_frames: Collection[str]) -> DeclaredFrame | None:
@@ -243,6 +250,7 @@ class MessageDecoder:
 
     def accepts_dvl_frame(self, frame_id: str) -> bool:
         """Whether messages of this frame are the DVL's; the first that may be is taken for its own."""
+        frame_id = frame_name(frame_id)
         if frame_id == self.dvl_frame:
             return True
         if not self.parameters.dvl_frame and self.dvl_frame is None and not self._is_body_or_earth(frame_id):
@@ -281,6 +289,7 @@ class MessageDecoder:
 
     def reference_frame(self, frame_id: str) -> DeclaredFrame | None:
         """The frame of reference messages with this frame_id; None if it says nothing."""
+        frame_id = frame_name(frame_id)
         if frame_id not in self._reference_frames:
             if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
                 self._reference_frames.clear()
@@ -301,6 +310,7 @@ class MessageDecoder:
 
     def note_imu_frame(self, frame_id: str) -> None:
         """Take note of the frame of IMU messages."""
+        frame_id = frame_name(frame_id)
         if frame_id == self._imu_frame:
             return
         self._imu_frame = frame_id

@@ -47,7 +47,7 @@ from ..files.result_file import (
     result_text,
     save_result,
 )
-from ..messages.decode import heading_variance
+from ..messages.decode import frame_name, heading_variance
 from ..messages.feed import MessageFeed
 from ..streams import say
 from ..verdict.kinds import Severity
@@ -159,7 +159,7 @@ class CalibrationNode(AnsweringNode):
             return
         decoder = self._feed.decoder
         _, reference, imu = decoder.frame_ids
-        dvl = decoder.dvl_frame or decoder.dvl_type.frame_id(message)
+        dvl = decoder.dvl_frame or frame_name(decoder.dvl_type.frame_id(message))
         tried = (self._transforms.heard, (dvl, reference, imu))
         if tried == self._transforms_tried:
             return

@@ -19,7 +19,7 @@ from ..bags.layout import MessageColumns
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import Codes, Covariances, Index, Stamps
-from ..messages.decode import NO_DATA, UNREADABLE, heading_variance, stamp_ns
+from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
 from .growing import GrowingRows
 
@@ -203,7 +203,7 @@ class Collector:
             values, beside = _columns_of(velocity), np.broadcast_to(turning(columns), (n, 3))
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
-        self._world = self._world or columns.header.frame_id[0].tobytes().decode("ascii")
+        self._world = self._world or frame_name(columns.header.frame_id[0].tobytes().decode("ascii"))
         # nothing is taken before all of it is known to be readable
         index = np.where(covariances.index < 0, -1, covariances.index + self._n_distinct)
         if len(covariances.distinct):
@@ -237,7 +237,7 @@ class Collector:
             **{name: column.array() for name, column in self._laid.items()},
             world=self._world,
             heading_variance=self._heading_variance,
-            frames=tuple(name.decode("ascii") for name in self._frames),
+            frames=tuple(frame_name(name.decode("ascii")) for name in self._frames),
             distinct=np.concatenate([np.zeros((0, 3, 3)), *self._distinct]),
         )
         if (laid.arrival[1:] < laid.arrival[:-1]).any():  # of several layouts in turn

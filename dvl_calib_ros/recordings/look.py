@@ -20,7 +20,7 @@ import numpy as np
 from ..calibration.frames import Array
 from ..calibration.robust import median
 from ..calibration.samples import Index, Stamps
-from ..messages.decode import NO_DATA, UNREADABLE, heading_variance
+from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.fixes import FixDifference
 from .columns import TopicColumns, stamped, turning
@@ -206,11 +206,11 @@ class _Numbers:
             with suppress(*UNREADABLE):
                 values, beside = self._of(message)
                 row = np.array([[arrival], [log_ns], [stamped(message, log_ns)]])
-                name = str(message.header.frame_id if self._kind is None else self._kind.frame_id(message))
+                name = frame_name(str(message.header.frame_id if self._kind is None else self._kind.frame_id(message)))
                 self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), beside))
                 self._names += [(arrival, name)] if name else []
                 self._variances.append(np.array([self._claimed_variance(message)]))
-                self.world = self.world or str(message.header.frame_id)
+                self.world = self.world or frame_name(str(message.header.frame_id))
 
     def _of(self, message: Any) -> tuple[list[float], Array]:
         """A velocity, or quaternion and angular velocity of an IMU; and what is kept beside."""

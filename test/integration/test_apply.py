@@ -22,6 +22,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.rows import BEYOND
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.errors import printable
 from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting, scale_advice
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration, result_document, result_text
@@ -281,8 +282,18 @@ def test_the_launch_file_publishes_the_corrected_mounting(tmp_path, saved):
 def test_a_frame_name_from_a_bag_cannot_make_a_launch_file_run_something(tmp_path, result, capsys):
     document = result_document(result[1], "$(command touch)")
     path = change(tmp_path / "r.yaml", result[1], mounting=document["mounting"])
-    assert "is no name of a frame" in refused(capsys, path, "--launch", tmp_path / "l.xml")
+    assert "cannot be named in a launch file" in refused(capsys, path, "--launch", tmp_path / "l.xml")
     assert not (tmp_path / "l.xml").exists()
+
+
+@pytest.mark.parametrize("name", ["DVL A50", "dvl/'é'", "a\u2028b: c\n# d"])
+def test_a_frame_of_any_name_that_was_saved_is_taken_by_what_reads_it(tmp_path, result, name):
+    """A50s are 'DVL A50' to some drivers: what is calibrated with that name can be used."""
+    path = change(tmp_path / "r.yaml", result[1], mounting=result_document(result[1], name)["mounting"])
+    assert apply(path, "--launch", tmp_path / "l.xml", "--fusion", tmp_path / "fusion.yaml") == 0
+    arguments = shlex.split(ElementTree.parse(tmp_path / "l.xml").getroot().find("node").get("args"))
+    assert arguments[arguments.index("--child-frame-id") + 1] == printable(name)
+    assert load_parameters(tmp_path / "fusion.yaml").model == result[1].selected
 
 
 def test_the_fusion_file_makes_the_node_publish_what_was_calibrated(tmp_path, saved, result):

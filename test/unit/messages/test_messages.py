@@ -51,6 +51,17 @@ class Feed:
         return self.calibrator.counts[stream]
 
 
+def test_a_frame_that_garbage_made_megabytes_long_is_kept_short_and_its_data_are_used():
+    feed = Feed()
+    for i in range(3):
+        feed.feed.dvl(twist(i * SECOND, frame_id="d" * 30_000_000), 0)
+        feed.feed.imu(imu(i * SECOND, frame_id="i" * 30_000_000), 0)
+        feed.feed.reference(twist(i * SECOND, frame_id="r" * 30_000_000), 0)
+    assert all(1 < len(name) < 300 for name in feed.feed.decoder.frame_ids)
+    assert feed.counts("dvl")["usable"] == 3
+    assert sum(map(len, feed.said)) < 3000
+
+
 def test_stamps_keep_their_nanoseconds():
     assert stamp_ns(Fields(sec=1_763_688_000, nanosec=123_456_789)) == 1_763_688_000_123_456_789
 
