@@ -190,13 +190,16 @@ class Grid:
 
 @dataclass(frozen=True)
 class Problem:
-    """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare."""
+    """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
+    bursts: of how many samples an instrument was far off, which are left out.
+    """
 
     recordings: tuple[RecordedStreams, ...]
     rotation_dvl_from_body: Array
     lever_arm: Array
     grids: tuple[Grid, ...]
     of_axes: tuple[bool, bool, bool] = (True, True, True)
+    bursts: int = 0
     # Hypotheses as they were fitted last, by what they are made of: where to start from again
     fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -224,6 +227,15 @@ class Problem:
     def time(self) -> Array:
         """(M,) s of all bins, since the beginning of the bin's recording."""
         return np.concatenate([grid.bin_time for grid in self.grids])
+
+    def without(self, far: NDArray[np.bool_]) -> Problem:
+        """The problem without some bins (M,), as if nothing had been measured then."""
+        of_sample, ends = far[self.bin_of], np.cumsum([len(grid.stamps) for grid in self.grids])[:-1]
+        grids = tuple(
+            replace(grid, stamps=grid.stamps[~off])
+            for grid, off in zip(self.grids, np.split(of_sample, ends), strict=True)
+        )
+        return replace(self, grids=grids, bursts=int(of_sample.sum()), fitted={})
 
     @cached_property
     def recording_of(self) -> NDArray[np.intp]:

@@ -43,6 +43,8 @@ VISIBLE_TIMES_TYPICAL = 3.0
 # ... and a recording can only be cleared if that share of the effects could have been seen
 MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
+# Share of the gap's energy that effects have to close on held-out data to be what explains it
+MATERIAL = 0.2
 # What is left beyond the noise is told in the sentence from this share of the noise on
 WORTH_TELLING = 0.3
 Triple = tuple[float, float, float]
@@ -195,7 +197,7 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
-    if selection.selected and gap.not_explained > gap.noise_floor:
+    if selection.selected and (gap.not_explained > gap.noise_floor or gap.closure < MATERIAL):
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf
 from ..calibration.frames import Array
+from ..calibration.robust import robust_std
 from ..effects.base import Effect
 from .composed import Hypothesis, Problem, Seen, Values, amplitudes, is_time_of_run, whose_parameters
 from .least_squares import WhitenedLeastSquares
@@ -29,6 +30,9 @@ BY_CHANCE = 1.5
 PRIOR_IN_TYPICAL = 50.0
 # A fit is not made where it would come out worse by so much deviance, and by this share of what its first step gains
 SURELY, BENT = 2.0, 0.2
+# A burst: bins beyond so many standard deviations of what is usually left, those about them that are beyond fewer, and
+# the share of a recording up to which all of them are taken for errors of an instrument
+BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
 Mask = NDArray[np.bool_]
 
 
@@ -111,6 +115,17 @@ class Fitter:
     def without(self, held: Mask) -> Fitter:
         """One that does not see some bins (M,)."""
         return replace(self, held=held, _fits={})
+
+    def bursts(self, fit: Fit) -> Mask:
+        """(M,) bins in which an instrument is off for some seconds: far off, and too few for an effect.
+
+        Noise with a memory does not show them: it is the bursts' own.
+        """
+        raw = (fit.residual + self.outliers) / fit.noise.level
+        size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
+        run = np.cumsum(np.diff(size > ABOUT_BURST, prepend=False))  # odd in the runs, even between them
+        far = np.isin(run, run[size > BURST])
+        return far & (np.count_nonzero(far) <= RARE * len(far))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
         """Through the model, and residual (M, A)."""

@@ -39,6 +39,8 @@ SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3")
 MOVING_MPS = 0.1
 # However long a recording is, its streams are averaged to no less
 SLOWEST_AVERAGE_HZ = 2.5
+# So many samples of the reference tell all that can be compared with one of the DVL
+PER_DVL_SAMPLE = 2.5
 
 
 @dataclass(frozen=True)
@@ -146,14 +148,16 @@ def make_recording(
     repeats = int((np.diff(velocity, axis=0) == 0.0).all(axis=1).sum())
     spikes = len(time) - len(_claiming(dvl, dvl_std).without_spikes().time) if len(time) > 1 else 0
 
-    def curve(stream: tuple[Array, Array] | None, std: Array | None = None) -> Curve | None:
+    def curve(stream: tuple[Array, Array] | None, std: Array | None = None, rate: float = rate) -> Curve | None:
         if stream is None or len(stream[0]) < 2:
             return None
         return _claiming(stream, std).without_spikes().averaged(rate)
 
     if attitude is not None:
         attitude = attitude[0], _alike_in_sign(attitude[1])
-    dvl_curve, reference_curve = curve(dvl, dvl_std), curve(reference, reference_std)
+    dvl_curve = curve(dvl, dvl_std)
+    of_dvl = SLOWEST_AVERAGE_HZ if dvl_curve is None else PER_DVL_SAMPLE / dvl_curve.interval
+    reference_curve = curve(reference, reference_std, min(rate, max(of_dvl, SLOWEST_AVERAGE_HZ)))
     if dvl_curve is None or reference_curve is None:
         raise InputError(f"{name}: fewer than two samples of DVL or reference")
     return RecordedStreams(

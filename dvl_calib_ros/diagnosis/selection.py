@@ -117,6 +117,10 @@ def select(
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
         fitter, fit = _first_fit(problem, fit.hypothesis)
     fitter, fit = _about(fitter, fit, effects)
+    far = fitter.bursts(fit)
+    if far.any():
+        problem = problem.without(far)
+        fitter, fit = _about(*_first_fit(problem, fit.hypothesis), effects)
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
