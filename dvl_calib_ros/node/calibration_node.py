@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,6 @@ class CalibrationNode(AnsweringNode):
         self._corrected_by = ""
         self._published = self._mounting_published = ("", 0)
         self._pauses = Pauses(steady_s())
-        self._silence, self._recent = Silence(self._pauses.running_s(steady_s())), RecentCounts()
         self._save_problem: Reason | None = None
 
         self._estimate = self._output_message()
@@ -134,6 +134,9 @@ class CalibrationNode(AnsweringNode):
         self._subscribe(dvl_class, "dvl/twist")
         self._subscribe(gnss_class, "gnss/twist")
         self._subscribe(Imu, "imu/data")
+        topics = {own: subscription.topic_name for own, subscription in self._inputs.items()}
+        _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
+        self._silence, self._recent = Silence(self._pauses.running_s(steady_s()), topics), RecentCounts()
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -480,3 +483,10 @@ class CalibrationNode(AnsweringNode):
 
 def _set_stamp(stamp: Any, nanoseconds: int) -> None:
     stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
+
+
+def _check_distinct(topics: Mapping[str, str]) -> None:
+    """Raise InputError where two of our topics were remapped to one: a DVL agrees with itself at any mounting."""
+    for first, second in combinations(topics, 2):
+        if topics[first] == topics[second]:
+            raise InputError(f"{first} and {second} are both {topics[first]}; remap each to its own sensor's topic")

@@ -37,7 +37,7 @@ _PIECES = 6
 Counts = Mapping[str, Mapping[str, int]]
 _NOT_TAKEN = {"invalid", "duplicate", "out_of_order", "stray", "held", "before_restart"}
 _NAMED = {Stream.DVL: "DVL", Stream.REFERENCE: "GNSS", Stream.IMU: "IMU"}
-_SILENT = {"dvl": ("DVL_SILENT", "dvl/twist"), "imu": ("IMU_SILENT", "imu/data")}
+_SILENT = {"dvl": ("DVL_SILENT", "dvl/twist"), "imu": ("IMU_SILENT", "imu/data")}  # and the topic if not remapped
 
 
 class RecentCounts:
@@ -71,10 +71,12 @@ class _Taken(NamedTuple):
 class Silence:
     """Finds streams that bring nothing usable any more, and those that live in another time than the DVL.
 
-    Looked at once in a while, so that it costs nothing per message. now_s: a clock that does not go back.
+    Looked at once in a while, so that it costs nothing per message. now_s: a clock that does not go back. topics: what
+    the node's topics are called since they were remapped.
     """
 
-    def __init__(self, now_s: float) -> None:
+    def __init__(self, now_s: float, topics: Mapping[str, str]) -> None:
+        self._topics = topics
         self._started_s = now_s
         self._seen: dict[str, _Taken] = {}
 
@@ -88,7 +90,8 @@ class Silence:
                 self._seen[stream] = _Taken(taken, now_s)
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
-        for stream, (code, topic) in _SILENT.items():
+        for stream, (code, own_topic) in _SILENT.items():
+            topic = self._topics.get(own_topic, own_topic)
             if not counts[stream]["received"]:
                 if stream == "dvl" and now_s - self._started_s > SILENCE_S:
                     faults[stream] = finding("DVL_NO_MESSAGE", topic=topic)

@@ -50,6 +50,21 @@ def test_a_type_that_cannot_be_is_refused_at_the_start_in_one_line(capfd, argume
     assert len(errors.splitlines()) == 1 and said in errors
 
 
+def test_one_topic_for_two_sensors_is_refused_at_the_start_in_one_line(capfd):
+    """A reference that is the DVL itself agrees with every mounting that it is given."""
+    errors = refused_at_start(capfd, "-r", "dvl/twist:=/a50/velocity", "-r", "gnss/twist:=/a50/velocity")
+    assert len(errors.splitlines()) == 1 and "dvl/twist and gnss/twist are both /a50/velocity" in errors
+    errors = refused_at_start(capfd, "-r", "gnss/twist:=/dvl_calibration/calibrated_twist")
+    assert len(errors.splitlines()) == 1 and "gnss/twist and ~/calibrated_twist are both /dvl_calib" in errors
+
+
+def test_what_is_missing_is_named_as_it_was_remapped(world):
+    with node_here(world, cli_args=["--ros-args", "-r", "dvl/twist:=/a50/velocity"]) as node:
+        silent = node._silence.faults(node._calibrator, node._calibrator.counts, 1e9)
+        assert silent["dvl"].numbers["topic"] == "/a50/velocity"
+        assert "ros2 topic hz" in silent["dvl"].remedy and "/a50/velocity" in silent["dvl"].remedy
+
+
 def test_the_node_and_the_replay_agree_on_other_types(world, tmp_path):
     bag, saved = write_driver_bag(tmp_path / "bag", run(), ODOMETRY, TWIST_STAMPED), tmp_path / "live.yaml"
     types = as_arguments(PATIENT | {"dvl_type": ODOMETRY, "gnss_type": TWIST_STAMPED})
@@ -108,7 +123,7 @@ def test_a_drivers_messages_reach_the_calibration_where_its_package_is_installed
 
 def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wrong_with_them_is_said():
     calibrator, kind = Calibrator(Parameters(dvl_type=MARINE)), VELOCITY_TYPES[MARINE]
-    feed, silence, recent = MessageFeed(calibrator, lambda _: None), Silence(0.0), RecentCounts()
+    feed, silence, recent = MessageFeed(calibrator, lambda _: None), Silence(0.0, {}), RecentCounts()
     for second in range(8):
         message = Maker().velocity(MARINE, DvlSample(second * 10**9, (1.5, 0.0, 0.0)))
         message.beam_velocities_valid = False

@@ -129,7 +129,7 @@ def watch(folder: Path) -> None:
             if log_ns - first_ns > 250e9:
                 break
             handlers[topic](message, log_ns)
-    found = diagnose(calibrator, feed.decoder.dvl_type, [], Silence(0.0), RecentCounts(), 0.0)
+    found = diagnose(calibrator, feed.decoder.dvl_type, [], Silence(0.0, {}), RecentCounts(), 0.0)
     values = {item.key: item.value for item in found.values}
     shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
     terminal(shown, folder, "watch", "dvl-calib run --watch", 100)
