@@ -38,6 +38,7 @@ from dvl_calib_ros.evaluation.results import (
 from dvl_calib_ros.present.reports import write_replay_report
 from dvl_calib_ros.replay.navigation import Drift, Navigation
 from dvl_calib_ros.replay.replay import Replayed, replay
+from dvl_calib_ros.verdict.reasons import finding
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates
 FEW = ("M3", "F1")
@@ -194,7 +195,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
     )  # fmt: skip
     values: dict[str, Any] = {
         "verdict": DiagnosisVerdict.AMBIGUOUS,
-        "sentence": "The gap is explained by <i>two</i> effects.",
+        "reasons": (finding("GAP_AMBIGUOUS", names="<i>two</i> effects", before=42.1, after=35.3, noise=34.6),),
         "gap": Gap(0.0421, 0.0353, 0.0346, 0.982, (0.91, 1.0), 0.007, 0.03),
         "effects": (
             FoundEffect("lever_arm", ("sideslip",), {"x_m": (0.3, 0.25, 0.35), "z_m": (-0.1, -0.3, 0.1)}, 0.85, 1e-20),

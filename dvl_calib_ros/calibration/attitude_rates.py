@@ -15,6 +15,7 @@ from itertools import product as all_of
 
 import numpy as np
 
+from ..verdict.reasons import Reason, finding
 from .frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
 from .imu_alignment import quaternion_product
 from .samples import Index
@@ -37,25 +38,25 @@ _BODY, _ENU, _NED = range(3)
 _AXES = "xyz"
 _INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
 _KNOWN = {
-    (1, 1, -1): "a heading that turns against the angular velocity about z, as a compass counts it (clockwise)",
-    (-1, -1, -1): "an angular velocity of the other sign",
-    (1, -1, -1): "an attitude and an angular velocity of which one is forward-left-up, the other forward-right-down",
+    (1, 1, -1): "HEADING_CLOCKWISE",
+    (-1, -1, -1): "RATES_NEGATED",
+    (1, -1, -1): "IMU_AXES_MIXED",
 }
 
 
-def _conventions() -> Iterator[tuple[str, Array]]:
-    """All axes that may be exchanged or negated, in words, and as B (3, 3), turning = B rates; the likely ones first.
+def _conventions() -> Iterator[tuple[Reason, Array]]:
+    """All axes that may be exchanged or negated, and as B (3, 3), turning = B rates; the likely ones first.
 
     On a level vehicle that only turns about z many fit alike.
     """
-    known_ones = [(words, np.diag(signs).astype(float)) for signs, words in _KNOWN.items()]
+    known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _KNOWN.items()]
     yield from known_ones
     for order in permutations(range(3)):
         for signs in all_of((1, -1), repeat=3):
             axes = ", ".join("-"[: sign < 0] + _AXES[axis] for sign, axis in zip(signs, order, strict=True))
             matrix = np.diag(signs).astype(float) @ np.eye(3)[list(order)]
             if axes != "x, y, z" and not any((matrix == known).all() for _, known in known_ones):
-                yield f"an attitude whose turning about x, y, z is the angular velocity's about {axes}", matrix
+                yield finding("RATES_EXCHANGED", axes=axes), matrix
 
 
 CONVENTIONS = tuple(_conventions())
@@ -111,23 +112,25 @@ class AttitudeRates:
         """Whether the attitude is a heading alone, without roll and pitch."""
         return self._n >= ENOUGH and not self._tilted
 
-    def says(self) -> str:
-        """What the data fit, in words, where attitude and angular velocity do not agree; else ''."""
+    def contradiction(self) -> Reason | None:
+        """What the data fit, where attitude and angular velocity do not agree."""
         shown = slice(None) if self._tilted else slice(2, None)  # of a heading alone, what is about the vertical
         total = float(np.trace(self._turning[shown, shown]))
         if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
-            return ""
+            return None
         if not self._rates[_BODY].any():
-            return "the data fit an IMU without angular velocity (exactly 0 in every message)"
+            return finding("IMU_NO_RATES")
         given = self._left(_BODY, np.eye(3), shown)
         if given < WRONG_FROM * total:
-            return ""
-        explained = [(self._left(frame, matrix, shown), words) for frame, matrix, words in self._explanations()]
+            return None
+        explained = [(self._left(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
         best = min(left for left, _ in explained)
         if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
-            return ""
-        named = [words for left, words in explained if left <= AS_GOOD * best + 1e-3 * total]
-        return f"the data fit {', or '.join(named[:2])} (IMU: its orientation and its angular velocity contradict)"
+            return None
+        found, *others = (fits for left, fits in explained if left <= AS_GOOD * best + 1e-3 * total)
+        if others:
+            return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
+        return finding("IMU_CONTRADICTS", found=found)
 
     def _left(self, frame: int, matrix: Array, shown: slice) -> float:
         """Σ|a - B w|² over the axes that are shown, for one B (3, 3) and a frame of w."""
@@ -136,23 +139,23 @@ class AttitudeRates:
         turning = float(np.trace(self._turning[shown, shown]))
         return turning - 2.0 * crossed + float(np.trace(matrix @ self._rates[frame] @ matrix.T))
 
-    def _explanations(self) -> Iterator[tuple[int, Array, str]]:
-        """Frames of the angular velocity, and B (3, 3), that may be what was recorded, and each in words."""
-        yield from ((_BODY, matrix, words) for words, matrix in CONVENTIONS)
+    def _explanations(self) -> Iterator[tuple[int, Array, Reason]]:
+        """Frames of the angular velocity, and B (3, 3), that may be what was recorded, and what each is."""
+        yield from ((_BODY, matrix, convention) for convention, matrix in CONVENTIONS)
         both, rates = self._both[_BODY], self._rates[_BODY]
         scale = float(np.trace(both) / np.trace(rates))
         if scale > 0.0 and abs(math.log(scale)) > SCALED_FROM:
             in_degrees = abs(math.log(scale * 180.0 / math.pi)) < SCALED_FROM
-            size = "in degrees per second" if in_degrees else f"that is {1.0 / scale:.2g} times as large"
-            yield _BODY, scale * np.eye(3), f"an angular velocity {size}"
-        yield _ENU, np.eye(3), "an angular velocity about the axes of the earth (ENU), not of the body"
-        yield _NED, np.eye(3), "an angular velocity about the axes of the earth (NED), not of the body"
-        yield _ENU, -np.eye(3), "an inverted attitude (a quaternion that turns the earth into the body)"
+            size = finding("RATES_DEGREES") if in_degrees else finding("RATES_SCALED", times=1.0 / scale)
+            yield _BODY, scale * np.eye(3), size
+        yield _ENU, np.eye(3), finding("RATES_IN_EARTH", frame="ENU")
+        yield _NED, np.eye(3), finding("RATES_IN_EARTH", frame="NED")
+        yield _ENU, -np.eye(3), finding("ATTITUDE_INVERTED")
         u, _, vt = np.linalg.svd(both)
         turned = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
         angle = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0))))
         if angle > TURNED_FROM_DEG and np.abs(turned).max(axis=1).min() < EXCHANGED_FROM:
-            yield _BODY, turned, f"an angular velocity whose axes are turned by {angle:.0f}° against the attitude's"
+            yield _BODY, turned, finding("RATES_TURNED", degrees=angle)
 
 
 def _spans(times: Array) -> Index:

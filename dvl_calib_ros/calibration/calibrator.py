@@ -571,7 +571,7 @@ class Calibrator:
             held_out,
             self.parameters,
             (estimate.used, estimate.gated),
-            self.suggestion if model.aided else "",
+            self.suggestion if model.aided else None,
             any(each.reference_claims for each in self._further),
             next((each.doubt for each in self._further if each.doubt), "") if model.aided else "",
             bool(model.estimator) and estimator.claims,
@@ -730,9 +730,9 @@ class Calibrator:
         return next((found for found in each if found is not None), None)
 
     @property
-    def suggestion(self) -> str:
-        """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
-        return next((each.suggestion for each in self._further if each.suggestion), "")
+    def suggestion(self) -> Reason | None:
+        """What configuration the data fit, where the one given is grossly wrong."""
+        return next((each.suggestion for each in self._further if each.suggestion), None)
 
     @property
     def are_clocks_known(self) -> bool:
@@ -745,9 +745,9 @@ class Calibrator:
         return next((each.registration_so_far for each in self._further), None)
 
     @property
-    def suggestion_so_far(self) -> str:
+    def suggestion_so_far(self) -> Reason | None:
         """`suggestion`, live: what a look that is not made anew for every message says."""
-        return next((each.suggestion_so_far for each in self._further if each.suggestion_so_far), "")
+        return next((each.suggestion_so_far for each in self._further if each.suggestion_so_far), None)
 
 
 def _own(block: AlignedBlock) -> AlignedBlock:

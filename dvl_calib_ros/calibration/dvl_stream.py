@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from ..verdict.reasons import Reason, finding
 from .frames import Array
 from .robust import median, steps
 
@@ -52,17 +53,17 @@ class DvlStream:
         self._square += float((velocity**2).sum())
         self._noise = max(self._noise, math.sqrt(float(median(steps(steps(one)) ** 2).max()) / 20.0))
 
-    def says(self) -> str:
-        """What the data fit, in words, where they are not what one DVL measures; else ''."""
+    def contradiction(self) -> Reason | None:
+        """What the data fit, where they are not what one DVL measures."""
         if self._blocks < ENOUGH:
-            return ""
+            return None
         if self._alternating > MOST * self._blocks:
-            return "the data fit two DVLs on one topic, between whose velocities the messages go to and fro"
+            return finding("DVL_TWO_ON_TOPIC")
         rounded = np.where(self._repeated > REPEATED_FROM * self._n, self._step, 0.0)
         step = float(np.where(np.isfinite(rounded), rounded, 0.0).max())
         if step > ROUNDED_FROM * math.sqrt(self._square / self._n):
-            return f"the data fit a DVL whose velocity is rounded to {step:.2g} m/s: no mounting is as fine as that"
+            return finding("DVL_ROUNDED", step=step)
         dead = [axis for axis, is_dead in zip(_AXES, self._is_dead, strict=True) if is_dead]
         if dead and len(dead) < 3 and self._noise > NOISE_MPS:
-            return f"the data fit a DVL without velocity along {' and '.join(dead)} (exactly 0 in every message)"
-        return ""
+            return finding("DVL_AXIS_DEAD", axes=" and ".join(dead))
+        return None

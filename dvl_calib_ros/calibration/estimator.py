@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..verdict.reasons import Reason
 from .alignment import Aligner
 from .bank import Group, ModelCounts
 from .delay.clocks import Rest
@@ -89,9 +90,9 @@ class Estimator(ABC):
         return None
 
     @property
-    def suggestion(self) -> str:
-        """What configuration the data fit, in words, where the one given is grossly wrong; ''."""
-        return ""
+    def suggestion(self) -> Reason | None:
+        """What configuration the data fit, where the one given is grossly wrong."""
+        return None
 
     @property
     def is_level(self) -> bool:
@@ -124,7 +125,7 @@ class Estimator(ABC):
         return None
 
     @property
-    def suggestion_so_far(self) -> str:
+    def suggestion_so_far(self) -> Reason | None:
         """`suggestion` as it was seen a little ago, which nobody has to wait for."""
         return self.suggestion
 

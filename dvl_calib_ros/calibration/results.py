@@ -159,7 +159,7 @@ class Result:
     """
 
     selected: str
-    selected_because: str
+    selected_because: Reason
     estimates: Mapping[str, Estimate]
     segments: tuple[Segment, ...]
     counts: Mapping[str, Mapping[str, int]]
@@ -167,7 +167,7 @@ class Result:
     last_ns: int | None
     parameters: Mapping[str, Any]
     verifications: Mapping[str, Verification]
-    suggestion: str = ""
+    suggestion: Reason | None = None
     days: tuple[Day, ...] = ()
     days_of: str = ""
     doubts: tuple[Reason, ...] = ()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from bisect import insort
 from collections import deque
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..verdict.reasons import Reason, finding
 from .models import EXTENDED_BY, WITH_HEADINGS
 from .parameters import AUTO, IAC, Parameters
 from .samples import Mask, Stamps
@@ -64,25 +66,24 @@ class GnssAvailability:
         return not self.available and not paired.any()
 
     @property
-    def reason(self) -> str:
-        """In words, for the operator."""
-        state = "available" if self.available else "not available"
+    def reason(self) -> Reason:
+        """For the operator."""
         if self._changing_since_ns is None:
-            return f"GNSS is {state}"
-        change = "going" if self.available else "coming"
-        return f"GNSS is {state}, {change}; waiting for gnss_hysteresis"
+            return finding("GNSS_AVAILABLE" if self.available else "GNSS_NOT_AVAILABLE")
+        return finding("GNSS_GOING" if self.available else "GNSS_COMING")
 
 
 class Evidence(NamedTuple):
     """For the model that extends another: chi-square of what only it has, or the share of a variance that only it knows
-    of; and what of the other model that says, in words.
+    of; and what of the other model that says: the code of a reason, and its numbers beside the model.
     """
 
     chi_square: float
-    found: str
+    code: str = "NO_EVIDENCE"
+    numbers: Mapping[str, Any] = {}
 
 
-NO_EVIDENCE = Evidence(0.0, "")
+NO_EVIDENCE = Evidence(0.0)
 # Chi-square (four degrees of freedom at most) from which the extending model is taken, and below which it is left: by
 # chance 30 comes once in 200 000 times, and an effect of a few σ that comes and goes does not flap the output.
 EXTENDED_FROM, EXTENDED_UNTIL = 30.0, 15.0
@@ -170,19 +171,18 @@ class Selection:
             return EXTENDED_BY.get(aided, aided)
         return aided
 
-    def reason(self, parameters: Parameters, evidence: Evidence | None = None) -> str:
+    def reason(self, parameters: Parameters, evidence: Evidence | None = None) -> Reason:
         """Why it is that model. evidence: as it is now, for a model that extends another; None: as it was noted."""
         if parameters.model not in (AUTO, IAC):
-            return "set by parameter model"
-        reason = f"{parameters.model}: {self.gnss.reason}"
+            return finding("MODEL_NAMED")
+        chosen = {"by": parameters.model, "gnss": self.gnss.reason}
         if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
-            told = "headings tell" if self._headings else "no attitude over headings that would tell"
-            if self._headings and self._trimmed:
-                return f"{reason}; the trim is known"
-            return f"{reason}; {told} a current from the mounting"
+            headings = "TRIM_KNOWN" if self._trimmed else "HEADINGS_TELL_CURRENT"
+            return finding("MODEL_CHOSEN_AS", **chosen, why=finding(headings if self._headings else "HEADINGS_TOO_FEW"))
         if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
-            return reason
-        return f"{reason}; {parameters.gnss_model} {(evidence or self._evidence).found}"
+            return finding("MODEL_CHOSEN", **chosen)
+        seen = evidence or self._evidence
+        return finding("MODEL_CHOSEN_AS", **chosen, why=finding(seen.code, model=parameters.gnss_model, **seen.numbers))
 
 
 def published_models(parameters: Parameters) -> tuple[str, str]:

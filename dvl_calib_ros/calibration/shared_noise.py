@@ -18,6 +18,7 @@ import math
 
 import numpy as np
 
+from ..verdict.reasons import Reason, finding
 from .frames import Array
 from .robust import median
 from .samples import Mask
@@ -117,15 +118,10 @@ class SharedNoise:
         sure = c_4 - steps - SHARED_FROM * noise > SURE_FROM * float(std[best, 0])
         return (c_4 - steps) / noise if sure else 0.0
 
-    def says(self) -> str:
-        """What the data fit, in words, where the reference holds the DVL's noise; else ''."""
+    def contradiction(self) -> Reason | None:
+        """What the data fit, where the reference holds the DVL's noise."""
         share = self.share()
-        if not share:
-            return ""
-        return (
-            f"the data fit a reference that a filter made from this DVL (it holds {100.0 * min(share, 1.0):.0f} % of "
-            "the DVL's own noise; take the GNSS velocity alone)"
-        )
+        return finding("REFERENCE_HOLDS_DVL", percent=100.0 * min(share, 1.0)) if share else None
 
 
 def _about_mean(values: Array) -> Array:

@@ -140,7 +140,7 @@ def verify(
     held_out: HeldOutError | None,
     parameters: Parameters,
     used_and_gated: tuple[int, int] | None = None,
-    suggestion: str = "",
+    suggestion: Reason | None = None,
     reference_claims: bool = True,
     lever_arm_turns: str = "",
     finds_lever_arm: bool = False,
@@ -157,7 +157,7 @@ def verify(
     held_out: What it did on samples that it had not seen; None for too few.
     parameters: The thresholds.
     used_and_gated: How many samples it used, and threw out; None where that is not known.
-    suggestion: What configuration would fit, in words, if the one given does not.
+    suggestion: What configuration would fit, if the one given does not.
     reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
     lever_arm_turns: How much of an angle is the lever arm's, in words, if the motion does not tell them apart.
     finds_lever_arm: Whether it is in σ of the angles, and not taken as known.

@@ -11,6 +11,9 @@ _TABLES = {
     "doctor": "everything that the doctor can find wrong with a bag",
     "verdicts": "every reason for which a calibration is or is not to be used",
     "comparisons": "everything that compare can say",
+    "configurations": "what the data can fit instead of what was configured",
+    "selections": "why a model is selected",
+    "diagnoses": "everything that diagnose can conclude",
 }
 
 

@@ -19,6 +19,7 @@ from ..effects.registry import EFFECTS
 from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
+from ..verdict.reasons import Reason, finding
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
@@ -84,8 +85,8 @@ def diagnose_recordings(
     testable = {name: effect for name, effect in effects.items() if name not in untestable}
     selection = select(recordings, parameters.rotation_dvl_from_body, np.array(parameters.lever_arm), testable)
     if len(selection.fitter.problem.time) < SETTINGS.min_bins:
-        why = f"{len(selection.fitter.problem.bin_of)} samples have DVL, reference and attitude together"
-        return _nothing_to_say(f"{why}; record {SETTINGS.min_seconds:.0f} s at least, better 600 s", notes)
+        samples, seconds = len(selection.fitter.problem.bin_of), sum(each.seconds for each in recordings)
+        return _nothing_to_say(_too_short(samples, seconds), notes)
     _check_bounds(selection)
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
@@ -108,7 +109,7 @@ def diagnose_recordings(
     calibration = zip([*hypothesis.phi, *hypothesis.scale], np.sqrt(np.diag(covariance)[:6]).tolist(), strict=True)
     return Diagnosis(
         verdict=verdict,
-        sentence=_sentence(verdict, gap, found, rest, visible, len(testable)),
+        reasons=_reasons(verdict, gap, found, rest, visible, len(testable)),
         gap=gap,
         effects=found,
         noise=tuple(noise_findings(selection.fitter, selection.fit)),
@@ -161,27 +162,28 @@ def _compared_axes(selection: EffectSelection) -> str:
     return f"{axes} of the body" if in_body else f"{axes} of the body held level" if axes == "xy" else f"{axes} (ENU)"
 
 
-def _says_nothing(recordings: Sequence[RecordedStreams]) -> str:
-    """Why recordings cannot say anything, '' if they can."""
+def _says_nothing(recordings: Sequence[RecordedStreams]) -> Reason | None:
+    """Why recordings cannot say anything; None if they can."""
     seconds = sum(recording.seconds for recording in recordings)
     samples = sum(min(len(recording.dvl.time), len(recording.reference.time)) for recording in recordings)
     if samples < SETTINGS.min_bins or seconds < SETTINGS.min_seconds:
-        return (
-            f"{samples} samples over {seconds:.0f} s are too few; record {SETTINGS.min_seconds:.0f} s at least, "
-            "better 600 s"
-        )
+        return _too_short(samples, seconds)
     if max(float(np.ptp(recording.reference.values, axis=0).max()) for recording in recordings) < 1e-6:
-        return "the reference velocity is constant to the last digit; a receiver that has stopped says nothing"
+        return finding("GAP_REFERENCE_CONSTANT")
     if not any(recording.measured[0] and recording.measured[1] for recording in recordings):
-        return "the reference does not measure the horizontal velocity"
-    return ""
+        return finding("GAP_REFERENCE_VERTICAL")
+    return None
 
 
-def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
+def _too_short(samples: int, seconds: float) -> Reason:
+    return finding("GAP_TOO_SHORT", samples=samples, seconds=seconds, wanted=SETTINGS.min_seconds)
+
+
+def _nothing_to_say(why: Reason, notes: Sequence[str]) -> Diagnosis:
     nan = float("nan")
     return Diagnosis(
         verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION,
-        sentence=f"This recording cannot show a gap: {why}.",
+        reasons=(why,),
         gap=Gap(nan, nan, nan, nan, (nan, nan)),
         effects=(),
         noise=(),
@@ -191,6 +193,16 @@ def _nothing_to_say(why: str, notes: Sequence[str]) -> Diagnosis:
         next_manoeuvre="straight legs on several headings and at several speeds, with turns to both sides",
         notes=tuple(notes),
     )
+
+
+# How each verdict is said.
+CODES = {
+    DiagnosisVerdict.KNOWN: "GAP_EXPLAINED",
+    DiagnosisVerdict.AMBIGUOUS: "GAP_AMBIGUOUS",
+    DiagnosisVerdict.UNKNOWN: "GAP_UNKNOWN",
+    DiagnosisVerdict.NO_GAP: "NO_GAP",
+    DiagnosisVerdict.INSUFFICIENT_EXCITATION: "GAP_NOT_TESTABLE",
+}
 
 
 def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
@@ -314,40 +326,33 @@ def _next_manoeuvre(
     return "; ".join(f"to see {name}: {testable[name].manoeuvre}" for name in worst)
 
 
-def _sentence(
+def _reasons(
     verdict: DiagnosisVerdict,
     gap: Gap,
     found: Sequence[FoundEffect],
     rest: Unexplained,
     visible: Sequence[str],
     n_tested: int,
-) -> str:
-    names = " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found)
-    falls = (
-        f"the error falls from {1e3 * gap.before:.1f} to {1e3 * gap.after:.1f} mm/s on held-out data, over noise of "
-        f"{1e3 * gap.noise_floor:.1f}"
+) -> tuple[Reason, ...]:
+    """The verdict, and what is left."""
+    numbers = {
+        "names": " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found),
+        "before": 1e3 * gap.before,
+        "after": 1e3 * gap.after,
+        "noise": 1e3 * gap.noise_floor,
+        "visible": len(visible),
+        "tested": n_tested,
+    }
+    is_unknown = verdict is DiagnosisVerdict.UNKNOWN
+    is_left = (
+        gap.not_explained > WORTH_TELLING * gap.noise_floor and verdict is not DiagnosisVerdict.INSUFFICIENT_EXCITATION
     )
-    is_left = gap.not_explained > WORTH_TELLING * gap.noise_floor
-    left = f"; {1e3 * gap.not_explained:.1f} mm/s are not explained" if is_left else ""
-    if is_left and rest.found and verdict is not DiagnosisVerdict.UNKNOWN:
-        left += f" and follow {rest.about}"
-    if verdict is DiagnosisVerdict.KNOWN:
-        return f"The gap is explained by {names}: {falls}{left}."
-    if verdict is DiagnosisVerdict.AMBIGUOUS:
-        return f"The gap is explained by {names}: {falls}{left}; this data cannot tell between them."
-    if verdict is DiagnosisVerdict.UNKNOWN:
-        if found:
-            follows = f"what is left follows {rest.about}" if rest.found else "what it follows does not show"
-            return (
-                f"Beside {names} there is something that no effect of the library explains: {falls}{left}; {follows}."
-            )
-        return (
-            f"There is an error of {1e3 * gap.before:.1f} mm/s, over noise of {1e3 * gap.noise_floor:.1f}, that no "
-            f"effect of the library explains; it follows {rest.about}."
-        )
-    if verdict is DiagnosisVerdict.NO_GAP:
-        return (
-            f"No gap beyond the noise of {gap.noise_floor:.3f} m/s{left}; {len(visible)} of {n_tested} effects would "
-            "have shown at sizes that matter."
-        )
-    return f"This data could not have shown a gap: {len(visible)} of {n_tested} effects would have shown."
+    code = "GAP_PARTLY_UNKNOWN" if is_unknown and found else CODES[verdict]
+    reasons = [finding(code, **numbers)]
+    if is_left and code != "GAP_UNKNOWN":
+        reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
+    if rest.found and (is_left or is_unknown):
+        reasons.append(finding("REST_FOLLOWS", about=rest.about))
+    elif is_unknown:
+        reasons.append(finding("REST_FOLLOWS_NOTHING"))
+    return tuple(reasons)

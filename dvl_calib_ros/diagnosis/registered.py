@@ -42,7 +42,7 @@ def check_clocks(recording: RecordedStreams, rotation_dvl_from_body: Array) -> N
     motion = _motion(recording)
     far = None if motion is None else far_clocks(motion, rotation_dvl_from_body)
     if far is not None:
-        raise InputError(f"{recording.name}: {far.says}")
+        raise InputError(f"{recording.name}: {far.reason.sentence}")
 
 
 def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:

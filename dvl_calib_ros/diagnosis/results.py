@@ -8,6 +8,7 @@ from enum import Enum
 from typing import Any
 
 from ..verdict.answering import Answering
+from ..verdict.reasons import Reason
 from .closure import Gap
 from .dvl import DvlSeen
 from .noise_findings import NoiseFinding
@@ -44,14 +45,14 @@ class FoundEffect:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis(Answering):
-    """The whole answer. notes: on the data. series: for pictures, if they were asked for and there are any.
-    calibration: value, low, high of φ (rad) and δk, three of each, beside the effects. compared_axes: in words.
-    recordings: names and first stamps (ns). twins: of the recordings. dvl: as another simulator has to be told of it.
-    selection: the fits behind it, None where nothing could be fitted.
+    """The whole answer. reasons: the verdict first. notes: on the data. series: for pictures, if they were asked for
+    and there are any. calibration: value, low, high of φ (rad) and δk, three of each, beside the effects.
+    compared_axes: in words. recordings: names and first stamps (ns). twins: of the recordings. dvl: as another
+    simulator has to be told of it. selection: the fits behind it, None where nothing could be fitted.
     """
 
     verdict: DiagnosisVerdict
-    sentence: str
+    reasons: tuple[Reason, ...]
     gap: Gap
     effects: tuple[FoundEffect, ...]
     noise: tuple[NoiseFinding, ...]
@@ -68,12 +69,18 @@ class Diagnosis(Answering):
     dvl: DvlSeen | None = None
     selection: EffectSelection | None = field(default=None, repr=False, compare=False)
 
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        return " ".join(reason.full_sentence for reason in self.reasons)
+
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
     """The JSON of diagnosis.md."""
     gap = diagnosis.gap
     return {
         "verdict": diagnosis.verdict.value,
+        "reasons": [reason.as_dict() for reason in diagnosis.reasons],
         "gap": {
             "before_mps": gap.before,
             "after_mps": gap.after,

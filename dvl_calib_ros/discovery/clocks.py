@@ -23,6 +23,7 @@ from ..messages.decode import MessageDecoder
 from ..recordings.look import Look, Survey
 from ..recordings.recording import Recording
 from ..recordings.topics import Topics
+from ..verdict.reasons import Reason
 
 # A registration that leaves less than this share of the speed is one (17 degrees of misalignment); another reading of
 # the frames is taken for it if it leaves less than this share of what the first one leaves.
@@ -50,20 +51,20 @@ class FoundClocks:
     far: Far | None = None
 
     @property
-    def doubt(self) -> str:
-        """What no calibration can be done with, in words; else ''."""
+    def doubt(self) -> Reason | None:
+        """What no calibration can be done with."""
         if self.far is not None:
-            return self.far.says
+            return self.far.reason
         moves = self.registration.unsteady
         is_left = moves is not None and not MOVING & self.offsets.keys()
-        return f"{moves.says}: {moves.remedy}" if moves is not None and is_left else ""
+        return moves.reason if moves is not None and is_left else None
 
     def says(self) -> Iterator[str]:
         """Of each clock that is off how late it is, and what comes of it; one sentence each."""
         r = self.registration
         if r.unsteady is not None and not self.doubt:
             taken = ", ".join(f"{name} {self.offsets[name]:.13g}" for name in sorted(MOVING & self.offsets.keys()))
-            yield f"{r.unsteady.says}: taken off ({taken})"
+            yield f"{r.unsteady.reason.says}: taken off ({taken})"
         for name, late in r.offsets.items():
             if name in self.offsets:
                 done = f"taken off ({name} {late:.2f})"
@@ -72,7 +73,7 @@ class FoundClocks:
             else:
                 done = "not taken off"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
-            yield f"{r.told(name)}{which}: {done}"
+            yield f"{r.told(name).says}{which}: {done}"
         if r.apart.is_shown and not r.offsets:
             yield (
                 f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; whose clock is "

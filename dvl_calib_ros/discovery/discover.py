@@ -38,6 +38,7 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look, Survey
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
+from ..verdict.reasons import Reason, finding
 from . import choose
 from .clocks import FoundClocks, find_clocks, in_time
 from .gravity import Gravity
@@ -84,7 +85,7 @@ class Discovery:
     parameters: Parameters
     found: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    contradictions: tuple[str, ...] = ()
+    contradictions: tuple[Reason, ...] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
     agreement: Agreement | None = None
     reference_frame: VelocityFrame | None = None
@@ -109,12 +110,13 @@ class Discovery:
     @property
     def doubts(self) -> tuple[str, ...]:
         """What the user should not overlook."""
-        return (*self.contradictions, *self.notes)
+        return (*(each.sentence for each in self.contradictions), *self.notes)
 
     def document(self) -> dict[str, Any]:
         """Plain data, for JSON: topics, what was found, doubts."""
         topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
-        return {"topics": topics, "found": list(self.found), "doubts": list(self.doubts)}
+        codes = [each.as_dict() for each in self.contradictions]
+        return {"topics": topics, "found": list(self.found), "doubts": list(self.doubts), "contradictions": codes}
 
 
 def discover(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
@@ -174,7 +176,7 @@ class _Search:
         self._values: dict[str, Any] = {}
         self._found: list[str] = []
         self._notes: list[str] = list(self._tree.problems)
-        self._contradictions: list[str] = []
+        self._contradictions: list[Reason] = []
         self._mounting_because = ""
         self._chosen: Agreement | None = None
         self._readings: Readings  # of DVL and reference, once these are compared
@@ -287,8 +289,10 @@ class _Search:
     def _look_at_gravity(self, imu: Look) -> None:
         """Say where acceleration and orientation contradict what the IMU's data are taken for."""
         gravity, taken = Gravity.of(imu), self._parameters.replace(**self._values)
-        if gravity is not None and (said := gravity.says(rotation_from_rpy(taken.imu_rpy), taken.imu_frame)):
-            self._contradictions.append(f"{imu.topic}: {said}")
+        if gravity is not None and (
+            found := gravity.contradiction(imu.topic, rotation_from_rpy(taken.imu_rpy), taken.imu_frame)
+        ):
+            self._contradictions.append(found)
 
     def _know_heading(self, imu: Look) -> None:
         """How far the heading is to be believed, where the IMU says it."""
@@ -332,10 +336,7 @@ class _Search:
         frame = self._parameters.dvl_frame or dvl.frame_id
         if self._is_body_or_earth(dvl.frame_id) and not self._parameters.dvl_frame:
             self._values["dvl_frame"] = dvl.frame_id
-            self._contradictions.append(
-                f"{dvl.topic}: the DVL's messages carry frame {dvl.frame_id!r} and not one of its own; they are taken "
-                "as they are"
-            )
+            self._contradictions.append(finding("DVL_FRAME_NOT_OWN", topic=dvl.topic, frame=dvl.frame_id))
         placed = self._tree.placed(frame, base_frame)
         if placed is None and not self._is_body_or_earth(frame):
             like = self._tree.likely(choose.DVL_WORDS)
@@ -493,9 +494,7 @@ class _Search:
     def _is_in_body(self, found: Agreement) -> bool:
         if self._readings.is_in_body(found):
             return True
-        self._contradictions.append(
-            "DVL and reference agree as if both were in the body, and so they would if both were in the earth's frame"
-        )
+        self._contradictions.append(finding("BODY_OR_EARTH"))
         return False
 
     def _take(
@@ -520,10 +519,8 @@ class _Search:
                     f"gnss_frame:={name})"
                 )
             else:
-                self._contradictions.append(
-                    f"{reference.topic}: frame {reference.frame_id!r} says {declared.name}, but DVL and reference "
-                    f"agree only as {name}; taken so. To insist: -p gnss_frame:={declared.name}"
-                )
+                frame = {"frame": reference.frame_id, "declared": declared.name, "taken": name}
+                self._contradictions.append(finding("REFERENCE_FRAME_OTHER", topic=reference.topic, **frame))
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
         if reading.imu is not None and imu_frames:
@@ -542,9 +539,9 @@ class _Search:
                     level_left, _ = self._readings.registered(reading, rotation_from_rpy(level).T)
                     self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
         elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
+            given, fits = _degrees(rpy_from_rotation(known)), nominal_rpy(found)
             self._contradictions.append(
-                f"DVL and reference do not agree with the mounting {_degrees(rpy_from_rotation(known))}; they do with "
-                f"{_degrees(nominal_rpy(found))}: try -p mounting_rpy:={_option(nominal_rpy(found))}"
+                finding("MOUNTING_CONTRADICTED", given=given, found=_degrees(fits), option=_option(fits))
             )
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from ..calibration.frames import Array, rotation_from_quaternion
 from ..calibration.screening import unit_quaternions
 from ..recordings.look import Look
+from ..verdict.reasons import Reason, finding
 
 # Fewer samples, and an acceleration below this (m/s²), tell nothing.
 ENOUGH, LEAST = 20, 0.2
@@ -53,29 +54,24 @@ class Gravity(NamedTuple):
         """How many of the two, the body's up and the world's, are down if an IMU's data are meant so."""
         return int(float(rotation_body_from_imu[2] @ self.body) < -CLEARLY) + int(self._up(world) < -CLEARLY)
 
-    def says(self, rotation_body_from_imu: Array, world: str) -> str:
-        """What is wrong with how an IMU's data are taken, in words; else ''."""
+    def contradiction(self, topic: str, rotation_body_from_imu: Array, world: str) -> Reason | None:
+        """What is wrong with how the data of an IMU's topic are taken."""
         body_up, up = float(rotation_body_from_imu[2] @ self.body), self._up(world)
         if body_up < -CLEARLY and up < -CLEARLY:
-            return "the IMU's acceleration at rest points down, as gravity with the other sign: its driver has it wrong"
+            return finding("GRAVITY_SIGN", topic=topic)
         if body_up < -CLEARLY or up < -CLEARLY:
-            which = "body" if body_up < -CLEARLY else "world of its orientation"
-            return (
-                f"gravity is upside down in the {which}: the IMU is turned over, or its axes and its orientation are "
-                "of two conventions (imu_rpy, imu_frame)"
-            )
+            where = "body" if body_up < -CLEARLY else "world of its orientation"
+            return finding("GRAVITY_UPSIDE_DOWN", topic=topic, where=where)
         if self.across > TILTED and self.inverted < CLEARLY * self.across:
-            return (
-                "the data fit an IMU with an inverted attitude: only with quaternions inverted gravity points up "
-                f"(to {math.degrees(self.inverted):.1f}°, as they are to {math.degrees(self.across):.1f}°)"
-            )
+            tilts = {"inverted": math.degrees(self.inverted), "given": math.degrees(self.across)}
+            return finding("GRAVITY_FITS_INVERTED", topic=topic, **tilts)
         if self.across > math.sin(LEANS) and math.hypot(*self.world[:2].tolist()) > math.sin(LEANS):
-            return f"gravity is {math.degrees(math.acos(min(1.0, up))):.0f}° from up by the IMU's own orientation"
+            return finding("GRAVITY_LEANS", topic=topic, degrees=math.degrees(math.acos(min(1.0, up))))
         if abs(self.size - 1.0) < NEAR:
-            return "the IMU's acceleration at rest is 1 g and not 9.81 m/s²: its driver does not send SI units"
+            return finding("GRAVITY_IN_G", topic=topic)
         if abs(self.size / STANDARD - 1.0) > NEAR:
-            return f"the IMU's acceleration at rest is {self.size:.3g} m/s², which is not gravity"
-        return ""
+            return finding("GRAVITY_SIZE", topic=topic, size=self.size)
+        return None
 
     def _up(self, world: str) -> float:
         return float(self.world[2]) * (-1.0 if world == "ned" else 1.0)

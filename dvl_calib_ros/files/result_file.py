@@ -81,7 +81,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         "std_of_recording": _std_in_words(estimate, estimate.recording_std),
         "std_by_filter": _std_in_words(estimate, estimate.filter_std),
         **({} if verification is None else {"verification": verification_document(verification)}),
-        **({"suggestion": result.suggestion} if result.suggestion else {}),
+        **({"suggestion": result.suggestion.sentence} if result.suggestion else {}),
         **({"doubts": [each.as_dict() for each in result.doubts]} if result.doubts else {}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
         "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],

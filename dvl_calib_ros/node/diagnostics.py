@@ -156,8 +156,8 @@ def diagnose(
     status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
-        "why": selection.reason(calibrator.parameters),
-        "gnss": selection.gnss.reason,
+        "why": selection.reason(calibrator.parameters).sentence,
+        "gnss": selection.gnss.reason.sentence,
         "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
         **_estimate_values(estimate),

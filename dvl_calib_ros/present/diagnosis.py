@@ -10,10 +10,9 @@ import math
 import numpy as np
 
 from ..calibration.frames import Array
-from ..diagnosis.results import Diagnosis, DiagnosisVerdict
+from ..diagnosis.results import Diagnosis
 from ..diagnosis.series import DiagnosisSeries
 from ..effects.registry import EFFECTS
-from ..verdict.kinds import Severity
 from .document import (
     Answer,
     Cell,
@@ -37,13 +36,6 @@ from .document import (
 from .twin_table import twin_table
 
 BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
-SEVERITIES = {
-    DiagnosisVerdict.NO_GAP: Severity.ACCEPT,
-    DiagnosisVerdict.KNOWN: Severity.ACCEPT,
-    DiagnosisVerdict.AMBIGUOUS: Severity.MARGINAL,
-    DiagnosisVerdict.INSUFFICIENT_EXCITATION: Severity.MARGINAL,
-    DiagnosisVerdict.UNKNOWN: Severity.REJECT,
-}
 NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",
     "stale_samples": "samples that repeat the one before, as a share",
@@ -70,7 +62,7 @@ def diagnosis(d: Diagnosis) -> Document:
     return Document(
         title="Sim-to-real gap of the DVL",
         subtitle="" if d.series is None else ", ".join(d.series.recordings),
-        answer=Answer(d.verdict.value, SEVERITIES[d.verdict], [d.sentence, *found]),
+        answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found]),
         warnings=d.notes,
         sections=[
             Section("", [Numbers(_numbers(d))] if math.isfinite(d.gap.before) else []),

@@ -250,7 +250,7 @@ def _facts(run: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
     estimate = result.estimate
     missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
     return [
-        ("Model", f"{result.selected} ({result.selected_because}); {estimate.convergence.value}"),
+        ("Model", f"{result.selected} ({result.selected_because.sentence}); {estimate.convergence.value}"),
         *([("Angles", "against the IMU's heading and level")] if run.reference_frame in EARTH else []),
         ("Recorded", _when(result)),
         ("DVL data", run.dvl_data),
@@ -278,7 +278,7 @@ def _selected(run: Replayed) -> list[tuple[str, str]]:
     """For who asks for details."""
     dvl, pairing = run.result.counts["dvl"], run.result.counts["pairing"]
     return [
-        ("selected", f"{run.result.selected} ({run.result.selected_because})"),
+        ("selected", f"{run.result.selected} ({run.result.selected_because.sentence})"),
         ("dvl data", run.dvl_data),
         ("samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} with a reference velocity at their time"),
     ]

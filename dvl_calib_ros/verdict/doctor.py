@@ -144,7 +144,7 @@ _KINDS = (
     ),
     Kind(
         "DOCTOR_FRAMES",
-        "{said}",
+        "{says}",
         "What the recording declares and what its data show are not the same.",
         "check frames and transforms; the option named insists",
     ),

@@ -45,7 +45,7 @@ FINDINGS = (
     ),
     Kind(
         "CLOCK_TAKEN_OFF",
-        "{said}: taken off ({values}); the calibration began anew with it, by what came from then on",
+        "{says}: taken off ({values}); the calibration began anew with what came from then on",
         "Two looks at velocities and turns agreed on it. What came before is not kept well enough to be used again.",
         "set that clock right, or give what was found as a parameter, which then stands",
     ),
@@ -291,7 +291,7 @@ FINDINGS = (
     ),
     Kind(
         "CONFIGURATION_WRONG",
-        "{says}, not the configuration given",
+        "the data contradict the configuration: {says}",
         "The reference is not in the frame, or the DVL not mounted, as the parameters say: another frame or a rotation "
         "by a large angle fits the samples, gated ones with them, much better.",
         "stop, set it, and begin anew",

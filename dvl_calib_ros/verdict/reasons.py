@@ -12,9 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from .comparisons import COMPARISONS
+from .configurations import CONFIGURATIONS
+from .diagnoses import DIAGNOSES
 from .doctor import DOCTOR
 from .findings import FINDINGS
 from .kinds import Kind, Severity
+from .selections import SELECTIONS
 from .verdicts import VERDICTS
 
 _FIELD = re.compile(r"\{[^{}]*\}")
@@ -24,6 +27,9 @@ TABLES: Mapping[str, Sequence[Kind]] = {
     "doctor": DOCTOR,
     "verdicts": VERDICTS,
     "comparisons": COMPARISONS,
+    "configurations": CONFIGURATIONS,
+    "selections": SELECTIONS,
+    "diagnoses": DIAGNOSES,
 }
 KINDS: Mapping[str, Kind] = {kind.code: kind for kinds in TABLES.values() for kind in kinds}
 # The worst first.
@@ -32,7 +38,10 @@ _WORST_FIRST = (Severity.ERROR, Severity.REJECT, Severity.MARGINAL, Severity.WAR
 
 @dataclass(frozen=True)
 class Reason:
-    """Something that was found: an entry of the tables with what was put in. ``str()`` of it is what people read."""
+    """Something that was found: an entry of the tables with what was put in. ``str()`` of it is what people read.
+
+    What is put in may be a reason as well: then its sentence is read in its place.
+    """
 
     code: str
     severity: Severity
@@ -41,12 +50,12 @@ class Reason:
     @property
     def says(self) -> str:
         """What is the matter."""
-        return KINDS[self.code].says.format(**self.numbers)
+        return KINDS[self.code].says.format(**self._words)
 
     @property
     def remedy(self) -> str:
         """What to do; '' where there is nothing to do."""
-        return KINDS[self.code].remedy.format(**self.numbers)
+        return KINDS[self.code].remedy.format(**self._words)
 
     @property
     def page(self) -> str:
@@ -62,6 +71,15 @@ class Reason:
     def full_sentence(self) -> str:
         """`sentence` with a capital and a full stop."""
         return full(self.sentence)
+
+    @property
+    def _words(self) -> dict[str, Any]:
+        return {name: each.sentence if isinstance(each, Reason) else each for name, each in self.numbers.items()}
+
+    @property
+    def causes(self) -> tuple[Reason, ...]:
+        """The reasons that are put into it."""
+        return tuple(each for each in self.numbers.values() if isinstance(each, Reason))
 
     def __str__(self) -> str:
         remedy = self.remedy
@@ -79,7 +97,8 @@ class Reason:
             "says": self.says,
             "remedy": self.remedy,
             "page": self.page,
-            "numbers": {name: _plain(value) for name, value in self.numbers.items()},
+            "numbers": {name: _plain(value) for name, value in self._words.items()},
+            **({"causes": [each.as_dict() for each in self.causes]} if self.causes else {}),
         }
 
 

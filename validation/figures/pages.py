@@ -31,7 +31,19 @@ PRINTED: dict[str, tuple[str, ...]] = {
     "parameters": (),
     **{
         name: (f"--{name}",)
-        for name in ("models", "effects", "drivers", "findings", "doctor", "verdicts", "comparisons", "commands")
+        for name in (
+            "models",
+            "effects",
+            "drivers",
+            "findings",
+            "doctor",
+            "verdicts",
+            "comparisons",
+            "configurations",
+            "selections",
+            "diagnoses",
+            "commands",
+        )
     },
 }
 

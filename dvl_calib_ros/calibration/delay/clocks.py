@@ -12,6 +12,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...verdict.reasons import Reason
 from ..frames import Array
 from ..heading_deviation import HeadingDeviation, heading_deviation
 from ..left_over import LeftOver, left_over
@@ -146,7 +147,7 @@ class Looked(NamedTuple):
 
     blocks: int = 0
     registration: Registration | None = None
-    configuration: str = ""
+    configuration: Reason | None = None
     rest: Rest | None = None
 
 
@@ -174,7 +175,7 @@ class KeptClocks:
     def end_day(self) -> None:
         """The blocks from here on are of another day, whose clocks may be others."""
         found = self.looked()
-        self._over = found if found.configuration or self.says(found) else None
+        self._over = found if found.configuration or self.contradiction(found) else None
         self._seen.clear()
         self._blocks, self._latest = 0, Looked()
 
@@ -194,9 +195,9 @@ class KeptClocks:
             self._latest = self._look(posterior)
         return self._latest
 
-    def says(self, looked: Looked) -> str:
-        """What clocks fit what was seen, in words, where one is off; else ''."""
-        return "" if looked.registration is None else looked.registration.says(self._parameters)
+    def contradiction(self, looked: Looked) -> Reason | None:
+        """What clocks fit what was seen, where one is off."""
+        return None if looked.registration is None else looked.registration.contradiction(self._parameters)
 
     def _look(self, posterior: Posterior | None) -> Looked:
         motion = self._seen.motion() if len(self._seen) >= ENOUGH else None

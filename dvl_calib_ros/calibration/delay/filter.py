@@ -17,6 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from ...verdict.reasons import Reason
 from ..assembly import gate_of, prior
 from ..bank import ModelCounts
 from ..estimator import Estimator, EstimatorSetup
@@ -102,8 +103,8 @@ class DelayFilter(Estimator):
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # asked for by each model's verification
         # asked for with each message
         self._of_recording: tuple[Posterior, Registration | None, GaussianState] | None = None
-        self._suggested: tuple[Outcome, str] | None = None
-        self._suggested_so_far: tuple[Outcome, str] | None = None
+        self._suggested: tuple[Outcome, Reason | None] | None = None
+        self._suggested_so_far: tuple[Outcome, Reason | None] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
         for track in (aligner.reference, aligner.imu):
             track.needed_from[self] = LONG_AGO_NS  # until the first block is known
@@ -206,8 +207,8 @@ class DelayFilter(Estimator):
         return GaussianState(np.concatenate([base.x, prior.x[n:]]), p)
 
     @property
-    def suggestion(self) -> str:
-        """What configuration the data fit, in words, where the one given is grossly wrong; else ''."""
+    def suggestion(self) -> Reason | None:
+        """What configuration the data fit, where the one given is grossly wrong."""
         newest = self._newest()
         if self._suggested is None or self._suggested[0] is not newest:  # asked for more often than there is a block
             self._suggested = newest, self._solver.suggestion()
@@ -239,7 +240,7 @@ class DelayFilter(Estimator):
         return self._told.looked.registration
 
     @property
-    def suggestion_so_far(self) -> str:
+    def suggestion_so_far(self) -> Reason | None:
         """The same, where a clock is late as it was seen a little ago: nobody waits for a look at all there is."""
         newest = self._newest()
         if self._suggested_so_far is None or self._suggested_so_far[0] is not newest:
@@ -266,9 +267,9 @@ class DelayFilter(Estimator):
             found.append(f"DVL stamps {abs(x[DELAY]):.2f} ± {said[DELAY]:.2f} s {late}")
         turns = float(posterior.by_lever_arm.max())
         if turns > chi_square:
-            return Evidence(turns, f"takes the lever arm as known, and {_turns_in_words(posterior)}")
+            return Evidence(turns, "ARM_TAKEN_AS_KNOWN", {"turns": _turns_in_words(posterior)})
         shown = " and ".join(found) or "a lever arm or a delay"
-        return Evidence(chi_square, f"does not explain the data, which show {shown}")
+        return Evidence(chi_square, "ARM_OR_DELAY_SHOWN", {"shown": shown})
 
     @property
     def doubt(self) -> str:
@@ -529,4 +530,4 @@ class DelayFilter(Estimator):
 def _turns_in_words(posterior: Posterior) -> str:
     index = int(np.argmax(posterior.by_lever_arm))
     angle, turn = ("roll", "pitch", "yaw")[index], math.degrees(posterior.turned[index])
-    return f"in this motion 0.1 m of it is {0.1 * turn:.1f}° of {angle}"
+    return f"on this track a 0.1 m error of the lever arm looks like {abs(0.1 * turn):.1f}° of {angle}"

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...verdict.reasons import Reason, finding
 from ..attitude_rates import AttitudeRates
 from ..bank import ModelCounts
 from ..dvl_stream import DvlStream
@@ -119,22 +120,19 @@ class BlockSolver:
         counts = ModelCounts(bank.used, bank.gated + self._spikes, bank.mean_nis, 3.0, self.restarted)
         return Outcome(bank.prior, self._posterior, counts, self._claims, has_rows)
 
-    def suggestion(self, *, fresh: bool = True) -> str:
-        """What configuration the data fit, in words, where the one given is grossly wrong; else ''.
+    def suggestion(self, *, fresh: bool = True) -> Reason | None:
+        """What configuration the data fit, where the one given is grossly wrong.
 
         fresh: by all that is known, which takes a while; else as they were looked at on the way, live.
         """
-        if own := self._dvl_stream.says():
+        if own := self._dvl_stream.contradiction():
             return own
         looked = self._clocks.looked(self._posterior, fresh=fresh)
-        contradiction, found = self._attitude_rates.says(), looked.configuration
+        contradiction, found = self._attitude_rates.contradiction(), looked.configuration
         if contradiction:  # of what follows from it only what mends it is worth a word
-            return f"{contradiction}; {found}" if "imu_frame" in found else contradiction
-        if found:
-            return found
-        if shared := self._shared_noise.says():
-            return shared
-        return self._clocks.says(looked)
+            is_mended = found is not None and found.code in ("IMU_LOOKS_NED", "REFERENCE_OR_IMU_NED")
+            return finding("TWO_CONTRADICTIONS", one=contradiction, other=found) if is_mended else contradiction
+        return found or self._shared_noise.contradiction() or self._clocks.contradiction(looked)
 
     def registration(self) -> Registration | None:
         """How the instruments stand; None where the data do not show it."""

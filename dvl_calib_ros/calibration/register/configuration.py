@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...verdict.reasons import Reason, finding
 from ..delay.rows import attitude_at
 from ..directions import Directions
 from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
@@ -54,23 +55,20 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 def fitting_configuration(
     motion: MotionStreams, declared: VelocityFrame, nominal: Array, lever_arm: Array, given: Registration | None
-) -> str:
-    """What fits much better than what is configured, in words; '' if nothing does, or the configuration fits.
+) -> Reason | None:
+    """What fits much better than what is configured; None if nothing does, or the configuration fits.
 
     declared: the frame that the reference is said to be in. nominal: rotation_body_from_dvl (3, 3). given: the motion
     registered with it.
     """
     if not all(motion.measured):
-        return ""
+        return None
     if motion.has_attitude:
         directions = Directions()
         rotation, known = attitude_at(motion.imu, motion.dvl.times, GAP_S)
         directions.add((motion.dvl.velocity @ nominal.T)[known], rotation[known])
         if directions.turn_with_heading:
-            return (
-                "the DVL's velocities turn with the heading, as those in the earth's frame do (let its driver give "
-                "them in its own axes)"
-            )
+            return finding("DVL_TURNS_WITH_HEADING")
     curves = Curves(motion)
     as_given = _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given is not None else 1.0
     if as_given < WRONG_FROM:
@@ -88,11 +86,11 @@ def fitting_configuration(
         if some := [one for one in each if one is not None]:
             found[frame] = min(some, key=lambda one: one.level)
     if not found:
-        return ""
+        return None
     # of two that fit alike the frame given is the likelier
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
-        return ""
+        return None
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
 
@@ -125,7 +123,9 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _flipped(motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration) -> str:
+def _flipped(
+    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
+) -> Reason | None:
     """Whether y and z turned round explain more without a lever arm than the axes given do with any.
 
     A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
@@ -140,48 +140,46 @@ def _flipped(motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: A
 
     turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM, FAR_WORSE * registered.spread)
     if turned is None or turned.level > AS_WELL * registered.spread:
-        return ""
+        return None
     if abs(registered.reference.late) < HELD_TO_S and abs(registered.dvl.late) < LATE_S[-1]:  # found already
         given = fit(0.0, registered.dvl.late, nominal, (REFERENCE,))
     else:
         given = fitted(nominal, (REFERENCE,))
     if given is None:
-        return ""
+        return None
     # of the same samples but for those at the ends; outliers, and a level that is told by the middle one, judge nothing
     most = (OUTLYING * max(min(given.level, turned.level), 1e-6)) ** 2
     as_given, as_turned = (float(np.minimum(each.squares, most).mean()) for each in (given, turned))
     gain = 3.0 * turned.rows * math.log(max(as_given, 1e-12) / max(as_turned, 1e-12))
     # read at other times, the DVL's noise is another one: what is left differs by that alone
     by_chance = math.sqrt(6.0 * turned.rows) if abs(given.dvl_late - turned.dvl_late) > ALIKE_S else 0.0
-    return "the DVL's axes look forward-right-down (dvl_axes: frd)" if gain > CLEARLY + by_chance else ""
+    return finding("DVL_AXES_FRD") if gain > CLEARLY + by_chance else None
 
 
-def _named(declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool) -> str:
+def _named(
+    declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool
+) -> Reason | None:
     """also_turned: the axes of the body turned round fit as well."""
     same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
     if same_frame and as_given:  # a large misalignment, for the calibration to find
-        return ""
-    frame, body = best.value, VelocityFrame.BODY
-    about = (
-        [] if same_frame else [f"the reference looks like {frame.upper() if best is not body else 'the body frame'}"]
-    )
-    parameters: dict[str, object] = {} if same_frame else {"gnss_frame": frame}
+        return None
+    body = VelocityFrame.BODY
+    frame = {"name": "the body frame" if best is body else best.value.upper(), "frame": best.value}
     earth = body not in (best, declared)
-    otherwise = ""
+    if as_given and earth and also_turned:
+        return finding("REFERENCE_OR_IMU_NED", **frame)
     if as_given:  # the frame explains it
-        if earth and not same_frame and also_turned:
-            otherwise = ", or the IMU's orientation looks like NED (imu_frame: ned): only sway tells these apart"
-    elif not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
-        about, parameters = ["the IMU's orientation looks like NED, forward-right-down"], {"imu_frame": "ned"}
-    elif angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        about.append("the DVL's axes look forward-right-down")
-        parameters["dvl_axes"] = "frd"
+        return finding("REFERENCE_LOOKS", **frame)
+    if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
+        return finding("IMU_LOOKS_NED")
+    if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
+        turned = finding("DVL_AXES_FRD")
     else:
-        rpy = [round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(_as_drawn(rotation))]
-        about.append(f"the data fit mounting_rpy {' '.join(f'{angle:.3g}' for angle in rpy)}")
-        parameters["mounting_rpy"] = rpy
-    remedy = ", ".join(f"{name}: {value}" for name, value in parameters.items())
-    return f"{' and '.join(about)} ({remedy}){otherwise}"
+        rpy = (round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(_as_drawn(rotation)))
+        turned = finding("MOUNTING_FITS", **dict(zip(("roll", "pitch", "yaw"), rpy, strict=True)))
+    if same_frame:
+        return turned
+    return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
 
 
 def _as_drawn(rotation: Array) -> Array:

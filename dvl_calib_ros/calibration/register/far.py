@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...verdict.reasons import Reason, finding
 from ..delay.rows import attitude_at
 from ..frames import Array
 from ..robust import median
@@ -37,12 +38,11 @@ class Far(NamedTuple):
     late: float
 
     @property
-    def says(self) -> str:
-        """In words, with the remedy."""
+    def reason(self) -> Reason:
+        """What is said of it."""
         way = "later" if self.late > 0.0 else "earlier"
-        return (
-            f"{self.whose} stamps are about {abs(self.late):.0f} s {way} than {self.others}; up to {LONGEST_S:.0f} s "
-            "can be found and taken off: set that clock right, or correct the stamps in the bag"
+        return finding(
+            "CLOCK_FAR", whose=self.whose, seconds=abs(self.late), way=way, others=self.others, limit=LONGEST_S
         )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ...verdict.reasons import Reason, finding
 from ..frames import Array
 from ..parameters import Parameters
 from .coarse import LONGEST_S, places
@@ -149,27 +150,26 @@ class Registration:
         is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
         return {} if is_little else found
 
-    def told(self, name: str) -> str:
-        """Whose stamps are how late, in words, by the parameter that takes it off."""
+    def told(self, name: str) -> Reason:
+        """Whose stamps are how late, by the parameter that takes it off."""
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference, "imu_time_offset": self.imu}
         if not self.is_turned and name == "reference_time_offset":
             clocks[name] = replace(self.apart, late=-self.apart.late)
         clock = clocks[name]
-        way = "late" if clock.late > 0.0 else "early"
-        return f"{OFFSETS[name]} stamps are {abs(clock.late):.2f} ± {clock.std:.2f} s {way}"
+        return finding("CLOCK_OFF", whose=OFFSETS[name], seconds=abs(clock.late), std=clock.std, way=_way(clock))
 
-    def says(self, parameters: Parameters) -> str:
-        """What configuration would fit, in words, where a clock beside the DVL's is off beyond doubt; else ''."""
-        imu = f"imu_time_offset: {round(parameters.imu_time_offset + self.imu.late, 2):g}"
+    def contradiction(self, parameters: Parameters) -> Reason | None:
+        """What the data fit, where a clock beside the DVL's is off beyond doubt."""
         if self.unsteady is not None:
-            return f"{self.unsteady.says} ({self.unsteady.remedy})"
-        if self.imu.is_shown:
-            return f"the data fit an IMU whose stamps are {_late(self.imu)} ({imu})"
-        if not self.reference.is_shown:
-            return ""
-        of_reference = f"reference_time_offset: {round(parameters.reference_time_offset + self.reference.late, 2):g}"
-        dvl = f"whose stamps are {_late(self.dvl)}" if self.dvl.is_shown else "that is in time"
-        return f"the data fit a reference whose stamps are {_late(self.reference)}, and a DVL {dvl} ({of_reference})"
+            return self.unsteady.reason
+        name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
+        if not clock.is_shown:
+            return None
+        offset = round(getattr(parameters, name) + clock.late, 2)
+        off = {"seconds": abs(clock.late), "way": _way(clock), "parameter": name, "offset": offset}
+        if clock is self.reference and self.dvl.is_shown:
+            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.late), dvl_way=_way(self.dvl), **off)
+        return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
 
 
 def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
@@ -336,8 +336,8 @@ def _is_possible(fitted: Fitted) -> bool:
     return bool(np.isfinite(fitted.x).all() and np.abs(late).max() <= LONGEST_S)
 
 
-def _late(clock: Clock) -> str:
-    return f"{abs(clock.late):.2f} s {'late' if clock.late > 0.0 else 'early'}"
+def _way(clock: Clock) -> str:
+    return "late" if clock.late > 0.0 else "early"
 
 
 def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...verdict.reasons import Reason, finding
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates
 from ..frames import Array
 from ..samples import Mask
@@ -48,24 +49,16 @@ class Unsteady:
     std: float = 0.0
 
     @property
-    def says(self) -> str:
-        """In words, without the remedy."""
-        whose = f"the {self.whose.upper() if self.whose != 'reference' else self.whose}'s clock"
-        if not self.whose:
-            whose = "one of the clocks"
+    def reason(self) -> Reason:
+        """Whose clock moves, with the remedy."""
+        whose = {"dvl": "the DVL's", "imu": "the IMU's", "reference": "the reference's", "": "one"}[self.whose]
+        ppm = {"ppm": 1e6 * self.drift, "std": 1e6 * self.std}
+        if self.drift and self.whose == "dvl":
+            return finding("CLOCK_DRIFTS_DVL", drift=self.drift, **ppm)
         if self.drift:
-            return f"{whose} drifts by {1e6 * self.drift:.0f} ± {1e6 * self.std:.0f} ppm beside the others"
+            return finding("CLOCK_DRIFTS", whose=whose, **ppm)
         way = "ahead" if self.leap > 0.0 else "back"
-        return f"{whose} leaps {way} by {abs(self.leap):.2f} ± {self.std:.2f} s after {self.at:.0f} s"
-
-    @property
-    def remedy(self) -> str:
-        """What to do about it."""
-        if self.leap:
-            return "cut the recording there, and calibrate with either part"
-        return "set the clocks by one source" + (
-            f", or dvl_clock_drift: {self.drift:.2g}" if self.whose == "dvl" else ""
-        )
+        return finding("CLOCK_LEAPS", whose=whose, way=way, seconds=abs(self.leap), std=self.std, at=self.at)
 
     def timed(self, motion: MotionStreams, fit: MotionFit, x: Array, rotation: Array, level: float) -> Unsteady:
         """A leap ahead at the hole that it leaves in the stamps, if there is just one; else at the time at which the

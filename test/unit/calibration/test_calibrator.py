@@ -266,7 +266,7 @@ def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expec
     auto, iac = (calibrate(outage, Parameters(model=model, **given)) for model in ("auto", "iac"))
     assert [segment.model for segment in iac.selection.segments] == [*expected, *expected]
     assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in auto.selection.segments]
-    assert iac.result().selected_because == "iac: GNSS is available"
+    assert iac.result().selected_because.sentence == "iac: GNSS is available"
     for name in MODELS:  # what is selected changes no estimate
         np.testing.assert_array_equal(iac.state(name).x, auto.state(name).x)
 

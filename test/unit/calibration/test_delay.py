@@ -125,7 +125,7 @@ def test_what_the_run_does_not_show_is_not_claimed_and_g2_is_g1(how):
     assert "slowing down" in shown["time_offset"].missing
 
 
-ON_A_CIRCLE = "in this motion 0.1 m of it is 0.6° of yaw"
+ON_A_CIRCLE = "on this track a 0.1 m error of the lever arm looks like 0.6° of yaw"
 
 
 def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_what_would_help():
@@ -149,7 +149,7 @@ def test_on_a_circle_at_changing_speed_auto_takes_the_model_whose_sigma_knows_of
     assert verification.verdict is not Severity.ACCEPT and "LEVER_ARM_NOT_SHOWN" in [
         each.code for each in verification.reasons
     ]
-    assert f"G1 takes the lever arm as known, and {ON_A_CIRCLE}" in calibrator.result().selected_because
+    assert calibrator.result().selected_because.numbers["why"].code == "ARM_TAKEN_AS_KNOWN"
     g1, g2 = calibrator.estimate("G1"), calibrator.estimate("G2")
     assert abs(g1.state[2]) > 20.0 * g1.filter_std[2] and abs(g1.state[2]) < 4.0 * g1.std[2]
     assert abs(g2.state[2]) < 3.0 * g2.std[2]
@@ -162,17 +162,17 @@ def test_why_g2_is_stayed_with_is_said_in_whole_sentences(times_more):
     x, p = filtered.posterior.state
     nothing = replace(filtered.posterior, state=GaussianState(0.1 * x, p), by_lever_arm=np.zeros(3))
     filtered._posterior = replace(nothing, by_lever_arm=np.array([0.0, 0.0, times_more]))
-    assert filtered.evidence.found == f"takes the lever arm as known, and {ON_A_CIRCLE}"
+    assert filtered.evidence[1:] == ("ARM_TAKEN_AS_KNOWN", {"turns": ON_A_CIRCLE})
     filtered._posterior = nothing
-    assert not filtered.evidence.found.endswith(" ")
+    assert filtered.evidence.numbers["shown"].strip()
 
 
 def test_auto_takes_g2_when_the_data_call_for_it_and_says_why():
     calibrator = found(-1.4)
     result = calibrator.result()
     assert result.selected == "G2"
-    assert "lever arm of x -1." in result.selected_because
-    assert "s early" in result.selected_because
+    assert "lever arm of x -1." in result.selected_because.sentence
+    assert "s early" in result.selected_because.sentence
     assert [segment.model for segment in result.segments][-2:] == ["G1", "G2"]
 
 

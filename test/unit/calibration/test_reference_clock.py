@@ -11,6 +11,7 @@ from test_delay import LEVER_ARM, NOISE, late
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.samples import ImuSample, ReferenceSample
+from dvl_calib_ros.verdict.reasons import Reason
 
 
 def stamped_late(samples, kind, seconds):
@@ -29,7 +30,7 @@ def found(dvl: float = 0.0, reference: float = 0.0, imu: float = 0.0) -> Calibra
 
 @pytest.mark.parametrize("dvl", [0.0, -1.4, 0.9])
 def test_a_late_dvl_is_no_late_reference(dvl):
-    assert found(dvl=dvl).suggestion == ""
+    assert found(dvl=dvl).suggestion is None
     assert found(dvl=dvl).verification("G2").verdict.value == "accept"
 
 
@@ -41,37 +42,37 @@ def test_a_late_reference_is_named_and_the_lever_arm_that_it_bends_is_rejected(r
     assert abs(bent) > 0.2
     way = "late" if reference > 0.0 else "early"
     said = calibrator.suggestion
-    assert said.startswith("the data fit a reference whose stamps are")
-    assert f"{way}, and a DVL that is in time" in said
+    assert said is not None and said.code == "CLOCK_LATE"
+    assert said.numbers["whose"] == "the reference's" and said.numbers["way"] == way
     assert offset_named(said, "reference_time_offset") == pytest.approx(reference, abs=0.05)
     verification = calibrator.verification("G2")
     assert verification.verdict.value == "reject"
-    assert f"{said}, not the configuration given" in verification.reasons[0].sentence
+    assert verification.reasons[0].causes == (said,) and said.sentence in verification.reasons[0].sentence
 
 
-def offset_named(sentence: str, parameter: str) -> float:
-    return float(sentence.split(f"{parameter}: ")[1].rstrip(")"))
+def offset_named(said: Reason | None, parameter: str) -> float:
+    assert said is not None and said.numbers["parameter"] == parameter
+    return float(said.numbers["offset"])
 
 
 def test_what_it_says_makes_the_calibration_right():
     samples = stamped_late(late(0.0), ReferenceSample, 0.6)
     offset = offset_named(found(reference=0.6).suggestion, "reference_time_offset")
     calibrator = calibrate(samples, NOISE.replace(reference_time_offset=offset), verified=True)
-    assert calibrator.suggestion == ""
+    assert calibrator.suggestion is None
     assert calibrator.verification("G2").verdict.value == "accept"
     np.testing.assert_allclose(calibrator.estimate("G2").state[8:10], LEVER_ARM[:2], atol=0.1)
 
 
 def test_two_late_clocks_are_told_apart():
     said = found(dvl=-0.5, reference=0.6).suggestion
-    assert "a reference whose stamps are 0.6" in said
-    assert "a DVL whose stamps are 0.4" in said or "a DVL whose stamps are 0.5" in said
-    assert "early" in said
+    assert said is not None and said.code == "CLOCKS_LATE" and said.numbers["dvl_way"] == "early"
+    assert (said.numbers["seconds"], said.numbers["dvl_seconds"]) == pytest.approx((0.6, 0.5), abs=0.1)
 
 
 def test_a_late_imu_is_not_put_down_to_the_two_others():
     said = found(imu=0.5).suggestion
-    assert said.startswith("the data fit an IMU whose stamps are") and "late" in said
+    assert said is not None and said.code == "CLOCK_LATE" and said.numbers["way"] == "late"
     assert offset_named(said, "imu_time_offset") == pytest.approx(0.5, abs=0.05)
 
 

@@ -18,7 +18,7 @@ from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.curve import Curve
-from dvl_calib_ros.diagnosis.diagnose import _sentence, _verdict, diagnose_recordings
+from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
@@ -237,7 +237,10 @@ def test_what_comes_and_goes_with_a_period_of_its_own_is_unknown():
         replace_velocity(s, tuple(np.array(s.velocity) + (0.06 if i % 55 < 22 else 0.0))) for i, s in enumerate(run.dvl)
     ]
     diagnosis = diagnose_recordings([recording_of(Run(bursts, run.gnss, run.imu))], Parameters())
-    assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and "no effect of the library" in diagnosis.sentence
+    assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and diagnosis.reasons[0].code in (
+        "GAP_UNKNOWN",
+        "GAP_PARTLY_UNKNOWN",
+    )
 
 
 def with_added(run: Run, added) -> RecordedStreams:
@@ -328,14 +331,17 @@ def test_a_straight_run_at_one_speed_makes_no_confident_claim_about_a_bias():
 
 def test_a_run_that_is_too_short_says_so():
     diagnosis = diagnosed(seconds=30.0)
-    assert diagnosis.verdict is DiagnosisVerdict.INSUFFICIENT_EXCITATION and "too few" in diagnosis.sentence
+    assert diagnosis.reasons[0].code == "GAP_TOO_SHORT"
 
 
 def test_a_constant_reference_is_insufficient():
     run = simulate(scenario())
     still = [replace_velocity(sample, (1.0, 0.0, 0.0)) for sample in run.gnss]
     diagnosis = diagnose_recordings([recording_of(Run(run.dvl, still, run.imu))], Parameters())
-    assert diagnosis.verdict is DiagnosisVerdict.INSUFFICIENT_EXCITATION and "constant" in diagnosis.sentence
+    assert (
+        diagnosis.verdict is DiagnosisVerdict.INSUFFICIENT_EXCITATION
+        and diagnosis.reasons[0].code == "GAP_REFERENCE_CONSTANT"
+    )
 
 
 # ------------------------------------------------------------------ its parts
@@ -552,5 +558,5 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
     found = _verdict(selection, nothing_left, gap, 1.0)
     assert found is verdict
     effect = FoundEffect("scale_drift", (), {}, 0.7, 1e-9)
-    sentence = _sentence(found, gap, [effect], nothing_left, [], 1)
-    assert ("what it follows does not show" in sentence) == (verdict is DiagnosisVerdict.UNKNOWN)
+    reasons = _reasons(found, gap, [effect], nothing_left, [], 1)
+    assert ("REST_FOLLOWS_NOTHING" in {each.code for each in reasons}) == (verdict is DiagnosisVerdict.UNKNOWN)

@@ -20,6 +20,7 @@ from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.reports import write_report
 from dvl_calib_ros.present.twin_section import spectrum
 from dvl_calib_ros.present.twin_table import rms
+from dvl_calib_ros.verdict.reasons import finding
 
 pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each
 
@@ -95,7 +96,9 @@ def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_pat
     found = diagnosis()
     series = replace(found.series, traces={})
     nothing = replace(
-        found, verdict=DiagnosisVerdict.NO_GAP, sentence="No gap.", effects=(), where=(), series=series,
+        found, verdict=DiagnosisVerdict.NO_GAP,
+        reasons=(finding("NO_GAP", noise=1.0, visible=2, tested=3),),
+        effects=(), where=(), series=series,
         gap=Gap(0.001, 0.001, 0.03, float("nan"), (float("nan"), float("nan"))),
     )  # fmt: skip
     page = page_of(tmp_path, nothing)
@@ -109,13 +112,14 @@ def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_pat
 def test_data_that_says_nothing_gives_a_page_without_numbers_and_pictures(tmp_path):
     nan = float("nan")
     found = diagnosis(
-        verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION, sentence="Too short.",
+        verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION,
+        reasons=(finding("GAP_TOO_SHORT", samples=3, seconds=4.0, wanted=60.0),),
         gap=Gap(nan, nan, nan, nan, (nan, nan)),
         effects=(), noise=(), where=(), untestable={}, minimum_detectable={}, series=None,
     )  # fmt: skip
     page = page_of(tmp_path, found)
     assert page.images() == [] and page.rows == []
-    assert "insufficient excitation Too short." in page.text and "nan" not in page.text
+    assert "insufficient excitation This recording cannot show a gap: 3 samples" in page.text and "nan" not in page.text
     assert found.next_manoeuvre in page.text
 
 

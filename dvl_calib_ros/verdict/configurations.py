@@ -1,0 +1,246 @@
+"""What the data fit where it is not what was configured or declared: of instruments, frames and clocks."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from .kinds import Kind, Severity
+
+_Said = partial(Kind, page="troubleshooting.md#what-the-data-fit-instead", severity=Severity.REJECT)
+CONFIGURATIONS = (
+    # the DVL
+    _Said(
+        "DVL_TWO_ON_TOPIC",
+        "two DVLs publish on one topic: the velocity alternates between two values",
+        "The difference from one message to the next changes its sign almost every time.",
+        "record one DVL per topic",
+    ),
+    _Said(
+        "DVL_ROUNDED",
+        "the DVL's velocity is rounded to {step:.2g} m/s, too coarse to find a mounting",
+        "Most values repeat exactly, and the step between two values is larger than the noise.",
+        "let the driver send all digits",
+    ),
+    _Said(
+        "DVL_AXIS_DEAD",
+        "the DVL measures nothing along {axes} (exactly 0 in every message)",
+        "The other axes are noisy, so this one is no simulation without noise.",
+        "check the driver's fields",
+    ),
+    _Said(
+        "DVL_TURNS_WITH_HEADING",
+        "the DVL's velocity turns with the heading, as a velocity in the earth's frame does",
+        "The driver has turned the velocity into ENU or NED.",
+        "let the driver send the velocity in the DVL's own axes",
+    ),
+    _Said(
+        "DVL_AXES_FRD",
+        "the DVL's axes look forward-right-down",
+        "The data fit much better with y and z negated.",
+        "set dvl_axes to frd",
+    ),
+    _Said(
+        "MOUNTING_FITS",
+        "the data fit mounting_rpy {roll:.3g} {pitch:.3g} {yaw:.3g}",
+        "The DVL is turned by far more than a misalignment.",
+        "set mounting_rpy to [{roll:.4g}, {pitch:.4g}, {yaw:.4g}]",
+    ),
+    # the reference
+    _Said(
+        "REFERENCE_LOOKS",
+        "the reference looks like {name}",
+        "The data fit much better with the reference taken in that frame.",
+        "set gnss_frame to {frame}",
+    ),
+    _Said(
+        "REFERENCE_OR_IMU_NED",
+        "the reference looks like {name} (gnss_frame: {frame}), or the IMU's orientation looks like NED (imu_frame: "
+        "ned); only sway tells which",
+        "Both explain the motion ahead alike.",
+        "check both drivers",
+    ),
+    _Said(
+        "REFERENCE_HOLDS_DVL",
+        "a filter made the reference from this DVL: the reference holds {percent:.0f} % of the DVL's own noise",
+        "Such a reference repeats the DVL's error and cannot judge it.",
+        "use the velocity of GNSS alone",
+    ),
+    # the IMU
+    _Said(
+        "IMU_LOOKS_NED",
+        "the IMU's orientation looks like NED, forward-right-down",
+        "The data fit much better with the orientation taken so.",
+        "set imu_frame to ned",
+    ),
+    _Said(
+        "IMU_NO_RATES",
+        "the IMU sends no angular velocity (exactly 0 in every message) while its orientation turns",
+        "A lever arm shows in turns only, and needs the angular velocity.",
+        "let the IMU's driver fill angular_velocity",
+    ),
+    _Said(
+        "IMU_CONTRADICTS",
+        "the IMU's orientation and its angular velocity contradict each other; the data fit {found}",
+        "The orientation is differentiated and compared with the angular velocity; no other sensor is needed.",
+        "correct the IMU's driver",
+    ),
+    _Said(
+        "IMU_CONTRADICTS_EITHER",
+        "the IMU's orientation and its angular velocity contradict each other; the data fit {found}, or {other}",
+        "As IMU_CONTRADICTS, where two conventions explain the data about as well.",
+        "correct the IMU's driver",
+    ),
+    # which conventions
+    _Said(
+        "HEADING_CLOCKWISE",
+        "a heading that turns against the angular velocity about z, as a compass counts it (clockwise)",
+        "An ENU yaw is 0 at east and grows to the left.",
+        "",
+    ),
+    _Said("RATES_NEGATED", "an angular velocity of the other sign", "All three axes are negated.", ""),
+    _Said(
+        "IMU_AXES_MIXED",
+        "an attitude and an angular velocity of which one is forward-left-up, the other forward-right-down",
+        "y and z are negated in one of them.",
+        "",
+    ),
+    _Said(
+        "RATES_EXCHANGED",
+        "an attitude that turns about x, y, z as the angular velocity's about {axes}",
+        "Axes are exchanged or negated.",
+        "",
+    ),
+    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "It has to be in rad/s.", ""),
+    _Said(
+        "RATES_SCALED",
+        "an angular velocity that is {times:.2g} times as large",
+        "It is not in rad/s, or of a wrong scale.",
+        "",
+    ),
+    _Said(
+        "RATES_IN_EARTH",
+        "an angular velocity about the axes of the earth ({frame}), not of the body",
+        "sensor_msgs/Imu has it about the IMU's own axes.",
+        "",
+    ),
+    _Said(
+        "ATTITUDE_INVERTED",
+        "an inverted attitude (a quaternion that turns the earth into the body)",
+        "sensor_msgs/Imu has the quaternion that turns the body into the earth.",
+        "",
+    ),
+    _Said(
+        "RATES_TURNED",
+        "an angular velocity whose axes are turned by {degrees:.0f}° against the attitude's",
+        "Two instruments in one message, or one that is corrected for its mounting and one that is not.",
+        "",
+    ),
+    # gravity
+    _Said(
+        "GRAVITY_SIGN",
+        "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
+        "sensor_msgs/Imu has the specific force, which points up at rest.",
+        "correct the IMU's driver",
+    ),
+    _Said(
+        "GRAVITY_UPSIDE_DOWN",
+        "{topic}: gravity is upside down in the {where}",
+        "The IMU is turned over, or its axes and its orientation are of two conventions.",
+        "set imu_rpy or imu_frame",
+    ),
+    _Said(
+        "GRAVITY_FITS_INVERTED",
+        "{topic}: the data fit an IMU with an inverted attitude: only with quaternions inverted gravity points up (to "
+        "{inverted:.1f}°, as they are to {given:.1f}°)",
+        "The quaternion turns the earth into the body, and not the body into the earth.",
+        "correct the IMU's driver",
+    ),
+    _Said(
+        "GRAVITY_LEANS",
+        "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
+        "Roll and pitch are wrong by that, or the acceleration is.",
+        "check the IMU's mounting in its driver",
+    ),
+    _Said(
+        "GRAVITY_IN_G",
+        "{topic}: the IMU's acceleration at rest is 1 g and not 9.81 m/s²",
+        "Its driver does not send SI units; the angular velocity may be in degrees as well.",
+        "let the driver send SI units",
+    ),
+    _Said(
+        "GRAVITY_SIZE",
+        "{topic}: the IMU's acceleration at rest is {size:.3g} m/s², which is not gravity",
+        "Gravity has been taken out, or the units are others.",
+        "let the driver send the acceleration with gravity, in m/s²",
+    ),
+    # clocks
+    _Said(
+        "CLOCK_OFF",
+        "{whose} stamps are {seconds:.2f} ± {std:.2f} s {way}",
+        "By what velocities and turns show, beside the IMU's clock.",
+        "",
+    ),
+    _Said(
+        "CLOCK_LATE",
+        "{whose} stamps are {seconds:.2f} s {way}",
+        "By what velocities and turns show; the other clocks are in time.",
+        "set {parameter} to {offset:g}",
+    ),
+    _Said(
+        "CLOCKS_LATE",
+        "the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
+        "Both are off beside the IMU's clock. A calibration finds the DVL's delay by itself.",
+        "set {parameter} to {offset:g}",
+    ),
+    _Said(
+        "CLOCK_DRIFTS",
+        "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
+        "It gains or loses time at a steady rate.",
+        "set the clocks by one source",
+    ),
+    _Said(
+        "CLOCK_DRIFTS_DVL",
+        "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
+        "It gains or loses time at a steady rate.",
+        "set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
+    ),
+    _Said(
+        "CLOCK_LEAPS",
+        "{whose} clock leaps {way} by {seconds:.2f} ± {std:.2f} s after {at:.0f} s",
+        "A clock was set during the recording.",
+        "cut the recording there, and calibrate with either part",
+    ),
+    _Said(
+        "CLOCK_FAR",
+        "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be found and taken off",
+        "Speeds agree only with that much between the stamps.",
+        "set that clock right, or correct the stamps in the bag",
+    ),
+    # what a recording declares
+    _Said(
+        "DVL_FRAME_NOT_OWN",
+        "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are taken as they "
+        "are",
+        "The driver may have turned the velocity into that frame.",
+        "check the driver's settings",
+    ),
+    _Said(
+        "BODY_OR_EARTH",
+        "DVL and reference agree as if both were in the body, and so they would if both were in the earth's frame",
+        "Without an attitude that turns, nothing tells the two apart.",
+        "set gnss_frame",
+    ),
+    _Said(
+        "REFERENCE_FRAME_OTHER",
+        "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}; taken so",
+        "The name of the frame and the data contradict each other.",
+        "to insist: -p gnss_frame:={declared}",
+    ),
+    _Said(
+        "MOUNTING_CONTRADICTED",
+        "DVL and reference do not agree with the mounting {given}; they do with {found}",
+        "A transform or parameter says another mounting than the data.",
+        "try -p mounting_rpy:={option}",
+    ),
+    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two of this list at once.", ""),
+)

@@ -1,0 +1,54 @@
+"""Why a model's estimate is the one: as a replay and /diagnostics say it of the selected model."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from .kinds import Kind, Severity
+
+_Said = partial(Kind, page="troubleshooting.md#why-a-model-is-selected", severity=Severity.ACCEPT)
+SELECTIONS = (
+    _Said("MODEL_NAMED", "set by parameter model", "The parameter names one model.", ""),
+    _Said("MODEL_CHOSEN", "{by}: {gnss}", "The parameter model is auto or iac, which go by GNSS.", ""),
+    _Said("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "As MODEL_CHOSEN, and by what the data show beside.", ""),
+    _Said("GNSS_AVAILABLE", "GNSS is available", "References keep coming (gnss_timeout).", ""),
+    _Said("GNSS_NOT_AVAILABLE", "GNSS is not available", "No reference has come for gnss_timeout.", ""),
+    _Said(
+        "GNSS_GOING",
+        "GNSS is available, going; waiting for gnss_hysteresis",
+        "No reference comes; the model changes if that lasts.",
+        "",
+    ),
+    _Said(
+        "GNSS_COMING",
+        "GNSS is not available, coming; waiting for gnss_hysteresis",
+        "References come again; the model changes if that lasts.",
+        "",
+    ),
+    _Said(
+        "HEADINGS_TELL_CURRENT",
+        "headings tell a current from the mounting",
+        "The mounting turns with the vehicle, a current does not.",
+        "",
+    ),
+    _Said(
+        "HEADINGS_TOO_FEW",
+        "no attitude over headings that would tell a current from the mounting",
+        "On one heading, or without an IMU, a current looks like a mounting.",
+        "",
+    ),
+    _Said("TRIM_KNOWN", "the trim is known", "The IMU gives roll and pitch, which a model with attitude uses.", ""),
+    _Said(
+        "ARM_TAKEN_AS_KNOWN",
+        "{model} takes the lever arm as known, and {turns}",
+        "The model that finds the lever arm has it in σ.",
+        "",
+    ),
+    _Said(
+        "ARM_OR_DELAY_SHOWN",
+        "{model} does not explain the data, which show {shown}",
+        "The model that finds lever arm and delay explains them.",
+        "",
+    ),
+    _Said("NO_EVIDENCE", "{model} explains the data as well", "Nothing speaks for another lever arm or a delay.", ""),
+)
