@@ -92,7 +92,8 @@ def test_where_dvl_and_reference_agree_it_is_the_imu(seconds):
     found = registered("free", 5.0, imu=seconds)
     assert found.imu.is_shown and found.imu.late == pytest.approx(seconds, abs=0.1)
     assert found.offsets == {"imu_time_offset": found.imu.late}
-    assert "an IMU whose stamps are" in found.says(Parameters())
+    said = found.contradiction(Parameters())
+    assert said is not None and (said.code, said.numbers["parameter"]) == ("CLOCK_LATE", "imu_time_offset")
 
 
 def test_a_reference_in_the_body_shows_only_the_difference_of_the_clocks():
