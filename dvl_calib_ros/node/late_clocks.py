@@ -30,10 +30,11 @@ class LateClocks:
         if before is None or not late or not _are_alike(before.taken_off, late):
             return None
         self._stands = True
-        said = ", ".join(registration.told(name).says for name in late)
         taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in late.items()}
-        values = ", ".join(f"{name}: {seconds:g}" for name, seconds in taken.items())
-        self.found = [finding("CLOCK_TAKEN_OFF", says=said, values=values)]
+        self.found = [
+            finding("CLOCK_TAKEN_OFF", clock=registration.told(name), parameter=name, value=seconds)
+            for name, seconds in taken.items()
+        ]
         return parameters.replace(**taken)
 
 

@@ -45,7 +45,7 @@ FINDINGS = (
     ),
     Kind(
         "CLOCK_TAKEN_OFF",
-        "{says}: taken off ({values}); the calibration began anew with what came from then on",
+        "{clock}: taken off ({parameter}: {value:g}); the calibration began anew with what came from then on",
         "Two looks at velocities and turns agreed on it. What came before is not kept well enough to be used again.",
         "set that clock right, or give what was found as a parameter, which then stands",
     ),

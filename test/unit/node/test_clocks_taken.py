@@ -11,6 +11,7 @@ from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.node.late_clocks import LateClocks
+from dvl_calib_ros.verdict.reasons import Reason, finding
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class Look:
     def taken_off(self):
         return {"reference_time_offset": self.late}
 
-    def told(self, name: str) -> str:
-        return f"{name} {self.late}"
+    def told(self, name: str) -> Reason:
+        return finding("CLOCK_OFF", whose=name, seconds=self.late, std=0.01, way="late")
 
 
 def test_two_looks_that_agree_take_a_clock_off_once():
@@ -32,6 +33,8 @@ def test_two_looks_that_agree_take_a_clock_off_once():
     assert clocks.parameters(Look(2.5), Parameters()) is None
     found = clocks.parameters(Look(2.52), Parameters())
     assert found is not None and found.reference_time_offset == 2.52
+    (said,) = clocks.found
+    assert said.code == "CLOCK_TAKEN_OFF" and said.numbers["value"] == 2.52 and said.causes[0].code == "CLOCK_OFF"
     assert clocks.parameters(Look(3.0), Parameters()) is clocks.parameters(Look(3.01), Parameters()) is None
 
 
