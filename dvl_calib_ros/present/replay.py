@@ -161,7 +161,7 @@ def _headline(run: Replayed) -> str:
     seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - run.pause_s
     return (
         f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} (model "
-        f"{result.selected}, {result.estimate.used} samples used of {seconds:.0f} s)"
+        f"{result.selected}, {seconds:.0f} s of data)"
     )
 
 
@@ -234,29 +234,41 @@ def _navigation(run: Replayed) -> list[Item]:
 
 def _not_shown(run: Replayed) -> list[Item]:
     """What the recording does not show, and the manoeuvre that would; one sentence per cause."""
-    causes: dict[str, list[str]] = {}
-    for entry in run.result.estimate.observability:
-        if entry.missing:
-            causes.setdefault(entry.missing, []).append(entry.axis)
     return [
-        Sentence(f"? {' and '.join(dict.fromkeys(axes))}: not shown by this recording; it needs {missing}")
-        for missing, axes in causes.items()
+        Sentence(f"? {axes}: not shown by this recording; it needs {missing}")
+        for missing, axes in not_shown(run.result).items()
     ]
+
+
+def not_shown(result: Result) -> dict[str, str]:
+    """The axes that the data do not show, by what they lack.
+
+    An angle is that about an axis of the vehicle, and says so where the DVL's own angle of the same name is shown: of a
+    DVL that is mounted across, the vehicle's roll is the DVL's pitch.
+    """
+    shown = {each.name for each in quantities(result) if each.shown}
+    causes: dict[str, dict[str, None]] = {}
+    for entry in result.estimate.observability:
+        if entry.missing:
+            axis = f"the vehicle's {entry.axis} axis" if entry.axis in shown else entry.axis
+            causes.setdefault(entry.missing, {})[axis] = None
+    return {missing: " and ".join(axes) for missing, axes in causes.items()}
 
 
 def _facts(run: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
     result = run.result
     dvl, pairing = result.counts["dvl"], result.counts["pairing"]
     estimate = result.estimate
-    missing = [f"{entry.axis}: shown by {entry.missing}" for entry in estimate.observability if entry.missing]
+    missing = [f"{axes}: shown by {lacking}" for lacking, axes in not_shown(result).items()]
+    used = "references" if MODELS[result.selected].estimator else "DVL samples"
     return [
         ("Model", f"{result.selected} ({result.selected_because.sentence}); {estimate.convergence.value}"),
         *([("Angles", "against the IMU's heading and level")] if run.reference_frame in EARTH else []),
         ("Recorded", _when(result)),
         ("DVL data", run.dvl_data),
         ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
-        ("Used by " + result.selected, f"{estimate.used}, {estimate.gated} gated"),
-        *([("Not shown yet", "; ".join(dict.fromkeys(missing)))] if missing else []),
+        ("Used by " + result.selected, f"{estimate.used} {used}, {estimate.gated} rejected as outliers"),
+        *([("Not shown yet", "; ".join(missing))] if missing else []),
         ("Bags", ", ".join(map(str, bags))),
     ]
 
