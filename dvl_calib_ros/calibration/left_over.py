@@ -35,8 +35,9 @@ BEND_S = 1.0
 STRETCH_S, ENOUGH = 15.0, 12
 # So many σ are no chance.
 SURELY = 6.0
-# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s).
-KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3)
+# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s), and of the
+# heading that change with it, once and twice around (rad).
+KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3 + [0.05] * 2 + [0.02] * 2)
 # ... and of what is looked for: shares of tilt, and bend (s²); a bias (m/s), looked for in means of so long, s.
 QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
@@ -126,7 +127,10 @@ def left_over(
     known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
     known[:, :, 5:8] = skew(rates)
     known[:, :, 8] = slope
-    known[:, :, 9:] = body_from_enu
+    known[:, :, 9:12] = body_from_enu
+    yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
+    around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)])
+    known[:, :, 12:] = known[:, :, 2, None] * around[:, None]
     quick = np.zeros((n, 3, 3))
     for axis in range(2):
         about = np.zeros((n, 3))

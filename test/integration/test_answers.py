@@ -162,6 +162,16 @@ def test_a_delay_that_moves_from_between_the_samples_of_a_noisy_reference_to_the
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [33042, 33058, 33059, 33141])
+def test_what_is_right_is_not_rejected_for_what_noise_and_compass_make(tmp_path, seed):
+    """A roll that is not shown was another mounting, a compass a bias of the DVL's, lasting noise a clock's drift."""
+    truth = write_survey(draw(seed), tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    assert run.verdict != "reject", run.reasons
+    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+
+
 def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_path):
     """Survey 23032: 73 degrees of roll were found where there are none, and the pitch came out 2.6 degrees off."""
     write_survey(draw(23032), tmp_path / "bag")

@@ -16,6 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..delay.rows import attitude_at
 from ..directions import Directions
+from ..extrinsics import turn_between
 from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..samples import VelocityFrame
 from .curves import GAP_S, Curves
@@ -44,6 +45,8 @@ AS_WELL = 1.1
 FAR_WORSE = 1.5 * AS_WELL
 # A registration explains the motion with a misalignment (rad) and a scale below these.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
+# So many σ of a turn are chance.
+BY_CHANCE = 3.0
 # From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
 LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
 # A clock that was held in time is so to this, s.
@@ -70,7 +73,7 @@ def fitting_configuration(
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
     curves = Curves(motion)
-    as_given = _left(given.left, given.scale, given.rotation_body_from_dvl, nominal) if given is not None else 1.0
+    as_given = 1.0 if given is None else _left(given.left, given.scale, _shown_turn(given, nominal))
     if as_given < WRONG_FROM:
         assert given is not None
         return _flipped(motion, curves, nominal, lever_arm, given)
@@ -106,11 +109,18 @@ def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
 
     left: as another measure than its own has it.
     """
-    return _left(one.left if left is None else left, float(one.x[SCALE]), one.rotation_body_from_dvl, nominal)
+    turned = angle_between(one.rotation_body_from_dvl, nominal)
+    return _left(one.left if left is None else left, float(one.x[SCALE]), turned)
 
 
-def _left(left: float, scale: float, rotation: Array, nominal: Array) -> float:
-    turned = angle_between(rotation, nominal)
+def _shown_turn(given: Registration, nominal: Array) -> float:
+    """By what angle (rad) a registration is turned from the mounting given, but for what chance turns it by: a level
+    vehicle hardly shows its roll."""
+    about = np.abs(turn_between(nominal, given.rotation_body_from_dvl))
+    return float(np.linalg.norm(np.maximum(about - BY_CHANCE * given.turn_std, 0.0)))
+
+
+def _left(left: float, scale: float, turned: float) -> float:
     is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
     return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
 

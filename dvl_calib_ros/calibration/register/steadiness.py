@@ -132,7 +132,12 @@ def unsteady(times: Array, stretches: Sequence[Fitted], is_turned: bool) -> Unst
     states = [*range(N)[ARM], APART, LATE]
     seen = np.array([each.x[states] for each in stretches])
     lags = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
-    weight = np.linalg.inv(np.array([each.p[np.ix_(states, states)] for each in stretches]) + lags)
+    # of a stretch blocks of time are few: noise that lasts shows in what is left
+    lasting = [np.maximum(each.inflation / each.raised[states], 1.0) for each in stretches]
+    p = np.array(
+        [each.p[np.ix_(states, states)] * np.outer(*[by] * 2) for each, by in zip(stretches, lasting, strict=True)]
+    )
+    weight = np.linalg.inv(p + lags)
     names = DIRECTIONS if is_turned else {"dvl": DIRECTIONS["dvl"]}
     everywhere = np.ones(len(times), dtype=bool)
     n = np.arange(len(times))

@@ -10,8 +10,10 @@ from test_register import ARM, run
 
 from dvl_calib_ros.calibration.delay.rows import ImuColumns
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.register.fine import Fitted
 from dvl_calib_ros.calibration.register.motion import make_motion
 from dvl_calib_ros.calibration.register.registration import Registration, register
+from dvl_calib_ros.calibration.register.steadiness import unsteady
 
 AT_S = 250.0
 
@@ -35,6 +37,25 @@ def registered(trajectory: str, whose: str = "", drift: float = 0.0, leap: float
 @pytest.mark.parametrize("trajectory", ["lawnmower", "box", "figure8", "free"])
 def test_clocks_that_stand_still_do(trajectory):
     assert registered(trajectory).unsteady is None
+
+
+def test_noise_that_lasts_as_long_as_blocks_of_a_stretch_is_no_drift():
+    """Survey 33059: -1914 ± 247 ppm were said of a clock that stood still, and the right answer was rejected."""
+    seen = [(47.0, 1.2, -0.27), (139.0, 0.7, -0.09), (232.0, 0.3, 0.09), (324.0, -0.1, 0.27)]
+
+    def found(inflation: float):
+        std = np.array([0.01] * 4 + [0.3, 0.07, 0.1, 0.05, 0.35])
+        each = [
+            Fitted(
+                np.array([0.0] * 7 + [apart, late]), np.diag(std**2), np.eye(3), 0.05, 400, 0.8, np.zeros(400), 3,
+                inflation, np.arange(400), np.full(9, 1.5),
+            )
+            for _, late, apart in seen
+        ]  # fmt: skip
+        return unsteady(np.array([at for at, *_ in seen]), each, is_turned=True)
+
+    assert found(1.5) is not None  # where no noise lasts
+    assert found(3.5) is None
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0, -3.0, 5.0])
