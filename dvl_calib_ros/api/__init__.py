@@ -219,7 +219,7 @@ def diagnose(
     from ..diagnosis.diagnose import diagnose as run
 
     ((recording, discovery),) = sides
-    return run(recording, discovery.parameters, discovery.topics)
+    return run(recording, discovery.diagnosed, discovery.topics)
 
 
 def simulate(

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
     write_report = report_writer(arguments)
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
-    parameters = discovery.parameters
+    parameters = discovery.diagnosed
     common.print_warnings(discovery.doubts)
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(

@@ -74,11 +74,11 @@ class Discovery:
     """What to calibrate with.
 
     found: what was found and where; notes: what was passed over; contradictions: where the recording's data do not
-    bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`, beside
-    `clocks.offsets`, which a calibration takes off and a diagnosis names. agreement:
+    bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`. agreement:
     how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
     knows_imu: whether it is known in which axes the IMU measures. mounting_because: why the mounting is what it is,
-    where it is guessed from the data; else ''.
+    where it is guessed from the data; else ''. clocks_given: the parameters of clocks of which more is taken off in
+    `parameters`, as they were before.
     """
 
     topics: Topics
@@ -92,6 +92,12 @@ class Discovery:
     knows_imu: bool = False
     clocks: FoundClocks | None = None
     mounting_because: str = ""
+    clocks_given: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def diagnosed(self) -> Parameters:
+        """The parameters with clocks as they were given: what a calibration takes off them a diagnosis names."""
+        return self.parameters.replace(**self.clocks_given)
 
     def with_mounting(self, rpy: Sequence[float]) -> Discovery:
         """The same where a calibration has found a better mounting (rad) than the one that was guessed."""
@@ -147,6 +153,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         found=(*found.found, *clocks.says()),
         contradictions=(*found.contradictions, *([clocks.doubt] if clocks.doubt else [])),
         clocks=clocks,
+        clocks_given={n: getattr(parameters, n) for n in clocks.offsets},
     )
 
 

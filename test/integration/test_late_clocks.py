@@ -14,6 +14,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
+from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate, write_bag
@@ -35,9 +36,9 @@ def bag_of(folder, late, trajectory="free", **scenario):
     return folder / "late"
 
 
-def said(command, bag, tmp_path, capsys):
+def said(command, bag, tmp_path, capsys, *options):
     """What a command prints, and its JSON."""
-    main([command, str(bag), "--json", str(tmp_path / f"{command}.json")])
+    main([command, str(bag), "--json", str(tmp_path / f"{command}.json"), *options])
     return " ".join(capsys.readouterr().out.split()), json.loads((tmp_path / f"{command}.json").read_text())
 
 
@@ -57,7 +58,8 @@ def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
     """By 2.5 s one said yes, one 1.2 s or more, and one was exact; by 5 s a scale was 6 % off."""
     bag = bag_of(tmp_path, late)
     doctor, examined = said("doctor", bag, tmp_path, capsys)
-    _, diagnosed = said("diagnose", bag, tmp_path, capsys)
+    applied = tmp_path / "applied.yaml"
+    _, diagnosed = said("diagnose", bag, tmp_path, capsys, "--apply", str(applied))
     assert examined["verdict"] == "yes"
     found = discover([bag], Parameters())
     for name, seconds in late.items():
@@ -68,10 +70,20 @@ def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
         assert " ".join(sentence.split()) in doctor
         effects = {each["name"]: each["parameters"] for each in diagnosed["effects"]}
         assert effects[name]["seconds"]["value"] == near
+        assert getattr(load_parameters(applied), parameter) == near  # it was twice as much
     replayed = replay([bag], found.parameters, found.topics)
     verification = replayed.result.verifications[replayed.result.selected]
     assert verification.verdict.value == "accept", verification.reasons
     assert replayed.result.estimate.state[8] == pytest.approx(ARM, abs=0.15)
+
+
+@pytest.mark.slow
+def test_the_function_names_the_clock_that_the_command_names(tmp_path):
+    """It took the clock off, and said nothing of it."""
+    effects = {
+        each.name: each.parameters for each in dc.diagnose(bag_of(tmp_path, {"reference_time_offset": 5})).effects
+    }
+    assert effects["reference_time_offset"]["seconds"][0] == pytest.approx(5.0, abs=0.2)
 
 
 def test_a_reference_in_the_body_is_calibrated_with_and_the_other_reading_is_said(tmp_path):
