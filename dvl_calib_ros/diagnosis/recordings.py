@@ -22,7 +22,7 @@ from ..calibration.screening import SMALLEST_VARIANCE
 from ..effects.base import EffectNeeds
 from ..errors import InputError
 from ..messages.decode import MessageDecoder
-from ..recordings.check import check_topics
+from ..recordings.check import check_topics, missing_imu
 from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording as Opened
 from ..recordings.recording import open_recording
@@ -264,6 +264,7 @@ def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) ->
         raise InputError(
             f"{path}: no reference velocity to compare the DVL with: no messages on {topics.gnss}; set --gnss-topic"
         )
+    found += missing_imu(opened, chosen, decoder.frame_of_reference)
     return streams, [*opened.notes, *map(str, found), *map(str, decoder.problems.values())]
 
 

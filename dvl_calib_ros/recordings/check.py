@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Set
 
+from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES
 from ..verdict.reasons import Reason, finding
@@ -27,8 +28,19 @@ def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> N
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
     if topics.gnss not in present:
         found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
-    if topics.imu not in recording.types:
-        found.append(finding("BAG_NO_IMU"))
+
+
+def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | None) -> list[Reason]:
+    """What it means that a recording has no IMU. frame: of the reference's messages, None where it is not known."""
+    if topics.imu in recording.types:
+        return []
+    if topics.gnss not in recording.types:
+        what = "nothing tells the heading"
+    elif frame is VelocityFrame.BODY:
+        what = "no lever arm is taken out or found"
+    else:
+        what = "a reference in the earth's frame cannot be compared with the DVL; no lever arm is found"
+    return [finding("BAG_NO_IMU", what=what)]
 
 
 def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> None:

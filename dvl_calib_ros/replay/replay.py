@@ -31,7 +31,7 @@ from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import REFERENCE_TYPES, TWIST_TYPE
-from ..recordings.check import check_topics
+from ..recordings.check import check_topics, missing_imu
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
@@ -123,7 +123,7 @@ def replay(
     clocks = _feed_all(recording, chosen, decoder, calibrator, on_progress)
     calibrator.finish()
     on_finished(calibrator)
-    found += decoder.problems.values()
+    found += [*missing_imu(recording, chosen, decoder.frame_of_reference), *decoder.problems.values()]
     result = calibrator.result()
     result = replace(result, days=_named(result.days, recording))
     found += _warnings(result, topics, decoder)

@@ -247,7 +247,7 @@ FINDINGS = (
     ),
     Kind(
         "BAG_NO_IMU",
-        "no IMU in the bag: a reference in the earth's frame cannot be compared with the DVL; no lever arm is found",
+        "no IMU in the bag: {what}",
         "Attitude turns a velocity over ground into the body; turn rates take out what a lever arm adds in turns.",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
     ),

@@ -45,6 +45,15 @@ def test_that_there_is_no_imu_is_the_first_sentence_of_doctor_and_replay(tmp_pat
     assert "27" not in answer.split("Not to be used")[0]  # no misalignment is made of velocities in two frames
 
 
+def test_without_an_imu_a_reference_in_the_body_is_compared_and_not_said_to_be_in_the_earths_frame(tmp_path, capsys):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    vehicle(told, "base_link")
+    out, _ = succeed(capsys, "replay", told.write(tmp_path / "bag"))
+    assert "No IMU in the bag: no lever arm is taken out or found" in " ".join(out.split())
+    assert "earth's frame cannot" not in " ".join(out.split())
+
+
 @pytest.mark.slow
 def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
     told = Told()
