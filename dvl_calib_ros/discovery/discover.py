@@ -522,8 +522,8 @@ class _Search:
             name = self._values["gnss_frame"] = taken.name
             if declared is None:
                 self._found.append(
-                    f"reference in {name}, which fits best: its frame {reference.frame_id!r} does not say (-p "
-                    f"gnss_frame:={name})"
+                    f"the reference is taken as {name}, which fits best; its frame {reference.frame_id!r} does not "
+                    f"say (-p gnss_frame:={name})"
                 )
             else:
                 frame = {"frame": reference.frame_id, "declared": declared.name, "taken": name}

@@ -78,7 +78,7 @@ class DvlDescription:
         if not all(math.isfinite(value) for vector in vectors for value in vector):
             raise InputError(f"{self.source}: holds numbers that are not finite; diagnose again")
         if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
-            raise InputError(f"{self.source}: a rate of {self.rate_hz:g} Hz is none; diagnose again")
+            raise InputError(f"{self.source}: rate_hz is {self.rate_hz:g}, which cannot be; diagnose again")
         if any(std < 0.0 for std in self.noise_std or ()):
             raise InputError(f"{self.source}: a negative standard deviation is none; diagnose again")
 

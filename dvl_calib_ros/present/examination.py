@@ -23,7 +23,7 @@ def examination(examined: Examination) -> Document:
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
     said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *discovery.notes)]
-    motion = f"Motion: {examined.speed_mps:.2f} m/s (median); what it shows of the DVL, ±1σ to expect"
+    motion = f"What the motion shows of the DVL (median speed {examined.speed_mps:.2f} m/s)"
     nothing = "Without a reference only pitch, and yaw if there are opposite headings."
     return Document(
         title="What is in a recording",
@@ -33,7 +33,7 @@ def examination(examined: Examination) -> Document:
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [_contents(examined), *said]),
             Section(
-                f"{len(found)} found" if found else "Nothing wrong was found",
+                f"Findings: {len(found)}" if found else "Nothing wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(motion, [_shown(examined.shown)] if examined.shown else [Sentence(nothing)]),
@@ -69,9 +69,9 @@ def _shown(shown: tuple[Shown, ...]) -> Table:
     for each in shown:
         full = round(BAR * each.share)
         kind = "good" if each.share >= 1.0 else "off" if not each.needs else "bad"
-        bar = Cell("█" * full + "░" * (BAR - full), kind)
+        bar = Cell("█" * full + "░" * (BAR - full), f"bar {kind}")
         rows.append((each.name, bar, f"±{each.std:.2f} {each.unit}", each.needs))
-    return Table(("", "shown", "to expect", "needs"), rows, words=4)
+    return Table(("", "shown", "expected ±1σ", "needs"), rows, words=4)
 
 
 def next_commands(examined: Examination) -> list[tuple[str, str]]:

@@ -117,7 +117,7 @@ def replayed(
         warnings=own,
         sections=[
             Section("", _worth(run) if not rejected else [], Where.PAGE),
-            Section(_headline(run) if not rejected else f"Not to be used. {_headline(run)}", _mounting(run, rejected)),
+            Section(_headline(run, rejected), _mounting(run, rejected)),
             Section("", [] if rejected else [figures("mounting_figures.mounting_pictures", result)], Where.PAGE),
             Section("", [Facts(_facts(run, bags))], Where.PAGE),
             Section("", [] if rejected else [Sentence("Corrected mounting, ready to paste:", soft=True)], Where.PAGE),
@@ -152,17 +152,17 @@ def _answer(verification: Verification | None) -> Answer:
     return Answer(verification.verdict.value, verification.verdict, said, ADVICE[verification.verdict])
 
 
-def _headline(run: Replayed) -> str:
-    """By how much the mounting is off, by which model, from how much data."""
+def _headline(run: Replayed, rejected: bool) -> str:
+    """By how much the mounting is off, by which model, from how much data; after a reject no mounting."""
     result = run.result
+    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - run.pause_s
+    data = f"(model {result.selected}, {seconds:.0f} s of data)"
+    if rejected:
+        return f"Not to be used: no mounting is given {data}"
     parameters = Parameters.from_mapping(result.parameters)
     turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
-    seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - run.pause_s
-    return (
-        f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} (model "
-        f"{result.selected}, {seconds:.0f} s of data)"
-    )
+    return f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} {data}"
 
 
 def _worth(run: Replayed) -> list[Item]:
@@ -193,13 +193,13 @@ def _against(run: Replayed) -> str:
     """What the angles are measured against, whose own error no data of this kind tell from the DVL's."""
     if not MODELS[run.result.selected].aided:
         return (
-            "Without a reference the angles are against the way in which the vehicle goes ahead: a constant crab is in "
-            "the yaw, and one that goes astern is turned round."
+            "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like "
+            "yaw, and driving astern looks like a DVL turned by 180°."
         )
     if run.reference_frame in EARTH:
         return (
-            "Angles are against the IMU's own: a constant error of its heading is in the yaw, one of its level in roll "
-            "and pitch, and both are harmless with that IMU."
+            "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll "
+            "and pitch. Both are harmless as long as the same IMU is used."
         )
     return ""
 

@@ -115,5 +115,5 @@ def _cell(cell: str | Cell) -> Text:
 
     if isinstance(cell, str):
         return Text(printable(cell))
-    text = Text(printable(cell.text), _STYLES.get(cell.kind, ""))
+    text = Text(printable(cell.text), _STYLES.get(cell.kind.removeprefix("bar "), ""))
     return text.append(f" {printable(cell.below)}", "dim") if cell.below else text

@@ -289,8 +289,8 @@ def in_words(navigation: Navigation) -> list[str]:
     over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
     said = [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
-        f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %); of that "
-        f"noise of reference and DVL may be {metres(n.noise_per_km)} m."
+        f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
+        f"Noise of reference and DVL alone may make {metres(n.noise_per_km)} m of it."
     ]
     said.append(
         f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"

@@ -33,8 +33,8 @@ _KINDS = (
     ),
     Kind(
         "MOUNTING_SUSPICIOUS",
-        "the mounting may have moved {moved} {between}; chance makes as much of one that did not in 1 of {often:.0f} "
-        "comparisons",
+        "the mounting may have moved {moved} {between}; by chance alone so large a difference comes up in 1 of "
+        "{often:.0f} comparisons",
         "Between 2 and 4 σ.",
         "calibrate once more before you rely on either",
         Severity.MARGINAL,
@@ -55,14 +55,14 @@ _KINDS = (
     ),
     Kind(
         "SCATTER_BESIDE_MOVES",
-        "beside that they scatter by {by:.1f} times their σ: what is said to have moved is as uncertain as that",
+        "apart from that, the calibrations scatter by {by:.1f} times their σ, so the size of the move is as uncertain",
         "σ does not hold all that differs between the recordings.",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "SCATTER",
-        "they scatter by {by:.1f} times their σ, without one instant that would explain it: σ is too small",
+        "the calibrations scatter by {by:.1f} times their σ, and no single date explains it: σ is too small",
         "σ does not hold all that differs between the recordings.",
         "",
         Severity.MARGINAL,

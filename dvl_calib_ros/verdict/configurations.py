@@ -150,8 +150,8 @@ CONFIGURATIONS = (
     ),
     _Said(
         "GRAVITY_FITS_INVERTED",
-        "{topic}: the data fit an IMU with an inverted attitude: only with quaternions inverted gravity points up (to "
-        "{inverted:.1f}°, as they are to {given:.1f}°)",
+        "{topic}: the IMU's orientation looks inverted: gravity is {given:.1f}° from up, and {inverted:.1f}° with the "
+        "quaternion inverted",
         "The quaternion turns the earth into the body, and not the body into the earth.",
         "correct the IMU's driver",
     ),
@@ -226,15 +226,15 @@ CONFIGURATIONS = (
     ),
     _Said(
         "BODY_OR_EARTH",
-        "DVL and reference agree as if both were in the body, and so they would if both were in the earth's frame",
+        "DVL and reference agree in the body frame, but would agree as well if both were in the earth's frame",
         "Without an attitude that turns, nothing tells the two apart.",
         "set gnss_frame",
     ),
     _Said(
         "REFERENCE_FRAME_OTHER",
-        "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}; taken so",
+        "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
         "The name of the frame and the data contradict each other.",
-        "to insist: -p gnss_frame:={declared}",
+        "-p gnss_frame:={declared} overrides this",
     ),
     _Said(
         "MOUNTING_CONTRADICTED",

@@ -146,7 +146,7 @@ _KINDS = (
         "DOCTOR_FRAMES",
         "{says}",
         "What the recording declares and what its data show are not the same.",
-        "check frames and transforms; the option named insists",
+        "check frames and transforms",
     ),
     Kind(
         "DOCTOR_SLOW_REFERENCE",

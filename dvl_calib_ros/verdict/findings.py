@@ -93,7 +93,7 @@ FINDINGS = (
     ),
     Kind(
         "MODEL_RESTARTED",
-        "{model}: its numbers ran away {count} times; it went on from its last good state",
+        "{model}: the filter diverged {count} times and went on from its last good state",
         "Data and parameters contradict each other so much that the filter's arithmetic fails, as with no gate and a "
         "mounting that is turned round.",
         "check mounting_rpy and lever_arm, and leave gate_probability on",
@@ -150,13 +150,14 @@ FINDINGS = (
     ),
     Kind(
         "POSITION_UNKNOWN",
-        "publish_tf is set, but nothing says where in {base} the reference point is, nor so the DVL; no transform is",
+        "publish_tf is set, but the position of the reference point in {base} is unknown, and so is the DVL's; no "
+        "transform is published",
         "The lever arm is the DVL's position from the reference point (an antenna, an INS), not from base_frame.",
         "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's frame",
     ),
     Kind(
         "TF_NOT_THERE",
-        "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, no transform is",
+        "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, a transform is not",
         "ROS from PyPI has no tf2_ros; a ROS installation has.",
         "install ros-$ROS_DISTRO-tf2-ros-py, and source its setup.bash",
     ),
@@ -294,15 +295,15 @@ FINDINGS = (
         "the data contradict the configuration: {says}",
         "The reference is not in the frame, or the DVL not mounted, as the parameters say: another frame or a rotation "
         "by a large angle fits the samples, gated ones with them, much better.",
-        "stop, set it, and begin anew",
+        "correct the configuration and start again",
         Severity.ERROR,
     ),
     Kind(
         "HEADING_DEVIATION",
-        "the heading is off by an amount that changes {course}: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at "
-        "{most_at:.0f}° and {least:+.1f}° at {least_at:.0f}°; {cost:.0f} m per km",
+        "the heading error changes {course}: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
+        "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
         "A compass deviates with the heading, a gyro drifts; no mounting does either. The DVL's yaw is found against "
-        "the IMU's heading, so it holds the mean of that error over the headings driven.",
+        "the IMU's heading, so the yaw includes the mean of that error over the headings driven.",
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
     Kind(
@@ -314,8 +315,8 @@ FINDINGS = (
     ),
     Kind(
         "TILT_NOT_FOLLOWED",
-        "the DVL's velocity does not turn with the vehicle's {axis}: it leaves {share:.1f} ± {std:.1f} of it, which "
-        "makes {off:.1f}° of mounting",
+        "the DVL's velocity does not follow the vehicle's {axis}: {share:.1f} ± {std:.1f} times the {axis} is left, "
+        "which looks like {off:.1f}° of mounting",
         "1: the driver has turned the velocity into a level frame. 2 or -2: the IMU's angle, or an axis of the DVL, "
         "has the other sign. Either way the mean of the angle over the run looks like a mounting.",
         "have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
@@ -358,28 +359,28 @@ FINDINGS = (
     ),
     Kind(
         "CLOCK_OR_ARM",
-        "a reference that is late looks like a lever arm at one speed, and like a yaw in a steady turn: {metres:.1f} "
-        "m, {degrees:.1f}° and {seconds:.1f} s of the DVL's delay are open, and in σ",
-        "A velocity that is turned into the body by an attitude of another time turns as one of a DVL elsewhere does, "
-        "by speed times delay. Only turns at two speeds, to both sides, tell them apart. A reference is taken to be in "
+        "at one speed a late reference looks like a lever arm, and in a steady turn like a yaw: {metres:.1f} m, "
+        "{degrees:.1f}° and {seconds:.1f} s of delay cannot be told apart; σ includes them",
+        "An attitude of another time turns the velocity like a lever arm of speed times delay would. Only turns at "
+        "two speeds, to both sides, tell them apart. A reference is taken to be in "
         "time to 0.5 s.",
         "drive turns to both sides at two speeds",
     ),
     Kind(
         "REFERENCE_OFFSET",
-        "the reference is off by {millimetres:.0f} mm/s towards {course:.0f}° all along{where}",
-        "An error of an inertial navigation that stays, or a current, where the DVL tracks the water. G1 and G2 have "
-        "it among their states, so they are none the worse; errors and drift against this reference hold it.",
+        "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
+        "A constant error of an inertial navigation, or a current where the DVL tracks the water. G1 and G2 estimate "
+        "it, so it does not harm them; errors and drift against this reference include it.",
         "judge the drift by another reference",
     ),
     Kind(
         "ONE_HEADING",
-        "on one heading an error of reference or DVL that stays is a yaw, a pitch or a scale: {off:g} m/s would be "
-        "{degrees:.1f}° or {percent:.1f} %, and σ holds that of the reference",
+        "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
+        "{degrees:.1f}° or {percent:.1f} %; σ includes that of the reference",
         "A constant velocity error turns with the vehicle where it is the DVL's, and does not where it is the "
         "reference's or a current's; on one heading at one speed no data tell either from a mounting.",
-        "drive the opposite heading as well, at two speeds; or set reference_offset_std, of which σ holds four times, "
-        "to what the reference is good for",
+        "drive the opposite heading as well, at two speeds; or set reference_offset_std to how good the reference is "
+        "(σ includes four times that)",
     ),
     Kind(
         "INNOVATIONS_LARGE",
@@ -398,7 +399,7 @@ FINDINGS = (
         "INITIAL_CONTRADICTED",
         "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
         "What is begun with would be blended with what these data show, into the mounting of neither.",
-        "inspect the mounting; if it is as it shall be, save these data's result and begin with that",
+        "inspect the mounting; if it is right, save this result and start from that",
     ),
     Kind(
         "RESULT_NOT_SAVED",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from .kinds import Kind, Severity
 
 _HELD_OUT = (
-    "on {samples} samples that it had not seen the velocity error is {uncorrected:.3f} m/s rms without correction, "
+    "on {samples} held-out samples the velocity error is {uncorrected:.3f} m/s rms without correction, "
     "{corrected:.3f} with it, {predicted:.3f} predicted"
 )
 _KINDS = (
@@ -30,7 +30,7 @@ _KINDS = (
         "NOTHING_COMPARED",
         "there is no IMU, so no DVL sample can be compared with the reference",
         "A velocity in the earth's frame says nothing of the DVL's axes without an attitude.",
-        "record its topic, with orientation",
+        "record the IMU's topic, with orientation",
         Severity.REJECT,
     ),
     Kind(
@@ -107,14 +107,14 @@ _KINDS = (
     ),
     Kind(
         "HELD_OUT_NO_BETTER",
-        _HELD_OUT + ": it gets no better, which may be for want of data, as σ says",
+        _HELD_OUT + ": the calibration makes no difference, perhaps for lack of data",
         "Worse by no more than what its σ by blocks of time allows.",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "HELD_OUT_SEVERAL_TIMES",
-        _HELD_OUT + ", several times less",
+        _HELD_OUT + ": the error is several times the predicted one",
         "The error is more than three times what the noise explains.",
         "the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
@@ -166,15 +166,15 @@ _KINDS = (
     ),
     Kind(
         "BAGS_MOUNTING_DIFFERS",
-        "the mounting differs {moved} {between}: all together are averaged, which is the mounting of neither",
+        "the mounting differs {moved} {between}: the average of all is the mounting of none",
         "Each recording was calibrated alone, and two of them contradict each other.",
         "",
         Severity.REJECT,
     ),
     Kind(
         "BAGS_DELAY_CHANGED",
-        "the DVL's stamps are late by another delay in each, and one is taken for all that follow each other so "
-        "closely",
+        "the delay of the DVL's stamps differs between recordings, but one delay is used for all that follow each "
+        "other so closely",
         "A model with one delay averages two.",
         "calibrate each by itself",
         Severity.REJECT,

@@ -118,6 +118,8 @@ def test_one_cursor_shows_the_values_of_that_time_in_every_figure_of_the_run(bro
     page, problems = opened(browser, reports["replay"], DESKTOP)
     figures = page.locator("figure.explorable")
     assert figures.count() > 8
+    legend = figures.first.locator(".u-legend").inner_text().split()
+    assert legend and "–" not in legend and "time," not in legend  # at rest, what each line is and no value
     hover(page, figures.first, 0.5)
     times = page.locator("figure.explorable .u-legend tr:first-child .u-value").all_text_contents()
     shown = [float(text) for text in times if text != "–"]

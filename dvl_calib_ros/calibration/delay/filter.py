@@ -256,15 +256,15 @@ class DelayFilter(Estimator):
         x, p = posterior.state
         at = np.flatnonzero(posterior.shown & _BEYOND)
         chi_square = float(x[at] @ np.linalg.solve(p[np.ix_(at, at)], x[at]))
-        std, said = (np.sqrt(np.diag(each)) for each in (p, p + self.left_open))
+        std = np.sqrt(np.diag(p))
         found = []
         arm = [index for index in at.tolist() if index != DELAY]
         if any(abs(x[index]) > NAMED_FROM * std[index] for index in arm):
-            axes = " ".join(f"{AXES[index - LEVER_ARM.start]} {x[index]:+.2f} ± {said[index]:.2f}" for index in arm)
+            axes = " ".join(f"{AXES[index - LEVER_ARM.start]} {x[index]:+.2f}" for index in arm)
             found.append(f"a lever arm of {axes} m")
         if DELAY in at and abs(x[DELAY]) > NAMED_FROM * std[DELAY]:
             late = "late" if x[DELAY] > 0.0 else "early"
-            found.append(f"DVL stamps {abs(x[DELAY]):.2f} ± {said[DELAY]:.2f} s {late}")
+            found.append(f"DVL stamps {abs(x[DELAY]):.2f} s {late}")
         turns = float(posterior.by_lever_arm.max())
         if turns > chi_square:
             return Evidence(turns, "ARM_TAKEN_AS_KNOWN", {"turns": _turns_in_words(posterior)})

@@ -63,7 +63,7 @@
   function drawn(figure, plot) {
     const image = figure.querySelector("img");
     const place = document.createElement("div");
-    place.className = "chart";
+    place.className = "chart rest";
     place.setAttribute("role", "img");
     place.setAttribute("aria-label", image.alt);
     image.after(place);
@@ -97,7 +97,8 @@
       axes: [
         { stroke: SOFT, font, labelFont: font, label: plot.x_label, labelSize: 18, size: 26, grid, ticks },
         { stroke: SOFT, font, labelFont: font, label: plot.y_label, labelSize: 18, size: 48, grid, ticks,
-          values: (u, splits) => splits.map(v => v == null ? "" : shown(v)) },
+          values: (u, splits) => splits.map(
+            v => v == null || plot.log && Math.abs(Math.log10(v) - Math.round(Math.log10(v))) > 1e-9 ? "" : shown(v)) },
       ],
       cursor: { y: false, points: { size: 6 }, drag: { x: true, y: false },
                 bind: { dblclick: () => () => { whole(plot.run); return null; } } },
@@ -105,6 +106,7 @@
         drawClear: [background(plot)],
         setCursor: [u => {
           const at = u.cursor.left < 0 ? null : u.posToVal(u.cursor.left, "x");
+          place.classList.toggle("rest", at == null);
           for (const show of maps.get(plot.run) ?? []) show(at);
           together(u, other => other.setCursor(
             at == null ? { left: -10, top: -10 } : { left: other.valToPos(at, "x"), top: 10 }));
