@@ -38,6 +38,11 @@ COMMANDS = (
         "dvl-calib watch --node /port/dvl_calibration",
     ),
     Command(
+        "play",
+        "play recorded bags over ROS 2, also where ros2 bag is not installed",
+        "dvl-calib play my_bag --rate 5 --remap /a50/velocity:=/dvl/twist --clock",
+    ),
+    Command(
         "doctor",
         "say what is in a bag, what is wrong with it, and whether it can calibrate",
         "dvl-calib doctor my_bag",

@@ -1,4 +1,4 @@
-"""Plays a bag to a running node over DDS, bytes as recorded."""
+"""Plays a bag over DDS, bytes as recorded: to a running node, or to whoever listens."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
 from ..bags.reader import BagReader
 from ..errors import InputError
@@ -17,63 +18,119 @@ from ..node.message_types import message_class
 from ..recordings.topics import Topics
 
 PATIENCE = Duration(seconds=30)
+# What is said once, and kept for those who come later, as robot_state_publisher and static broadcasters do
+LATCHED = ("/tf_static", "/robot_description")
+# A request to end is heard within this, s.
+BREATH_S = 0.05
+
+
+def sensors_of(bag: BagReader) -> dict[str, str]:
+    """DVL, GNSS and IMU topic of a bag, with the calibration node's own name for each."""
+    defaults = Topics()
+    found = defaults.found_in(bag.topics)
+    named = {found.dvl: defaults.dvl, found.gnss: defaults.gnss, found.imu: defaults.imu}
+    return {name: target for name, target in named.items() if name in bag.topics}
+
+
+def wait_until(time_s: float, has_ended: Callable[[], bool]) -> None:
+    """Wait until a time of `time.monotonic`, or the end."""
+    while (left := time_s - time.monotonic()) > 0.0 and not has_ended():
+        time.sleep(min(left, BREATH_S))
 
 
 class BagPlayer:
-    """Publishes the DVL, GNSS and IMU topics of a bag on the node's topics, reliably."""
+    """Publishes topics of bags, reliably.
 
-    def __init__(self, node: Node, paths: Sequence[Path], reliability: Any = ReliabilityPolicy.RELIABLE) -> None:
+    targets: topic of the bags -> what to publish it as; by default DVL, GNSS and IMU, as the calibration node calls
+    them. clock_hz: how often /clock is published, in seconds of the bag, 0 for never. Raises InputError.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        paths: Sequence[Path],
+        targets: Mapping[str, str] | None = None,
+        reliability: Any = ReliabilityPolicy.RELIABLE,
+        clock_hz: float = 0.0,
+    ) -> None:
         self._paths = paths
         self._reliable = reliability == ReliabilityPolicy.RELIABLE
-        defaults = Topics()
         self._publishers: dict[str, Any] = {}
         with BagReader(paths) as bag:
-            found = defaults.found_in(bag.topics)
-            for name, target in ((found.dvl, defaults.dvl), (found.gnss, defaults.gnss), (found.imu, defaults.imu)):
-                if name in bag.topics:
-                    kind = message_class(f"{name} of the bag holds", bag.topics[name])
-                    # room for every message: none is overwritten before it is acknowledged, however fast we play
-                    depth = max(bag.message_counts[name], 1)
-                    profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability)
-                    self._publishers[name] = node.create_publisher(kind, target, profile)
+            for name, target in (sensors_of(bag) if targets is None else targets).items():
+                kind = message_class(f"{name} of the bag holds", bag.topics[name])
+                # room for every message: none is overwritten before it is acknowledged, however fast we play
+                profile = QoSProfile(
+                    history=HistoryPolicy.KEEP_LAST,
+                    depth=max(bag.message_counts[name], 1),
+                    reliability=reliability,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL if name in LATCHED else DurabilityPolicy.VOLATILE,
+                )
+                self._publishers[name] = node.create_publisher(kind, target, profile)
+        self._clock = node.create_publisher(Clock, "/clock", 10) if clock_hz else None
+        self._tick_s = 1.0 / clock_hz if clock_hz else float("inf")
+
+    @property
+    def unheard(self) -> list[str]:
+        """Topics, as they are published, that nobody subscribes to."""
+        return [each.topic_name for each in self._publishers.values() if each.get_subscription_count() < 1]
 
     def wait_for_subscribers(self, timeout_s: float = 30.0) -> None:
         """Wait until every publisher has a subscriber. Raises InputError if one has none in time."""
         deadline = time.monotonic() + timeout_s
-        for topic, publisher in self._publishers.items():
-            while publisher.get_subscription_count() < 1:
-                if time.monotonic() > deadline:
-                    raise InputError(f"nobody subscribes to {topic} within {timeout_s:.0f} s; is the node running?")
-                time.sleep(0.01)
+        while unheard := self.unheard:
+            if time.monotonic() > deadline:
+                raise InputError(f"nobody subscribes to {unheard[0]} within {timeout_s:.0f} s; is the node running?")
+            time.sleep(0.01)
 
     def play(
-        self, speed: float, on_time: Callable[[float, Mapping[str, int]], None] = lambda at, sent: None
+        self,
+        speed: float,
+        on_time: Callable[[float, Mapping[str, int]], None] = lambda at, sent: None,
+        start_s: float = 0.0,
+        duration_s: float = float("inf"),
+        has_ended: Callable[[], bool] = lambda: False,
     ) -> dict[str, int]:
         """Publish all messages, at most `speed` times as fast as recorded; topic -> number sent.
 
-        on_time is called before every message with its time in s since the first and the numbers sent so far; as long
-        as it takes, so long the bag stands still.
+        on_time is called before every message with its time in s since the bag's first and the numbers sent so far;
+        as long as it takes, so long the bag stands still. start_s, duration_s: of the bag; of what lies before only
+        what is latched is published. has_ended: whether to stop.
         """
         sent = dict.fromkeys(self._publishers, 0)
         with BagReader(self._paths) as bag:
-            first_ns: int | None = None
-            started = time.monotonic()
+            first_ns = bag.span_ns[0]
+            began, next_tick = time.monotonic() - start_s / speed, start_s
             for log_ns, channel, data in bag.raw_messages(self._publishers):
-                first_ns = log_ns if first_ns is None else first_ns
                 at = (log_ns - first_ns) * 1e-9
+                if at > start_s + duration_s or has_ended():
+                    break
+                if at < start_s and channel.topic not in LATCHED:
+                    continue
                 asked = time.monotonic()
                 on_time(at, sent)
-                started += time.monotonic() - asked
-                wait = started + at / speed - time.monotonic()
-                if wait > 0.0:
-                    time.sleep(wait)
+                began += time.monotonic() - asked
+                while next_tick <= at and not has_ended():
+                    wait_until(began + next_tick / speed, has_ended)
+                    self._publish_clock(first_ns + round(next_tick * 1e9))
+                    next_tick += self._tick_s
+                wait_until(began + at / speed, has_ended)
+                if has_ended():
+                    break
                 self._publishers[channel.topic].publish(data)
                 sent[channel.topic] += 1
-        self.wait_until_received()
+        if not has_ended():
+            self.wait_until_received()
         return sent
 
+    def _publish_clock(self, nanoseconds: int) -> None:
+        if self._clock is not None:
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 1_000_000_000)
+            self._clock.publish(message)
+
     def wait_until_received(self) -> None:
-        """Wait until the node's middleware has all messages (of a reliable player)."""
+        """Wait until the middleware of those who listen has all messages (of a reliable player)."""
         if self._reliable:
             for publisher in self._publishers.values():
                 publisher.wait_for_all_acked(PATIENCE)

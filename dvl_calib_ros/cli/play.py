@@ -1,0 +1,146 @@
+"""Play recorded bags over ROS 2, as `ros2 bag play` does, also where that is not installed, and damaged ones as well.
+
+All topics whose message packages are installed are published, with the bytes that were recorded. Stamps stay as they
+are. Needs ROS 2 Jazzy (or pip install 'dvl_calib_ros[ros]').
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from . import common
+
+if TYPE_CHECKING:
+    from ..bags.reader import BagReader
+
+RATES = (0.01, 1000.0)
+CLOCKS_HZ = (0.1, 1000.0)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    parser.add_argument("-r", "--rate", type=float, default=1.0, help="times as fast as recorded; default: %(default)g")
+    parser.add_argument("-l", "--loop", action="store_true", help="again and again, until Ctrl-C")
+    parser.add_argument(
+        "-d", "--delay", type=float, default=0.0, metavar="S", help="wait so long before the first message"
+    )
+    parser.add_argument(
+        "--start-offset", type=float, default=0.0, metavar="S", help="begin so many seconds into the bag"
+    )
+    parser.add_argument(
+        "--playback-duration", type=float, default=float("inf"), metavar="S", help="play so many seconds of the bag"
+    )
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these")
+    parser.add_argument(
+        "-m", "--remap", nargs="+", default=[], metavar="OLD:=NEW", help="publish a topic by another name"
+    )
+    parser.add_argument(
+        "--clock", nargs="?", type=float, const=40.0, default=0.0, metavar="HZ",
+        help="publish /clock, so often in a second of the bag; without a number: 40",
+    )  # fmt: skip
+    parser.add_argument("--wait", action="store_true", help="begin when every topic has a subscriber")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Play until the end, or until Ctrl-C. Raises InputError."""
+    from ..bags.reader import BagReader
+    from ..errors import InputError
+    from ..node.ending import Ending
+
+    _check(arguments)
+    with Ending() as ending:
+        try:
+            import rclpy
+            from rclpy.signals import SignalHandlerOptions
+
+            from ..demo.player import BREATH_S, BagPlayer, wait_until
+            from ..node.answering import AnsweringNode
+        except ImportError as error:
+            raise InputError(
+                f"play needs ROS 2 ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
+            ) from error
+        with BagReader(arguments.bags) as bag:
+            targets = _targets(bag, arguments.topics, arguments.remap)
+            seconds = 1e-9 * (bag.span_ns[1] - bag.span_ns[0])
+        end = min(arguments.start_offset + arguments.playback_duration, seconds)
+        if not arguments.start_offset < end:
+            raise InputError(f"--start-offset {arguments.start_offset:g}: the recording has {seconds:.1f} s")
+
+        def has_ended() -> bool:
+            return ending.requested
+
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        node = AnsweringNode("dvl_calib_player")
+        try:
+            player = BagPlayer(node, arguments.bags, targets, clock_hz=arguments.clock)
+            while arguments.wait and player.unheard and not ending.requested:
+                time.sleep(BREATH_S)
+            wait_until(time.monotonic() + arguments.delay, has_ended)
+            total = 0
+            with common.progress("playing") as on_progress:
+
+                def on_time(at: float, _: object) -> None:
+                    on_progress((at - arguments.start_offset) / (end - arguments.start_offset))
+
+                while not ending.requested:
+                    sent = player.play(
+                        arguments.rate, on_time, arguments.start_offset, arguments.playback_duration,
+                        has_ended,
+                    )  # fmt: skip
+                    total += sum(sent.values())
+                    if not arguments.loop:
+                        break
+            print(f"published {total} messages of {len(targets)} topics")
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from ..errors import InputError
+
+    for name, (low, high) in (("rate", RATES), ("clock", CLOCKS_HZ)):
+        value = getattr(arguments, name)
+        if value and not low <= value <= high:
+            raise InputError(f"--{name}: {value:g} is outside {low:g} .. {high:g}")
+    for name in ("delay", "start_offset", "playback_duration"):
+        if not getattr(arguments, name) >= 0.0:
+            raise InputError(f"--{name.replace('_', '-')}: give a number of seconds, 0 or more")
+
+
+def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> dict[str, str]:
+    """Topic of the bags -> what to publish it as. Raises InputError."""
+    from ..errors import InputError
+    from ..node.message_types import message_class
+    from ..recordings.topics import spelled
+
+    def found(name: str, option: str) -> str:
+        there = spelled(name, bag.topics)
+        if there is None:
+            raise InputError(f"{option}: {name} is not in the recording, which has {', '.join(sorted(bag.topics))}")
+        return there
+
+    renamed = {}
+    for each in remap:
+        old, separator, new = each.partition(":=")
+        if not (separator and old and new):
+            raise InputError(f"--remap: {each!r} is not OLD:=NEW")
+        renamed[found(old, "--remap")] = new
+    targets = {}
+    for name in bag.topics if topics is None else [found(topic, "--topics") for topic in topics]:
+        try:
+            message_class(f"{name} of the bag holds", bag.topics[name])
+        except InputError as error:
+            if topics is not None:
+                raise
+            common.print_warnings([f"{error}; not played"])
+            continue
+        targets[name] = renamed.get(name, name)
+    if not targets:
+        raise InputError("no topic whose message package is installed; nothing can be played")
+    return targets
