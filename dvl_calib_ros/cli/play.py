@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..streams import say
 from . import common
 
 if TYPE_CHECKING:
     from ..bags.reader import BagReader
+    from ..demo.player import BagPlayer
 
+# Two processes that are both there find each other sooner.
+SAID_AFTER_S = 2.0
 RATES = (0.01, 1000.0)
 CLOCKS_HZ = (0.1, 1000.0)
 
@@ -58,7 +62,7 @@ def run(arguments: argparse.Namespace) -> None:
             import rclpy
             from rclpy.signals import SignalHandlerOptions
 
-            from ..demo.player import BREATH_S, BagPlayer, wait_until
+            from ..demo.player import BagPlayer, wait_until
             from ..node.answering import AnsweringNode
         except ImportError as error:
             raise InputError(
@@ -78,8 +82,8 @@ def run(arguments: argparse.Namespace) -> None:
         node = AnsweringNode("dvl_calib_player")
         try:
             player = BagPlayer(node, arguments.bags, targets, clock_hz=arguments.clock)
-            while arguments.wait and player.unheard and not ending.requested:
-                time.sleep(BREATH_S)
+            if arguments.wait:
+                _wait_for_subscribers(player, has_ended)
             wait_until(time.monotonic() + arguments.delay, has_ended)
             total = 0
             with common.progress("playing") as on_progress:
@@ -99,6 +103,17 @@ def run(arguments: argparse.Namespace) -> None:
         finally:
             node.destroy_node()
             rclpy.try_shutdown()
+
+
+def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> None:
+    from ..demo.player import BREATH_S
+
+    began, is_said = time.monotonic(), False
+    while (unheard := player.unheard) and not has_ended():
+        if not is_said and time.monotonic() - began > SAID_AFTER_S:
+            say(f"waiting for subscribers of {', '.join(unheard)}")
+            is_said = True
+        time.sleep(BREATH_S)
 
 
 def _check(arguments: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from itertools import pairwise
 
 import pytest
@@ -17,6 +18,7 @@ from ros import World, until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
 
+from dvl_calib_ros.cli import play
 from dvl_calib_ros.cli.main import main
 
 
@@ -67,6 +69,15 @@ def test_a_part_of_some_topics_is_played(world, bag):
     expected = [name for name, log_ns, _ in raw(bag) if name == "dvl/twist" and 4e9 <= log_ns - first_ns <= 7e9]
     until(lambda: len(dvl) == len(expected), "the part")
     assert not imu
+
+
+def test_who_is_waited_for_is_said(world, bag, capsys, monkeypatch):
+    monkeypatch.setattr(play, "SAID_AFTER_S", 0.1)
+    ended = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    ended.start()
+    assert main(["play", str(bag), "--wait", "--topics", "dvl/twist"]) == 0
+    said = capsys.readouterr()
+    assert "published 0 messages" in said.out and said.err == "waiting for subscribers of /dvl/twist\n"
 
 
 def test_a_loop_goes_on_until_ctrl_c_and_ends_cleanly(world, bag, capsys):
