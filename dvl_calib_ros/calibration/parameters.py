@@ -110,14 +110,14 @@ class Parameters:
     )
     gnss_model: str = _parameter(
         "G1",
-        "What auto runs while GNSS is available; under iac M3, unless this is M4.",
+        "Model that auto runs while GNSS is available. Under iac it is M3, unless this says M4.",
         choices=_AIDED,
         read_only=False,
     )
     gnss_free_model: str = _parameter(
         "F1",
-        "What auto runs while GNSS is not available: F1, and A1 in its place once there is attitude and headings show "
-        "the current; any other as it is. Under iac M7, unless this is M5 or M6.",
+        "Model that auto runs while GNSS is not available. F1 gives way to A1 once there is attitude and several "
+        "headings show the current. Under iac it is M7, unless this says M5 or M6.",
         choices=_UNAIDED,
         read_only=False,
     )
@@ -131,7 +131,7 @@ class Parameters:
     )
     gnss_hysteresis: float = _parameter(
         3.0,
-        "How long GNSS must have come or gone before auto switches.",
+        "How long GNSS must be present (or absent) before auto changes the model.",
         unit="s",
         low=0.0,
         high=600.0,
@@ -214,14 +214,14 @@ class Parameters:
     )
     dvl_position: str = _parameter(
         UNKNOWN,
-        "What is known of the DVL's position in base_frame. from_reference: reference_position plus the lever arm, as "
-        "it is found; told: the same with lever_arm as it is given, for the reference's place is not known; unknown: "
+        "How the DVL's position in base_frame is known. from_reference: reference_position plus the lever arm that is "
+        "found; told: the same with the lever_arm that is given; unknown: "
         "no position is written to URDF, TF or launch files.",
         choices=(UNKNOWN, TOLD, FROM_REFERENCE),
     )
     imu_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Orientation in the body of the axes in which the IMU gives its data, as in a URDF origin (fixed axes X, Y, "
+        "Orientation in the body of the axes of the IMU's data, as in a URDF origin (fixed axes X, Y, "
         "Z). Forward-right-down in a level vehicle is pi 0 0.",
         unit="rad",
         low=-2 * math.pi,
@@ -248,8 +248,8 @@ class Parameters:
     )
     reference_velocity_offset: tuple[float, ...] = _parameter(
         (0.0, 0.0),
-        "East and north part by which a reference velocity in ENU or NED is off against what the DVL measures: of an "
-        "inertial navigation that drifts, or a current where the DVL tracks water. Taken off.",
+        "Constant error (east, north) of a reference velocity in ENU or NED: of an inertial navigation that drifts, "
+        "or a current where the DVL tracks water. Taken off.",
         unit="m/s",
         low=-5.0,
         high=5.0,
@@ -270,14 +270,14 @@ class Parameters:
     )
     dvl_time_jump: float = _parameter(
         0.0,
-        "By how much DVL stamps are later still from dvl_time_jump_at on. Taken off.",
+        "By how much DVL stamps are later from dvl_time_jump_at on, in addition. Taken off.",
         unit="s",
         low=-10.0,
         high=10.0,
     )
     dvl_time_jump_at: float = _parameter(
         0.0,
-        "DVL stamp (s since 1970) from which on dvl_time_jump holds.",
+        "DVL stamp (s since 1970) at which dvl_time_jump begins.",
         unit="s",
         low=0.0,
         high=2.0**31,
@@ -297,15 +297,14 @@ class Parameters:
     )
     initial_std_lever_arm: float = _parameter(
         2.0,
-        "Prior standard deviation of each component of what the lever arm is beside lever_arm (G2).",
+        "Prior standard deviation of each component of the lever arm about lever_arm (G2).",
         unit="m",
         low=1e-4,
         high=100.0,
     )
     initial_std_time_offset: float = _parameter(
         1.0,
-        "Prior standard deviation of what the DVL's time offset is beside dvl_time_offset (G2, which looks within "
-        "3.2 s).",
+        "Prior standard deviation of the DVL's time offset about dvl_time_offset (G2, which looks within 3.2 s).",
         unit="s",
         low=1e-4,
         high=10.0,
@@ -367,8 +366,8 @@ class Parameters:
     reference_offset_std: float = _parameter(
         0.005,
         "Prior standard deviation, east and north, of a constant error of a reference velocity in an earth frame, as "
-        "of an inertial navigation (G1, G2). On one heading yaw and scale are never better known than by four times "
-        "it; several headings find it.",
+        "of an inertial navigation (G1, G2). On one heading, σ of yaw and scale is at least four times this; several "
+        "headings find the error.",
         unit="m/s",
         low=1e-6,
         high=10.0,
@@ -384,7 +383,7 @@ class Parameters:
     )
     day_std_heading: float = _parameter(
         math.radians(0.1),
-        "By how much the heading reference is off on a day, constantly: in the σ of yaw, which is that of the next "
+        "Constant error of the heading reference on one day: included in the σ of yaw, which is that of the next "
         "recording (0.1°: a fibre-optic gyrocompass; a magnetic compass: 1° and more).",
         unit="rad",
         low=0.0,
@@ -392,15 +391,16 @@ class Parameters:
     )
     day_std_scale: float = _parameter(
         0.003,
-        "By how much the scale differs from day to day: in the σ of scale, which is that of the next recording (0.3 %: "
+        "By how much the scale differs from day to day: included in the σ of scale, which is that of the next "
+        "recording (0.3 %: "
         "4.5 m/s of the speed of sound, as of 1.5 °C).",
         low=0.0,
         high=0.5,
     )
     current_std: float = _parameter(
         ASSUMPTIONS.current_std,
-        "Prior standard deviation of the current per axis (A1, F1). On one heading it decides how much of the sway is "
-        "taken for misalignment: half at speed · initial_std_misalignment.",
+        "Prior standard deviation of the current per axis (A1, F1). On one heading it decides how much of the sway "
+        "counts as misalignment: half, where it equals speed · initial_std_misalignment.",
         unit="m/s",
         low=1e-6,
         high=10.0,
@@ -448,8 +448,8 @@ class Parameters:
     )
     max_repeats: float = _parameter(
         0.0,
-        "How often in a row a DVL velocity may repeat the one before exactly; beyond, its driver hangs and it is not "
-        "used. 0: off (a simulated DVL without noise repeats itself).",
+        "How often in a row a DVL velocity may repeat exactly; further repeats mean that the driver hangs, and are "
+        "not used. 0: off (a simulated DVL without noise repeats itself).",
         low=0.0,
         high=1e6,
         read_only=False,
@@ -555,8 +555,8 @@ class Parameters:
     )
     result_backups: float = _parameter(
         3.0,
-        "How many results before are kept beside result_file: .bak is the one before, .bak.2 and on are those before "
-        "it that converged best, of equals the newest.",
+        "How many earlier results are kept beside result_file: .bak is the last one, .bak.2 and on are the best "
+        "converged of the others.",
         low=1.0,
         high=100.0,
         read_only=False,

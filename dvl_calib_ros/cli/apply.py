@@ -31,10 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--launch", type=Path, metavar="FILE", help="write a launch file (XML) with a static transform")
     parser.add_argument("--fusion", type=Path, metavar="FILE", help="write parameters for robot_localization (YAML)")
     parser.add_argument(
-        "--force", action="store_true", help="apply what is rejected, not converged, or of another mounting"
+        "--force", action="store_true", help="apply a result that is rejected, not converged, or of another mounting"
     )
     parser.add_argument(
-        "--rollback", action="store_true", help="bring back the files before (a second time: undo that)"
+        "--rollback", action="store_true", help="restore the files from before the last apply (again: undo that)"
     )
 
 
@@ -86,7 +86,7 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
         f"scale:  {scale_advice(calibrated)}",
     )
     if calibrated.objections and not arguments.force:
-        out.print("nothing to apply; --force shows and writes it all the same", soft_wrap=True)
+        out.print("nothing to apply; --force shows and writes it anyway", soft_wrap=True)
         return
     for line in lines:
         out.print(escape(line), soft_wrap=True)

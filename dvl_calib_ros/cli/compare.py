@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     paths: list[Path] = arguments.results
     if len(paths) < 2:
-        raise InputError(f"{paths[0]}: one alone cannot be compared; name two at least")
+        raise InputError(f"{paths[0]}: one calibration cannot be compared; name two at least")
     if len(set(paths)) < len(paths):
         twice = next(path for path in paths if paths.count(path) > 1)
         raise InputError(f"{twice}: named twice; a calibration cannot be compared with itself")

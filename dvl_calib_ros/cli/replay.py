@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
     parser.add_argument("--models", metavar="NAMES", help="show these models beside the answer, such as M3,M7 or all")
-    parser.add_argument("--merge", action="store_true", help="take bags together even if the mounting moved between")
+    parser.add_argument("--merge", action="store_true", help="calibrate bags together even if the mounting moved")
     parser.add_argument("-v", "--verbose", action="store_true", help="show counts, selection and all models as well")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")

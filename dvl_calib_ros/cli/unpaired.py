@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
 
     for option in NOT_WITH:
         if getattr(arguments, option) is not None:
-            raise InputError(f"--{option} is of a diagnosis of one vehicle; run it without --simulator")
+            raise InputError(f"--{option} works only without --simulator")
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments)
     real = _source(arguments, arguments.bags, arguments.params, defaults)

@@ -102,8 +102,8 @@ def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[str]:
     others = [each for each in survey.looks.values() if is_another_dvl(each, look)]
     measured = [each for each in others if (difference(look, each) or 0.0) >= SAME_SHARE]
     return [
-        f"two DVLs: {each.topic} ({each.frame_id}) is another one than {dvl} ({look.frame_id}), which is calibrated "
-        f"here; the other by itself with --dvl-topic {each.topic}"
+        f"two DVLs: {dvl} ({look.frame_id}) is calibrated here, not {each.topic} ({each.frame_id}); calibrate that "
+        f"with --dvl-topic {each.topic}"
         for each in sorted(measured, key=lambda each: each.topic)
     ]
 
@@ -125,12 +125,12 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
         share = None if dvl_look is None else difference(dvl_look, look)
         if _has(look, DVL_WORDS) or (share is not None and share < SAME_SHARE):
             if dvl_look is None or not is_another_dvl(look, dvl_look) or (share is not None and share < SAME_SHARE):
-                said.append(f"{look.topic} looks as if it were made from the DVL; not taken as a reference")
+                said.append(f"{look.topic} looks as if it was computed from the DVL; not taken as a reference")
             continue
         if is_derived(look):
             said.append(
-                f"{look.topic} may have the DVL in it (a filter's output?); not taken as a reference. If it has not: "
-                f"--gnss-topic {look.topic}"
+                f"{look.topic} may be a filter's output that uses the DVL; not taken as a reference. If it does not "
+                f"use the DVL: --gnss-topic {look.topic}"
             )
             continue
         kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(look, words)), 3)

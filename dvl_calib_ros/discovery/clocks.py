@@ -76,8 +76,8 @@ class FoundClocks:
             yield f"{r.told(name).says}{which}: {done}"
         if r.apart.is_shown and not r.offsets:
             yield (
-                f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; whose clock is "
-                "off does not show: drive turns at two speeds"
+                f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; the data do "
+                f"not show whose clock is off: drive turns at two speeds"
             )
 
 

@@ -308,7 +308,7 @@ class _Search:
             return
         self._values["heading_deviation_std"] = std
         self._found.append(
-            f"the IMU claims its heading to ±{math.degrees(imu.claimed_std):.2g}°: taken for how it may deviate "
+            f"the IMU claims a heading good to ±{math.degrees(imu.claimed_std):.2g}°, which is used "
             f"(-p heading_deviation_std:={std:.2g})"
         )
 
@@ -349,9 +349,7 @@ class _Search:
             like = self._tree.likely(choose.DVL_WORDS)
             placed = None if like is None else self._tree.placed(like, base_frame)
             if placed is not None:
-                self._notes.append(
-                    f"no transform has the DVL's frame {frame!r}; that of {placed.frame!r} is taken for it"
-                )
+                self._notes.append(f"no transform for the DVL's frame {frame!r}; using frame {placed.frame!r} instead")
         if placed is not None and placed.base != base_frame.strip("/") and not self._gives("base_frame"):
             self._values["base_frame"] = placed.base
         return placed
@@ -517,7 +515,7 @@ class _Search:
         declared = self._declared_reference(reference)
         taken = DeclaredFrame(reading.reference, reading.reference_turned)
         if imu is None and declared is None and chosen.best_left >= FITS:  # no frame could be tried but the body's
-            self._notes.append(f"{reference.topic}: nothing says in which frame it is, and without an IMU no data do")
+            self._notes.append(f"{reference.topic}: nothing tells its frame, not even the data without an IMU")
         elif taken != declared:
             name = self._values["gnss_frame"] = taken.name
             if declared is None:
@@ -569,7 +567,7 @@ class _Search:
         self._values["gnss_aided_std"] = float(f"{shown:.2g}")
         claims = f"claims {reference.claimed_std:.2g} m/s" if is_position else "claims no noise"
         self._found.append(
-            f"the reference {claims}; against the DVL it shows {shown:.2g} m/s per axis, which is taken "
+            f"the reference {claims}; against the DVL it shows {shown:.2g} m/s per axis, which is used "
             f"(-p gnss_aided_std:={shown:.2g})"
         )
 

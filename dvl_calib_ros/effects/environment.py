@@ -10,14 +10,14 @@ import numpy as np
 from ..calibration.frames import Array
 from .base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
 
-_CURRENT = "{} part of the velocity added: minus the current, which carries the water along"
+_CURRENT = "{} component of the added velocity (the negative of the current)"
 
 
 class WaterLock(Effect):
     """The DVL tracks the water, all the time or for some of it, so it misses what the current does."""
 
     name = "water_lock"
-    summary = "the DVL tracks water: an earth-fixed velocity (minus the current) added from from_s to to_s"
+    summary = "the DVL tracks water: an earth-fixed velocity (the negative of the current) is added from from_s to to_s"
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
         EffectParameter("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),

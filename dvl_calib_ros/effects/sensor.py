@@ -100,7 +100,7 @@ class MountingMoved(MountingEffect):
     """The DVL was mounted otherwise than in the first of several recordings."""
 
     name = "mounting_moved"
-    summary = "the mounting is turned against that of the first of several recordings"
+    summary = "the mounting differs from that of the first of several recordings"
     manoeuvre = "straight legs that speed up and slow down, in each recording"
     parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
     of_the_day = True
@@ -115,7 +115,7 @@ class SoundSpeedMoved(Effect):
     """The speed of sound was off by another amount than in the first of several recordings."""
 
     name = "sound_speed_moved"
-    summary = "the scale-factor error is another than in the first of several recordings: ratio · v"
+    summary = "the scale-factor error differs from that of the first of several recordings: ratio · v"
     manoeuvre = "straight legs, in each recording"
     parameters = (EffectParameter("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
     acts_on = ActsOn.DVL
@@ -138,7 +138,12 @@ class AxisNonorthogonality(Effect):
     manoeuvre = "sway and heave beside surge: drift across, dive or go in waves"
     parameters = tuple(
         EffectParameter(
-            f"{axes}_rad", "rad", 0.01, -0.3, 0.3, f"half of what the angle between {axes[0]} and {axes[1]} lacks"
+            f"{axes}_rad",
+            "rad",
+            0.01,
+            -0.3,
+            0.3,
+            f"half of the difference between 90° and the angle of {axes[0]} and {axes[1]}",
         )
         for axes in ("xy", "xz", "yz")
     )

@@ -36,7 +36,7 @@ _KINDS = (
     Kind(
         "NO_ANGLE_SHOWN",
         "the data has shown none of the angles yet",
-        "σ of each is about what was assumed before any data.",
+        "σ of each angle is still about that of the prior.",
         "",
         Severity.MARGINAL,
     ),
