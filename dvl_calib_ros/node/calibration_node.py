@@ -145,12 +145,15 @@ class CalibrationNode(AnsweringNode):
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._log_configuration()
 
-    def _begin(self, parameters: Parameters, initial: Mapping[str, GaussianState] | None) -> None:
-        """Calibrate with these parameters from here on."""
+    def _begin(
+        self, parameters: Parameters, initial: Mapping[str, GaussianState] | None, feed: MessageFeed | None = None
+    ) -> None:
+        """Calibrate with these parameters from here on. feed: whose messages so far are fed again."""
         self._calibrator = Calibrator(
             parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn, worker=self._worker
         )
-        self._feed = MessageFeed(self._calibrator, self._warn)
+        self._feed = feed or MessageFeed(self._calibrator, self._warn)
+        self._feed.begin_again(self._calibrator)
         self._lever_arm: Sequence[float] | None = parameters.lever_arm if any(parameters.lever_arm) else None
 
     def _place(self, message: Any) -> None:
@@ -180,9 +183,9 @@ class CalibrationNode(AnsweringNode):
         self.get_logger().info(f"{found.said}; the calibration begins with it (use_transforms: false does without)")
         self._begin_anew(parameters.replace(**found.values))
 
-    def _begin_anew(self, parameters: Parameters) -> None:
-        """Forget all samples, and calibrate with these parameters from here on."""
-        self._begin(parameters, None)
+    def _begin_anew(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
+        """As `_begin`, with nothing of what has been published."""
+        self._begin(parameters, None, feed)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._recent, self._correction, self._mounting_published = RecentCounts(), None, ("", 0)
 
@@ -277,7 +280,7 @@ class CalibrationNode(AnsweringNode):
         self._heading_is_open = False
         std = believed_heading(claimed)
         if std is not None:
-            self._begin(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial)
+            self._begin(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
 
     # ------------------------------------------------------------------ output
 
@@ -361,7 +364,9 @@ class CalibrationNode(AnsweringNode):
         parameters = self._late_clocks.parameters(calibrator.registration_so_far, calibrator.parameters)
         if parameters is not None:
             self._warn(" ".join(map(str, self._late_clocks.found)))
-            self._begin_anew(parameters)
+            self._begin_anew(parameters, self._feed)
+        if self._late_clocks.stand and not self._heading_is_open:
+            self._feed.kept.forget()
 
     def _publish_diagnostics(self) -> None:
         self._publish_mounting()
@@ -393,7 +398,7 @@ class CalibrationNode(AnsweringNode):
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
-        self._feed.decoder.forget()
+        self._feed.forget()
         self._recent = RecentCounts()
         self._pauses.forget()
         self._correction, self._mounting_published = None, ("", 0)

@@ -12,24 +12,24 @@ from ..verdict.reasons import Reason, finding
 class LateClocks:
     """What is to be taken off, once: where nobody named an offset, and two looks at the clocks agree.
 
-    found: what is said of it, while it is off.
+    found: what is said of it, while it is off. stand: whether nothing more is to be taken off.
     """
 
     def __init__(self, given: Collection[str]) -> None:
         """given: names of the parameters that the user named."""
-        self._stands = bool(OFFSETS.keys() & set(given))
+        self.stand = bool(OFFSETS.keys() & set(given))
         self._before: Registration | None = None
         self.found: list[Reason] = []
 
     def parameters(self, registration: Registration | None, parameters: Parameters) -> Parameters | None:
         """The parameters to begin anew with, by the newest look; None for as they are."""
-        if self._stands or registration is None or registration is self._before:
+        if self.stand or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
         late = registration.taken_off
         if before is None or not late or not _are_alike(before.taken_off, late):
             return None
-        self._stands = True
+        self.stand = True
         taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in late.items()}
         self.found = [
             finding("CLOCK_TAKEN_OFF", clock=registration.told(name), parameter=name, value=seconds)

@@ -6,14 +6,17 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from ros import NODE, World, until
 from std_srvs.srv import Trigger
 
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -62,6 +65,11 @@ def test_a_late_reference_is_taken_off_and_calibrated_with(world, bag, tmp_path)
     assert saved["parameters"]["reference_time_offset"] == pytest.approx(LATE, abs=0.1)
     at = MODELS["G2"].state_names.index("lever_arm_x")
     assert saved["models"]["G2"]["state"][at] == pytest.approx(ARM, abs=0.2)
+    # what came before it was taken off has been fed again
+    taken = Parameters(max_latency=20.0, reference_time_offset=saved["parameters"]["reference_time_offset"])
+    replayed = replay([bag], taken).result
+    assert saved["counts"]["dvl"] == dict(replayed.counts["dvl"])
+    np.testing.assert_allclose(saved["models"]["G2"]["state"], replayed.estimates["G2"].state, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.slow

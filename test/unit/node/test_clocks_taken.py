@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import pytest
 from runs import ONE_HERTZ, MatchedRun, make_samples
 
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from dvl_calib_ros.messages import kept
+from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.node.late_clocks import LateClocks
+from dvl_calib_ros.recordings.topics import Topics
+from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.simulation.injection import injection
+from dvl_calib_ros.simulation.scenario import Scenario, write_bag
+from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.verdict.reasons import Reason, finding
 
 
@@ -67,3 +78,53 @@ def first_known(worker) -> int:
 
 def test_when_a_clock_is_known_is_decided_by_stamps_however_busy_the_machine_is():
     assert 0 < first_known(AtOnce()) == first_known(Later())
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory):
+    """A bag whose reference is stamped late."""
+    path = tmp_path_factory.mktemp("late") / "bag"
+    effects = injection("lever_arm:x_m=-0.6"), injection("reference_time_offset:seconds=2.5")
+    errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)
+    write_bag(
+        Scenario("free", 200.0, 3, errors, gnss_std=0.05, imu_rate=10, effects=effects),
+        path,
+        Storage.MCAP,
+        Compression.NONE,
+    )
+    return path
+
+
+@pytest.mark.slow
+def test_what_came_before_a_clock_was_taken_off_is_fed_again_so_that_live_is_what_a_replay_is(late):
+    """It was forgotten: the answer was that of the rest of the bag."""
+    calibrator = Calibrator(Parameters(), worker=AtOnce())
+    feed, clocks, topics, taken_off = MessageFeed(calibrator), LateClocks(given=()), Topics(), 0
+    with BagReader([late]) as bag:
+        for topic, log_ns, message, _ in bag.messages(bag.topics):
+            if topic == topics.dvl:
+                now = feed.calibrator
+                if parameters := clocks.parameters(now.registration_so_far, now.parameters):
+                    taken_off = now.counts["dvl"]["accepted"]
+                    feed.begin_again(Calibrator(parameters, worker=AtOnce()))
+                feed.dvl(message, log_ns)
+            elif topic == topics.gnss:
+                feed.reference(message, log_ns)
+            elif topic == topics.imu:
+                feed.imu(message, log_ns)
+    assert taken_off > 200
+    live, replayed = feed.calibrator.result(), replay([late], feed.calibrator.parameters).result
+    assert live.counts == replayed.counts and live.first_ns == replayed.first_ns
+    for name, estimate in live.estimates.items():
+        np.testing.assert_allclose(estimate.state, replayed.estimates[name].state, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(estimate.covariance, replayed.estimates[name].covariance, rtol=1e-9, atol=1e-12)
+
+
+def test_what_is_more_than_is_kept_is_not_fed_again(monkeypatch):
+    monkeypatch.setattr(kept, "MOST", 3)
+    messages = kept.KeptMessages()
+    for i in range(3):
+        messages.add(Stream.DVL, DvlSample(i, (1.0, 0.0, 0.0)))
+    assert messages.streams is not None and len(messages.streams.dvl) == 3
+    messages.add(Stream.IMU, "no_data")
+    assert messages.streams is None
