@@ -682,8 +682,8 @@ class Calibrator:
 
     def _without_tilt(self, estimate: Estimate) -> Estimate:
         """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
-        the vertical; and no roll where another lever arm is found than was told: an attitude of another time makes one,
-        and in waves a roll."""
+        the vertical, which leaves the arm's height open too; and no roll where another lever arm is found than was
+        told: an attitude of another time makes one, and in waves a roll."""
         model, p = MODELS[estimate.model], self.parameters
         needs = ""
         if self.is_level:
@@ -696,6 +696,9 @@ class Calibrator:
         level = p.rotation_dvl_from_body[:, :unknown_axes]
         unknown = np.zeros((model.n_state, model.n_state))
         unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
+        if needs == MEASURES_VERTICAL and told_arm.finds_arm(model):  # nor does anything show its height
+            height = model.state_names.index("lever_arm_z")
+            unknown[height, height] = p.initial_std_lever_arm**2
         own = estimate.recording_covariance + unknown
         return replace(
             estimate,

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
+from .chi_square import chi2_isf
 from .frames import Array
 from .kalman import GaussianState
 from .results import Estimate
 
-# Its rms (rad) is worth a word from here on, and where it is so many times its σ.
-SAID_FROM, SURELY = math.radians(0.3), 3.0
+# Its rms (rad) is worth a word from here on, where as much is found by chance so seldom where there is none.
+SAID_FROM, CHANCE = math.radians(0.3), 1e-3
 # From here on (rad) the compass is to be calibrated first (QRev's rule).
 FIRST = math.radians(3.0)
 # ... and where more than this share of the samples was gated, which are those that it turns most.
@@ -57,7 +58,8 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
     shown = terms @ coefficients.x
     rms = float(np.sqrt((shown**2).mean()))
     std = math.sqrt(max(float(np.einsum("ni,ij,nj->n", terms, coefficients.p, terms).mean()), 0.0))
-    if rms < SAID_FROM or rms < SURELY * std:
+    found = float(coefficients.x @ np.linalg.solve(coefficients.p, coefficients.x))
+    if rms < SAID_FROM or found < chi2_isf(CHANCE, len(coefficients.x)):
         return None
     most, least = int(np.argmax(shown)), int(np.argmin(shown))
     north = (0.5 * math.pi - yaw) % (2.0 * math.pi)

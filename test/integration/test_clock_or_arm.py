@@ -26,6 +26,14 @@ def bags(tmp_path_factory):
     return bags
 
 
+@pytest.mark.slow
+def test_of_all_runs_together_the_compass_is_named_and_nothing_of_the_height_is_claimed(bags):
+    run = dc.replay([bags / name for name in RUNS], history=False)
+    assert "HEADING_DEVIATION" in [found.code for found in run.findings]
+    observed = {each.axis: each.observed for each in run.replayed.result.estimate.observability}
+    assert observed["yaw"] and not (observed["roll"] or observed["pitch"] or observed["lever arm z"])
+
+
 @pytest.mark.parametrize("name", few(RUNS, RUNS[:1]))
 def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
     """It was -0.46 m ± 0.05; by differences of velocities it is 0.0 ± 0.1."""
