@@ -290,7 +290,7 @@ def in_words(navigation: Navigation) -> list[str]:
     said = [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
         f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
-        f"Noise of reference and DVL alone may make {metres(n.noise_per_km)} m of it."
+        f"Noise of reference and DVL alone may make {metres(n.noise_per_km)} m."
     ]
     said.append(
         f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"
