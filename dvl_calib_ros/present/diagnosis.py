@@ -10,12 +10,15 @@ import math
 import numpy as np
 
 from ..calibration.frames import Array
-from ..diagnosis.results import Diagnosis
+from ..diagnosis.noise_findings import NoiseFinding
+from ..diagnosis.results import Diagnosis, FoundEffect
 from ..diagnosis.series import DiagnosisSeries
+from ..diagnosis.where import GapPlace
 from ..effects.registry import EFFECTS
 from .document import (
     Answer,
     Cell,
+    Columns,
     Document,
     Facts,
     Item,
@@ -31,6 +34,7 @@ from .document import (
     p_value,
     share,
     signed,
+    table_by,
     three,
 )
 from .twin_table import twin_table
@@ -44,6 +48,32 @@ NOISE_MEANING = {
     "coloured_reference_noise": "the noise has a memory",
 }
 MAX_PLACES = 12
+PLACES = "Share: of the gap's energy. Places overlap: only the axes over all of the run add up."
+EFFECTS_NOTE = (
+    "The calibration is refitted with every effect. p is adjusted for all effects that were tried. Of names joined by "
+    "“or”, the parameters are those of the first."
+)
+WHERE: Columns[GapPlace] = {
+    "axis": lambda place: f"{place.axis} ({BODY_AXES[place.axis]})",
+    "regime": lambda place: place.regime,
+    "time, s": lambda place: "{:.0f} to {:.0f}".format(*place.segment_s),
+    "band, Hz": lambda place: "{:.2g} to {:.2g}".format(*place.band_hz),
+    "share": lambda place: share(place.share),
+    "p, adjusted": lambda place: p_value(place.p),
+}
+FOUND: Columns[FoundEffect] = {
+    "effect": lambda effect: " or ".join((effect.name, *effect.equivalent_to)),
+    "closes alone": lambda effect: share(effect.closure),
+    "p, adjusted": lambda effect: p_value(effect.p),
+    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, _units(effect.name)), "text"),
+}
+NEEDS: Columns[tuple[str, str]] = {"not testable": lambda each: each[0], "needs": lambda each: Cell(each[1], "text")}
+NOISE: Columns[NoiseFinding] = {
+    "finding": lambda found: found.name,
+    "meaning": lambda found: Cell(NOISE_MEANING.get(found.name, ""), "text"),
+    "parameters (95 %)": lambda found: Cell(intervals(found.parameters), "text"),
+    "p, adjusted": lambda found: p_value(found.p),
+}
 
 
 def diagnosis(d: Diagnosis) -> Document:
@@ -51,13 +81,21 @@ def diagnosis(d: Diagnosis) -> Document:
     found = [
         f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, _units(e.name))}." for e in d.effects
     ]
-    untestable = [_untestable_table(d)] if d.untestable else []
+    untestable = [table_by(NEEDS, d.untestable.items())] if d.untestable else []
     detectable = [_detectable_table(d)] if d.minimum_detectable else []
     following = Sentence(f"Next: {d.next_manoeuvre}.")
     series = d.series
     followed = (
         [figures("twin_section.followed_picture", series.followed, _axes(series))] if series and series.followed else []
     )
+    more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
+    of_each = [
+        (effect.name, recording, intervals(parameters, _units(effect.name)))
+        for effect in d.effects
+        for recording, parameters in effect.by_recording.items()
+    ]
+    cannot = "This data cannot tell {} from {}; each explains it as well."
+    alike = [Sentence(cannot.format(e.name, " or ".join(e.equivalent_to))) for e in d.effects if e.equivalent_to]
     has_closure = bool(d.effects) and math.isfinite(d.gap.closure)
     return Document(
         title="Sim-to-real gap of the DVL",
@@ -68,19 +106,19 @@ def diagnosis(d: Diagnosis) -> Document:
             Section("", [Numbers(_numbers(d))] if math.isfinite(d.gap.before) else []),
             Section("", [Facts(_facts(series))] if series else [], Where.PAGE),
             Section("", [Warned()], Where.PAGE),
-            Section("Where the gap lies", [_where_table(d)] if d.where else []),
+            Section("Where the gap lies", [table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))] if d.where else []),
             Section(
                 "" if d.where else "Regimes of motion",
                 [figures("diagnosis_pictures.regime_picture", series, bool(d.effects))] if series else [],
                 Where.PAGE,
             ),
-            Section("Which effects make it", [_effect_table(d)] if d.effects else []),
-            Section("", [_by_recording(d)] if any(e.by_recording for e in d.effects) else []),
+            Section("Which effects make it", [table_by(FOUND, d.effects, (EFFECTS_NOTE,))] if d.effects else []),
+            Section("", [Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)] if of_each else []),
             Section("", [figures("diagnosis_pictures.closure_picture", d)] if has_closure else [], Where.PAGE),
             *(_traces(d, series) + _twins(d, series) if series else []),
             Section("What is left", [Sentence(_left(d)), *followed], Where.PAGE),
-            Section("What this data cannot tell", [*_alternatives(d), following, *untestable, *detectable]),
-            Section("The noise", [_noise_table(d)] if d.noise else []),
+            Section("What this data cannot tell", [*alike, following, *untestable, *detectable]),
+            Section("The noise", [table_by(NOISE, d.noise)] if d.noise else []),
         ],
     )
 
@@ -187,53 +225,7 @@ def _left(d: Diagnosis) -> str:
     )
 
 
-def _alternatives(d: Diagnosis) -> list[Item]:
-    return [
-        Sentence(f"This data cannot tell {each.name} from {' or '.join(each.equivalent_to)}; each explains it as well.")
-        for each in d.effects
-        if each.equivalent_to
-    ]
-
-
 # ------------------------------------------------------------------ tables
-
-
-def _where_table(d: Diagnosis) -> Table:
-    rows = [
-        (
-            f"{place.axis} ({BODY_AXES[place.axis]})", place.regime, "{:.0f} to {:.0f}".format(*place.segment_s),
-            "{:.2g} to {:.2g}".format(*place.band_hz), share(place.share), p_value(place.p),
-        )
-        for place in d.where[:MAX_PLACES]
-    ]  # fmt: skip
-    notes = ["Share: of the gap's energy. Places overlap: only the axes over all of the run add up."]
-    if len(d.where) > MAX_PLACES:
-        notes.append(f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all.")
-    return Table(("axis", "regime", "time, s", "band, Hz", "share", "p, adjusted"), rows, notes=notes)
-
-
-def _effect_table(d: Diagnosis) -> Table:
-    rows = [
-        (
-            " or ".join((effect.name, *effect.equivalent_to)), share(effect.closure), p_value(effect.p),
-            Cell(intervals(effect.parameters, _units(effect.name)), "text"),
-        )
-        for effect in d.effects
-    ]  # fmt: skip
-    return Table(
-        ("effect", "closes alone", "p, adjusted", Cell("parameters (95 %)", "text")),
-        rows,
-        notes=(
-            "The calibration is refitted with every effect. p is adjusted for all effects that were tried. "
-            "Of names joined by “or”, the parameters are those of the first.",
-        ),
-    )
-
-
-def _untestable_table(d: Diagnosis) -> Table:
-    return Table(
-        ("not testable", Cell("needs", "text")), [(name, Cell(needs, "text")) for name, needs in d.untestable.items()]
-    )
 
 
 def _detectable_table(d: Diagnosis) -> Table:
@@ -254,24 +246,3 @@ def _detectable_table(d: Diagnosis) -> Table:
             "more than the size worth knowing of.",
         ),
     )
-
-
-def _noise_table(d: Diagnosis) -> Table:
-    rows = [
-        (
-            finding.name, Cell(NOISE_MEANING.get(finding.name, ""), "text"),
-            Cell(intervals(finding.parameters), "text"),
-            p_value(finding.p),
-        )
-        for finding in d.noise
-    ]  # fmt: skip
-    return Table(("finding", Cell("meaning", "text"), Cell("parameters (95 %)", "text"), "p, adjusted"), rows)
-
-
-def _by_recording(d: Diagnosis) -> Table:
-    rows = [
-        (effect.name, recording, intervals(parameters, _units(effect.name)))
-        for effect in d.effects
-        for recording, parameters in effect.by_recording.items()
-    ]
-    return Table(("effect", "recording", "parameters (95 %)"), rows, words=3)

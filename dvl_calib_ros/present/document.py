@@ -7,11 +7,11 @@ What a result says is laid out once, by the module of this room that is called a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
@@ -83,6 +83,19 @@ class Table:
         return pandas.DataFrame(
             [[_text(cell) for cell in row] for row in self.rows], columns=[_text(cell) for cell in self.head]
         )
+
+
+T = TypeVar("T")
+# Heading -> what a column holds of a row's object.
+Columns = Mapping[str, Callable[[T], str | Cell]]
+
+
+def table_by(columns: Columns[T], of: Iterable[T], notes: Sequence[str] = (), words: int = 1) -> Table:
+    """A row for each object, by what each column holds of it; headings of texts are aligned as these are."""
+    rows = [[column(each) for column in columns.values()] for each in of]
+    texts = [isinstance(cell, Cell) and cell.kind.startswith("text") for cell in rows[0]] if rows else ()
+    head = [Cell(name, "text") if is_text else name for name, is_text in zip(columns, texts, strict=False)]
+    return Table(head, rows, notes=notes, words=words)
 
 
 def _text(cell: str | Cell) -> str:

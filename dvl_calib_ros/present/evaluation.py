@@ -38,6 +38,15 @@ from .document import (
 
 # Deviation from a published figure up to which a cell is coloured so
 DEVIATIONS = ((0.05, "good"), (0.25, "off"), (0.5, "far"), (math.inf, "bad"))
+CONVERGENCE_NOTE = (
+    "Error of the misalignment, ° rms: of the whole angle / of pitch and yaw alone. Calibrated on each run with "
+    f"attitude, for each noise of the reference. A published network has {PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s."
+)
+BASELINES_NOTE = (
+    "The rotation alone by least squares on SO(3): of displacements (Kinsey and Whitcomb, 2007; here of the integrated "
+    "reference velocity, whose noise grows with time, where they had positions), and of velocities (Troni and "
+    "Whitcomb, 2010). They have neither scale nor prior."
+)
 # Shares that the intervals claim, and from where to where a share that was found is as claimed
 CLAIMED = ((0.68, (0.60, 0.76)), (0.95, (0.91, 0.98)))
 
@@ -49,6 +58,19 @@ def evaluation(e: Evaluation) -> Document:
         (e.single_heading, "Calibrated on stretches of a single heading"),
     ]
     shown = [each for each in e.convergence if each.name in MODELS]
+    by_time = [
+        (each.name, "all" if window is None else f"{window:g} s", *(number(value, 4) for value in row.tolist()))
+        for each, of_set in zip(e.sets, e.seed_mean_by_time, strict=True)
+        for window, row in zip(e.windows_s, of_set, strict=True)
+    ]
+    times = Table(("set", "first", *e.columns), by_time, notes=("Avg.VRMSE, m/s.",), words=2)
+    angles = [
+        (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
+        for k, seconds in enumerate(TIMES_S)
+    ]
+    converging = Table(("first", *(each.label for each in e.convergence)), angles, notes=(CONVERGENCE_NOTE,))
+    others = [(name, *(f"{value:.4f}" for value in each), f"{each.mean():.4f}") for name, each in e.baselines.items()]
+    baselines = Table(("Avg.VRMSE, m/s", *(each.name for each in e.sets), "mean"), others, notes=(BASELINES_NOTE,))
     return Document(
         title="Evaluation of the DVL calibration models",
         subtitle=e.source,
@@ -62,16 +84,14 @@ def evaluation(e: Evaluation) -> Document:
             Section("", [Warned()], Where.PAGE),
             Section("Velocity error after calibration", [_score_table(e)]),
             _pictures("", figures("evaluation_pictures.improvement_picture", e)),
-            Section("Velocity error against calibration time", [_time_table(e)], Where.TERMINAL),
+            Section("Velocity error against calibration time", [times], Where.TERMINAL),
             _pictures(
                 "Velocity error against calibration time",
                 figures("evaluation_pictures.time_pictures", e),
                 e.models,
                 "Rings: published." if np.isfinite(published_of(e)).any() else "",
             ),
-            Section(
-                "How fast is the misalignment found?", [_convergence_table(e)] if e.convergence else [], Where.TERMINAL
-            ),
+            Section("How fast is the misalignment found?", [converging] if e.convergence else [], Where.TERMINAL),
             *(
                 [
                     _pictures(
@@ -85,7 +105,7 @@ def evaluation(e: Evaluation) -> Document:
                 if shown
                 else []
             ),
-            Section("What was done before", [_baselines(e)] if e.baselines else []),
+            Section("What was done before", [baselines] if others else []),
             *_coverages(e),
             *_pull(e.errors_in_variables),
             *(each for study, title in studies for each in _study(e, study, title)),
@@ -162,7 +182,8 @@ def _numbers(e: Evaluation) -> Iterable[Number]:
 
 
 def _facts(e: Evaluation) -> list[tuple[str, str]]:
-    p = e.parameters
+    p, n = e.parameters, len(e.seeds)
+    seeds = ", ".join(map(str, e.seeds)) if n <= 10 else f"{e.seeds[0]} to {e.seeds[-1]} ({n})"
     sets = "; ".join(
         f"{each.name}: {each.calibration_run}, " + ("all" if each.window_s is None else f"first {each.window_s:g} s")
         for each in e.sets
@@ -170,7 +191,7 @@ def _facts(e: Evaluation) -> list[tuple[str, str]]:
     return [
         ("Trajectories", f"{len(e.trajectories)}: {', '.join(e.trajectories)}"),
         ("Calibrated on", sets),
-        ("Errors", f"{e.n_combinations} combinations of misalignment and scale, noise seeds {_listed(e.seeds)}"),
+        ("Errors", f"{e.n_combinations} combinations of misalignment and scale, noise seeds {seeds}"),
         (
             "Prior, all models",
             f"{math.degrees(p['initial_std_misalignment']):.3g}°, {100 * p['initial_std_scale']:.3g} % (1σ)",
@@ -180,15 +201,7 @@ def _facts(e: Evaluation) -> list[tuple[str, str]]:
     ]
 
 
-def _listed(seeds: Sequence[int]) -> str:
-    return ", ".join(map(str, seeds)) if len(seeds) <= 10 else f"{seeds[0]} to {seeds[-1]} ({len(seeds)})"
-
-
 # ------------------------------------------------------------------ scores
-
-
-def _deviation_kind(ratio: float) -> str:
-    return next(kind for limit, kind in DEVIATIONS if abs(ratio - 1.0) <= limit)
 
 
 def _score(value: float, published: float) -> str | Cell:
@@ -197,7 +210,8 @@ def _score(value: float, published: float) -> str | Cell:
     if not math.isfinite(published):
         return f"{value:.4f}"
     ratio = value / published
-    return Cell(f"{value:.4f}", _deviation_kind(ratio), f"{published:.4f} ×{ratio:.2f}")
+    kind = next(kind for limit, kind in DEVIATIONS if abs(ratio - 1.0) <= limit)
+    return Cell(f"{value:.4f}", kind, f"{published:.4f} ×{ratio:.2f}")
 
 
 def _score_table(e: Evaluation) -> Table:
@@ -215,42 +229,6 @@ def _score_table(e: Evaluation) -> Table:
             "beyond. Means are those of the cells beside them, not the paper's."
         )
     return Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
-
-
-def _time_table(e: Evaluation) -> Table:
-    rows = []
-    for each, of_set in zip(e.sets, e.seed_mean_by_time, strict=True):
-        for window, row in zip(e.windows_s, of_set, strict=True):
-            first = "all" if window is None else f"{window:g} s"
-            rows.append((each.name, first, *(number(value, 4) for value in row.tolist())))
-    return Table(("set", "first", *e.columns), rows, notes=("Avg.VRMSE, m/s.",), words=2)
-
-
-def _convergence_table(e: Evaluation) -> Table:
-    rows = [
-        (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
-        for k, seconds in enumerate(TIMES_S)
-    ]
-    note = (
-        "Error of the misalignment, ° rms: whole angle / pitch and yaw. Calibrated on each run with attitude; by the "
-        f"noise of the reference. Published for a network: {PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s."
-    )
-    return Table(("first", *(each.label for each in e.convergence)), rows, notes=(note,))
-
-
-def _baselines(e: Evaluation) -> Table:
-    rows = [
-        (name, *(f"{value:.4f}" for value in values), f"{values.mean():.4f}") for name, values in e.baselines.items()
-    ]
-    return Table(
-        ("Avg.VRMSE, m/s", *(each.name for each in e.sets), "mean"),
-        rows,
-        notes=(
-            "The rotation alone by least squares on SO(3): of displacements (Kinsey and Whitcomb, 2007; here of the "
-            "integrated reference velocity, whose noise grows with time, where they had positions), and of velocities "
-            "(Troni and Whitcomb, 2010). They have neither scale nor prior.",
-        ),
-    )
 
 
 # ------------------------------------------------------------------ uncertainty
@@ -341,10 +319,12 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> list[Section]:
             for name, value in zip(e.columns, values, strict=True)
         ]
         rows.append((label, f"{math.degrees(run.heading_spread):.0f}", *cells))
-    rows.append(_median_row("median", study.median()))
-    manoeuvring = study.median(MANOEUVRING)
-    if np.isfinite(manoeuvring).any():
-        rows.append(_median_row(f"of {MANOEUVRING[0]} .. {MANOEUVRING[-1]}", manoeuvring))
+    medians = {"median": study.median(), f"of {MANOEUVRING[0]} .. {MANOEUVRING[-1]}": study.median(MANOEUVRING)}
+    rows += [
+        (name, "", *(number(value, 4) for value in each.tolist()))
+        for name, each in medians.items()
+        if name == "median" or np.isfinite(each).any()
+    ]
     notes = (
         "Avg.VRMSE on all other trajectories, m/s. Headings: their circular standard deviation. ? marks where the "
         "model mostly says that it has not seen yaw; – where it cannot run.",
@@ -355,10 +335,6 @@ def _study(e: Evaluation, study: EachStudy | None, title: str) -> list[Section]:
         Section(title, [table], Where.TERMINAL),
         Section("", [table], Where.PAGE),
     ]
-
-
-def _median_row(name: str, medians: Array) -> tuple[str, ...]:
-    return (name, "", *(number(value, 4) for value in medians.tolist()))
 
 
 def best_of_trace(trace: Trace) -> str:
@@ -391,11 +367,9 @@ def _held_out(held_out: Sequence[HeldOut]) -> list[Section]:
         "reference is in all errors.",
     )
 
-    def draw(name: str) -> Section:
-        of_set = [each for each in held_out if each.set_name == name]
-        return _pictures("", figures("evaluation_pictures.held_out_picture", name, of_set))
-
-    return [Section("Held-out verification", [Table(("model", *sets), rows, notes=notes)]), *map(draw, sets)]
+    by_set = {name: [each for each in held_out if each.set_name == name] for name in sets}
+    drawn = [_pictures("", figures("evaluation_pictures.held_out_picture", *each)) for each in by_set.items()]
+    return [Section("Held-out verification", [Table(("model", *sets), rows, notes=notes)]), *drawn]
 
 
 def _held_out_cell(each: HeldOut | None) -> str | Cell:

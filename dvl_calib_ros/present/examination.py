@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 
-from ..examination.examine import NO_IMU, Examination, Shown
+from ..examination.examine import NO_IMU, Content, Examination, Shown
 from ..verdict.kinds import Severity
 from ..verdict.reasons import full
-from .document import Answer, Cell, Commands, Document, FindingLine, Section, Sentence, Table
+from .document import Answer, Cell, Columns, Commands, Document, FindingLine, Section, Sentence, table_by
 
 BAR = 20
 ANSWERS = {
@@ -31,12 +31,12 @@ def examination(examined: Examination) -> Document:
         answer=Answer(examined.verdict, severity, [f"{answer} {_why(examined)}".rstrip()]),
         warnings=examined.notes,
         sections=[
-            Section(f"{names}: {examined.seconds:.0f} s", [_contents(examined), *said]),
+            Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *said]),
             Section(
                 f"Findings: {len(found)}" if found else "Nothing wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
-            Section(motion, [_shown(examined.shown)] if examined.shown else [Sentence(nothing)]),
+            Section(motion, [table_by(SHOWN, examined.shown, words=4)] if examined.shown else [Sentence(nothing)]),
             Section("", [Commands(next_commands(examined))]),
         ],
         lead=full(found[0].says) if found and found[0].code.startswith(NO_IMU) else "",
@@ -53,25 +53,25 @@ def _why(examined: Examination) -> str:
     return f"It does not show {' and '.join(missing)}." if missing else ""
 
 
-def _contents(examined: Examination) -> Table:
-    rows = [
-        (
-            each.role, each.topic, each.frame_id, f"{each.rate_hz:.3g}" if each.rate_hz else "–",
-            each.covariance.removesuffix(" always"),
-        )
-        for each in examined.contents
-    ]  # fmt: skip
-    return Table(("", "topic", "frame", "Hz", "claims"), rows, words=5)
+def _bar(each: Shown) -> Cell:
+    full = round(BAR * each.share)
+    kind = "good" if each.share >= 1.0 else "off" if not each.needs else "bad"
+    return Cell("█" * full + "░" * (BAR - full), f"bar {kind}")
 
 
-def _shown(shown: tuple[Shown, ...]) -> Table:
-    rows = []
-    for each in shown:
-        full = round(BAR * each.share)
-        kind = "good" if each.share >= 1.0 else "off" if not each.needs else "bad"
-        bar = Cell("█" * full + "░" * (BAR - full), f"bar {kind}")
-        rows.append((each.name, bar, f"±{each.std:.2f} {each.unit}", each.needs))
-    return Table(("", "shown", "expected ±1σ", "needs"), rows, words=4)
+CONTENTS: Columns[Content] = {
+    "": lambda each: each.role,
+    "topic": lambda each: each.topic,
+    "frame": lambda each: each.frame_id,
+    "Hz": lambda each: f"{each.rate_hz:.3g}" if each.rate_hz else "–",
+    "claims": lambda each: each.covariance.removesuffix(" always"),
+}
+SHOWN: Columns[Shown] = {
+    "": lambda each: each.name,
+    "shown": _bar,
+    "expected ±1σ": lambda each: f"±{each.std:.2f} {each.unit}",
+    "needs": lambda each: each.needs,
+}
 
 
 def next_commands(examined: Examination) -> list[tuple[str, str]]:

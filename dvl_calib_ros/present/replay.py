@@ -110,13 +110,19 @@ def replayed(
         drawn = figures("replay_pictures.velocity_pictures", run, history)
         velocities = [Sentence(_velocity_note(run), soft=True), drawn]
         data = [figures("replay_pictures.data_pictures", result, history, shown)]
+    drift = run.navigation
+    worth = [] if drift is None else [Worth(metres(drift.before.per_km), metres(drift.after.per_km))]
+    said = [
+        Sentence(f"? {axes}: not shown by this recording; it needs {lacks}")
+        for lacks, axes in not_shown(result).items()
+    ]
     return Document(
         title="DVL calibration",
         subtitle=", ".join(bag.name or str(bag) for bag in bags),
         answer=_answer(verification),
         warnings=own,
         sections=[
-            Section("", _worth(run) if not rejected else [], Where.PAGE),
+            Section("", worth if not rejected else [], Where.PAGE),
             Section(_headline(run, rejected), _mounting(run, rejected)),
             Section("", [] if rejected else [figures("mounting_figures.mounting_pictures", result)], Where.PAGE),
             Section("", [Facts(_facts(run, bags))], Where.PAGE),
@@ -124,7 +130,7 @@ def replayed(
             Section("", [] if rejected else [_paste(run)]),
             Section("", [Warned()], Where.PAGE),
             Section("What it means for navigation", _navigation(run)),
-            Section("", _not_shown(run), Where.TERMINAL),
+            Section("", said, Where.TERMINAL),
             Section(
                 "",
                 [Commands([("next" if not k else "", each) for k, each in enumerate(commands)])] if commands else [],
@@ -163,12 +169,6 @@ def _headline(run: Replayed, rejected: bool) -> str:
     turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
     return f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} {data}"
-
-
-def _worth(run: Replayed) -> list[Item]:
-    if run.navigation is None:
-        return []
-    return [Worth(metres(run.navigation.before.per_km), metres(run.navigation.after.per_km))]
 
 
 def _mounting(run: Replayed, rejected: bool) -> list[Item]:
@@ -230,14 +230,6 @@ def _navigation(run: Replayed) -> list[Item]:
     history = run.history
     pictures = [] if history is None else [figures("replay_pictures.navigation", navigation, history)]
     return [*map(Sentence, in_words(navigation)), *([Map(navigation)] if navigation.on_a_map else []), *pictures]
-
-
-def _not_shown(run: Replayed) -> list[Item]:
-    """What the recording does not show, and the manoeuvre that would; one sentence per cause."""
-    return [
-        Sentence(f"? {axes}: not shown by this recording; it needs {missing}")
-        for missing, axes in not_shown(run.result).items()
-    ]
 
 
 def not_shown(result: Result) -> dict[str, str]:

@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
-from ..unpaired.results import ComparedEffect, ComparedNoise, ComparisonStatus, SimulatorVerdict, UnpairedComparison
+from ..unpaired.results import (
+    ComparedEffect,
+    ComparedNoise,
+    ComparisonStatus,
+    Rung,
+    SimulatorVerdict,
+    UnpairedComparison,
+)
 from ..verdict.kinds import Severity
-from .document import Answer, Cell, Document, Section, Sentence, Table, Where, figures, interval, intervals, p_value
+from .document import (
+    Answer,
+    Cell,
+    Columns,
+    Document,
+    Section,
+    Sentence,
+    Table,
+    Where,
+    figures,
+    interval,
+    intervals,
+    p_value,
+    table_by,
+)
 
 SEVERITIES = {
     SimulatorVerdict.NO_DIFFERENCE: Severity.ACCEPT,
@@ -16,10 +37,49 @@ SEVERITIES = {
 }
 CELLS = {ComparisonStatus.MISSING: "bad", ComparisonStatus.OTHER_SIZE: "off", ComparisonStatus.ONLY_SIMULATOR: "off"}
 MM = 1e3
+EFFECTS: Columns[ComparedEffect] = {
+    "effect": lambda each: " or ".join((each.name, *each.equivalent_to)),
+    "": lambda each: Cell(each.status.words, CELLS.get(each.status, "")),
+    "vehicle (95 %)": lambda each: Cell(intervals(each.vehicle), "text"),
+    "simulator (95 %)": lambda each: Cell(intervals(each.simulator), "text"),
+    "adds, mm/s": lambda each: f"{MM * each.adds_mps:.1f}",
+    "mostly on": lambda each: str(each.lies or "–"),
+    "p, adjusted": lambda each: p_value(each.p),
+}
+EFFECTS_NOTE = (
+    "Each effect is fitted to both logs, whichever was found to have it. p: that both have the same size, adjusted for "
+    "all claims of this page. Adds: beyond what misalignment and scale take in."
+)
+LEVELS = ("noise of the DVL by regime, mm/s", "vehicle", "simulator")
+RUNGS: Columns[Rung] = {
+    "simulator": lambda r: r.name,
+    "error, mm/s": lambda r: f"{MM * r.error_mps:.1f}",
+    "energy distance": lambda r: f"{r.distance:.2f}",
+    "alike: below": lambda r: f"{r.null95:.2f}",
+    "p": lambda r: p_value(r.p),
+}
+RUNGS_NOTE = (
+    "On stretches of the vehicle's own motion that were held out; noise of {:.1f} mm/s stays in the error. Energy "
+    "distance: between windows of recorded and simulated velocity, each less that of an ideal DVL, by their means and "
+    "scatter on the axes."
+)
+NOISE: Columns[ComparedNoise] = {
+    "property": lambda each: each.name,
+    "": lambda each: Cell(each.status.words, CELLS.get(each.status, "")),
+    "vehicle (95 %)": lambda each: interval(each.vehicle),
+    "simulator (95 %)": lambda each: interval(each.simulator),
+    "unit": lambda each: each.unit,
+    "p, adjusted": lambda each: p_value(each.p),
+    "remarks": lambda each: each.note,
+}
 
 
 def unpaired(c: UnpairedComparison) -> Document:
     """What the simulator's DVL lacks, how far the gap shrinks with it, and what could not be told."""
+    needs = [Sentence(f"To tell {each.name}: {each.needs}.") for each in c.effects if each.needs]
+    effects = table_by(EFFECTS, c.effects, (EFFECTS_NOTE,), words=len(EFFECTS))
+    rungs = table_by(RUNGS, c.rungs, (RUNGS_NOTE.format(MM * c.floor_mps),))
+    levels = [(name, *(f"{MM * each:.1f}" for each in both)) for name, both in c.levels.items()]
     sides = {"vehicle": c.vehicle, "simulator": c.simulator}
     return Document(
         title="The DVL of a simulator against that of the vehicle",
@@ -27,11 +87,14 @@ def unpaired(c: UnpairedComparison) -> Document:
         answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [c.sentence]),
         warnings=c.notes,
         sections=[
-            Section("Effect by effect", [_effects(c.effects), *_needs(c.effects)] if c.effects else []),
-            Section("How far the gap shrinks", [_rungs(c)] if c.rungs else []),
+            Section("Effect by effect", [effects, *needs] if c.effects else []),
+            Section(
+                "How far the gap shrinks",
+                [rungs] if c.rungs else [],
+            ),
             Section("", [figures("unpaired_figures.shrink_pictures", c)] if c.rungs else [], Where.PAGE),
-            Section("Noise and stream", [_noise(c.noise)] if c.noise else []),
-            Section("", [_levels(c)] if c.levels else [], Where.TERMINAL),
+            Section("Noise and stream", [table_by(NOISE, c.noise, words=len(NOISE))] if c.noise else []),
+            Section("", [Table(LEVELS, levels)] if levels else [], Where.TERMINAL),
             Section("", [figures("unpaired_figures.noise_pictures", c)], Where.PAGE),
             Section("What the motions could not have shown", _not_shown(c)),
             Section(
@@ -41,56 +104,6 @@ def unpaired(c: UnpairedComparison) -> Document:
             ),
         ],
     )
-
-
-def _effects(effects: Sequence[ComparedEffect]) -> Table:
-    rows = [
-        (
-            " or ".join((each.name, *each.equivalent_to)), Cell(each.status.words, CELLS.get(each.status, "")),
-            Cell(intervals(each.vehicle), "text"), Cell(intervals(each.simulator), "text"),
-            f"{MM * each.adds_mps:.1f}", str(each.lies or "–"), p_value(each.p),
-        )
-        for each in effects
-    ]  # fmt: skip
-    notes = [
-        "Each effect is fitted to both logs, whichever was found to have it. p: that both have the same size, adjusted "
-        "for all claims of this page. Adds: beyond what misalignment and scale take in."
-    ]
-    head = ("effect", "", "vehicle (95 %)", "simulator (95 %)", "adds, mm/s", "mostly on", "p, adjusted")
-    return Table(head, rows, notes=notes, words=len(head))
-
-
-def _needs(effects: Sequence[ComparedEffect]) -> list[Sentence]:
-    return [Sentence(f"To tell {each.name}: {each.needs}.") for each in effects if each.needs]
-
-
-def _rungs(c: UnpairedComparison) -> Table:
-    rows = [
-        (r.name, f"{MM * r.error_mps:.1f}", f"{r.distance:.2f}", f"{r.null95:.2f}", p_value(r.p)) for r in c.rungs
-    ]  # fmt: skip
-    notes = [
-        f"On stretches of the vehicle's own motion that were held out; noise of {MM * c.floor_mps:.1f} mm/s stays in "
-        "the error. Energy distance: between windows of recorded and simulated velocity, each less that of an ideal "
-        "DVL, by their means and scatter on the axes."
-    ]
-    return Table(("simulator", "error, mm/s", "energy distance", "alike: below", "p"), rows, notes=notes)
-
-
-def _noise(noise: Sequence[ComparedNoise]) -> Table:
-    rows = [
-        (
-            each.name, Cell(each.status.words, CELLS.get(each.status, "")), interval(each.vehicle),
-            interval(each.simulator), each.unit, p_value(each.p), each.note,
-        )
-        for each in noise
-    ]  # fmt: skip
-    head = ("property", "", "vehicle (95 %)", "simulator (95 %)", "unit", "p, adjusted", "")
-    return Table(head, rows, words=len(head))
-
-
-def _levels(c: UnpairedComparison) -> Table:
-    rows = [(name, *(f"{MM * each:.1f}" for each in both)) for name, both in c.levels.items()]
-    return Table(("noise of the DVL by regime, mm/s", "vehicle", "simulator"), rows)
 
 
 def _not_shown(c: UnpairedComparison) -> list[Table]:
