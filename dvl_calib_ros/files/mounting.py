@@ -122,6 +122,11 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         saved = rotation_from_rpy(np.array(content["mounting"]["corrected_rpy"], dtype=float).reshape(3))
         frames = (str(content["mounting"]["frame_id"]), str(content["mounting"]["child_frame_id"]))
         turned = content["mounting"].get("dvl_data_axes") == FRD
+        told = {
+            name: np.array(content["mounting"][name], dtype=float).reshape(3)
+            for name in ("lever_arm", "position")
+            if content["mounting"].get(name) is not None
+        }
         convergence = Convergence(content["models"][model.name]["convergence"])
         objections, doubts = _judged(content.get("verification"), convergence)
         if "verification" not in content:
@@ -134,8 +139,14 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     errors = model.error_terms_from_state @ state.x
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
     arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
-    if not angle_between(rotation, saved) < 1e-6:
+    at_hand = {"lever_arm": arm, "position": position}
+    agree = all(np.allclose(told[name], at_hand[name] or told[name], rtol=0.0, atol=1e-6) for name in told)
+    if not (angle_between(rotation, saved) < 1e-6 and agree):
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
+    if parameters.dvl_frame not in ("", frames[1]):
+        raise InputError(
+            f"{path}: its mounting is of {frames[1]!r}, its parameters of {parameters.dvl_frame!r}; save it again"
+        )
     doubts += _unseen(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
     return CalibratedMounting(
@@ -212,9 +223,10 @@ def calibrated_urdf(
     begun_with = calibrated.parameters.rotation_dvl_from_body.T
     if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
         corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
-    moves = calibrated.position is not None and calibrated.lever_arm_found and not keep_position
-    position = np.array(calibrated.position) if moves else mounting.position
-    is_there = np.abs(mounting.position - position).max() < ALREADY
+    known = None if keep_position or calibrated.position is None else np.array(calibrated.position)
+    position = mounting.position if known is None else known
+    near = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # what was told may be rounded
+    is_there = np.abs(mounting.position - position).max() < near
     if angle_between(now, corrected) < ALREADY and is_there:
         return urdf.content
     if angle_between(now, begun_with) > SAME_MOUNTING and angle_between(now, corrected) > ALREADY and not force:
@@ -226,10 +238,11 @@ def calibrated_urdf(
         )
     began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
     if not is_there and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
+        found = f" and found {numbers(_rounded(position))}" if calibrated.lever_arm_found else ""
         raise InputError(
             f"{urdf.path}: has the DVL at {numbers(mounting.position)} in {calibrated.base_frame} (joint "
-            f"{mounting.joint.name}), but {calibrated.path} began with {numbers(began_at)} and found "
-            f"{numbers(_rounded(position))}; --keep-position turns the joint alone, --force moves it there"
+            f"{mounting.joint.name}), but {calibrated.path} began with {numbers(began_at)}{found}; --keep-position "
+            "turns the joint alone, --force moves it there"
         )
     return urdf.moved(mounting, corrected, None if is_there else position)
 

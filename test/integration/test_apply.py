@@ -7,6 +7,7 @@ import math
 import re
 import shlex
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.scenario import write_bag as write_scenario
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
+DVL_AT = (0.622423073, -0.0147556543, 0.238813905)  # in the URDF
 MOUNTING = (0.1, -0.2, 0.7)
 CHAIN = (0.3, 0.2, -1.1)  # of the frame that carries the DVL, in the body
 ODD = """<?xml version='1.0' encoding='UTF-8'?>\r
@@ -56,7 +58,7 @@ def result(tmp_path_factory):
     errors = DvlErrors((0.02, -0.03, 0.05), (0.004,) * 3, beam_std=0.002)
     scenario = Scenario("box", 120.0, imu_rate=20, errors=errors, mounting_rpy=MOUNTING, gnss_std=0.01)
     write_scenario(scenario, bag, Storage.MCAP, Compression.NONE)
-    return bag, replayed(bag, mounting_rpy=MOUNTING, dvl_position="told").result
+    return bag, replayed(bag, mounting_rpy=MOUNTING, dvl_position="told", reference_position=DVL_AT).result
 
 
 @pytest.fixture(scope="module")
@@ -149,12 +151,41 @@ def test_an_origin_may_be_written_in_any_way(tmp_path, result, origin, expected)
     joint = f'<joint type="fixed" name="j"><parent link="base_link"/>{origin}<child link="dvl_link"/></joint>'
     urdf = tmp_path / "r.urdf"
     urdf.write_text(f"\ufeff<robot>{joint}</robot>")
-    assert apply(change(tmp_path / "r.yaml", found), "--urdf", urdf, "--force") == 0
+    assert apply(change(tmp_path / "r.yaml", found), "--urdf", urdf, "--force", "--keep-position") == 0
     text = urdf.read_text()
     written = [float(word) for word in re.search(r"rpy=['\"]([^'\"]*)", text)[1].split()]
     assert written == pytest.approx([float(word) for word in rpy.split()], abs=1e-8)
     assert expected.format(" ".join(f"{value:.9g}" for value in written)) in text
     assert ElementTree.fromstring(text.removeprefix("\ufeff")).tag == "robot"
+
+
+def test_a_urdf_whose_dvl_is_elsewhere_than_was_told_is_refused(tmp_path, result, capsys):
+    """The same joint of another vehicle, or of yesterday's: a lever arm that is taken for granted must not be two."""
+    parameters = result[1].parameters | {"reference_position": [0.9, 0.0, 0.2]}
+    path = change(tmp_path / "r.yaml", replace(result[1], parameters=parameters))
+    urdf = robot(tmp_path / "robot.urdf")
+    before = urdf.read_bytes()
+    assert "has the DVL at 0.622423073 -0.0147556543 0.238813905" in (said := refused(capsys, path, "--urdf", urdf))
+    assert "began with 0.9 0 0.2; --keep-position" in said and urdf.read_bytes() == before
+    assert apply(path, "--urdf", urdf, "--keep-position") == 0
+
+
+@pytest.mark.parametrize("key, value", [("lever_arm", [0.5, 0.0, 0.0]), ("position", [0.5, 0.0, 0.0])])
+def test_a_result_that_says_two_lever_arms_is_refused(tmp_path, result, capsys, key, value):
+    mounting = result_document(result[1])["mounting"] | {key: value}
+    path = change(tmp_path / "r.yaml", result[1], mounting=mounting)
+    assert "does not follow from its states; was it changed by hand" in refused(
+        capsys, path, "--launch", tmp_path / "l"
+    )
+    path = change(tmp_path / "r.yaml", result[1], mounting=mounting | {key: "x"})
+    assert "damaged, or of another version" in refused(capsys, path, "--launch", tmp_path / "l")
+
+
+def test_a_result_of_two_frames_is_refused(tmp_path, result, capsys):
+    found = replace(result[1], parameters=result[1].parameters | {"dvl_frame": "dvl_a"})
+    mounting = result_document(found)["mounting"] | {"child_frame_id": "dvl_b"}
+    path = change(tmp_path / "r.yaml", found, mounting=mounting)
+    assert "is of 'dvl_b', its parameters of 'dvl_a'" in refused(capsys, path, "--launch", tmp_path / "l")
 
 
 def test_a_calibration_that_starts_from_the_applied_urdf_finds_nothing_more(tmp_path, result, saved, capsys):
