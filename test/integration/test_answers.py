@@ -252,6 +252,6 @@ def test_the_answer_says_against_what_its_angles_are(tmp_path, capsys, has_refer
         vehicle(told)
     out, _ = succeed(capsys, "replay", told.write(tmp_path / "bag"))
     said = " ".join(out.split())
-    own = "one of its level in roll and pitch, and both are harmless with that IMU"
-    crab = "a constant crab is in the yaw, and one that goes astern is turned round"
+    own = "a constant error of its heading is in the yaw, one of its level in roll and pitch"
+    crab = "driving astern looks like a DVL turned by 180°"
     assert (own in said, crab in said) == (has_reference, not has_reference)

@@ -58,8 +58,8 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     out, _ = succeed(capsys, "replay", *bags, "--json", tmp_path / "r.json", "--save", tmp_path / "r.yaml")
     said = " ".join(out.split())
     assert re.search(r"reject: Do not use this calibration. The mounting differs by 2\.[0-3]\d° ± 0", said)
-    assert "5 Hz" in said and "of 360 s" in said  # the nights are not counted
-    assert "(tuesday) and" in said and "(wednesday): all together are averaged" in said
+    assert "5 Hz" in said and "360 s of data" in said  # the nights are not counted
+    assert "(tuesday) and" in said and "(wednesday): the average of all" in said
     document = json.loads((tmp_path / "r.json").read_text())
     assert document["recordings"]["moved"][0]["first_after"] == "wednesday"
     assert document["verification"]["G1"]["verdict"] == "reject"
