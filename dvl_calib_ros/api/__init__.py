@@ -93,10 +93,19 @@ def replay(
     **parameters
         Any of the node's parameters, in SI units, such as ``mounting_rpy=(0, 0, 0.785)``.
 
+    Returns
+    -------
+    Calibration
+        ``mounting`` with σ, ``verdict`` with its reasons, and `Calibration.correct`, ``save``, ``plot``, ``report``.
+
     Raises
     ------
     InputError, ParameterError
         For what is no bag, has no DVL, or cannot be a parameter.
+
+    References
+    ----------
+    The models M1 to M7 are those of Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
     """
     from ..replay.checked import checked_replay
 
@@ -174,7 +183,23 @@ def doctor(
     params: StrPath | None = None,
     **parameters: Any,
 ) -> Examination:
-    """Say what is in recordings, what is wrong with them, and whether they can calibrate; arguments as `replay`."""
+    """Say what is in recordings, what is wrong with them, and whether they can calibrate, as ``dvl-calib doctor``.
+
+    Parameters
+    ----------
+    bags, dvl_topic, gnss_topic, imu_topic, params, **parameters
+        As of `replay`.
+
+    Returns
+    -------
+    Examination
+        ``verdict``: yes, partly or no; ``findings``, and what the motion ``shown`` is good for, with σ to expect.
+
+    Raises
+    ------
+    InputError, ParameterError
+        As `replay`.
+    """
     from ..examination.examine import examine
 
     merged, names = _parameters(params, parameters)
@@ -199,6 +224,11 @@ def diagnose(
         As of `replay`.
     simulator
         Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
+
+    Returns
+    -------
+    Diagnosis or UnpairedComparison
+        ``verdict``, ``effects`` with 95 % intervals, ``noise``, and what could not be told. The second with simulator.
 
     Raises
     ------
@@ -242,6 +272,11 @@ def simulate(
     **scenario_fields
         Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
 
+    Returns
+    -------
+    Path
+        The bag.
+
     Raises
     ------
     InputError
@@ -284,6 +319,20 @@ def evaluate(
         Of bags; those of `dvl-calib simulate` where not named.
     **parameters
         Any of the node's parameters, in SI units.
+
+    Returns
+    -------
+    Evaluation or CrossCheck
+        Velocity errors by model and set of trajectories; of bags, by the bag that calibrated and the one that verified.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For trajectories or bags that cannot be read, and for a model or parameter that there is not.
+
+    References
+    ----------
+    Avg.VRMSE and the procedure are those of Yampolsky and Klein; see the page Evaluation.
     """
     from ..evaluation.bags import cross_check
     from ..evaluation.evaluate import DEFAULTS, EVALUATED
@@ -438,6 +487,11 @@ def export(simulator: str, source: StrPath, output: StrPath) -> Export:
     output
         File to write; what the simulator cannot represent is beside it, as FILE.missing.json.
 
+    Returns
+    -------
+    Export
+        ``settings``, and what is ``missing`` in the simulator with the error that it makes.
+
     Raises
     ------
     InputError
@@ -454,7 +508,19 @@ def report(
 ) -> Path:
     """Write a result as a page (HTML), or with all its figures as JSON where the path ends in .json.
 
-    They are what ``--report`` and ``--json`` of the commands write; a `Comparison` may be a picture (.png) as well.
+    They are what ``--report`` and ``--json`` of the commands write.
+
+    Parameters
+    ----------
+    result
+        What a function of this module returned.
+    path
+        File to write: .html, .json, and of a `Comparison` .png as well.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Raises
     ------

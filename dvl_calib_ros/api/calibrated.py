@@ -164,10 +164,20 @@ class Calibration:
         )
 
     def correct(self, velocity_dvl: Array, angular_velocity: Array | None = None) -> Array:
-        """Measured velocities (..., 3) m/s, forward-left-up axes of the DVL, to corrected ones in the body.
+        """Turn measured velocities into corrected ones in the body.
 
-        With angular_velocity, (..., 3) rad/s in the body, they are those of the reference point, by the lever arm that
-        was found; without, of the place where the DVL is. They are of ``mounting.time_offset_s`` before their stamps.
+        Parameters
+        ----------
+        velocity_dvl
+            Measured velocities (..., 3), m/s, in the DVL's forward-left-up axes.
+        angular_velocity
+            Angular velocities (..., 3), rad/s, in the body's axes; takes out what the lever arm adds in turns.
+
+        Returns
+        -------
+        ndarray
+            Velocities (..., 3), m/s, in the body's axes: of the reference point with angular_velocity, else of the
+            DVL's own place. They are of ``mounting.time_offset_s`` before their stamps.
         """
         rotation = self.discovery.parameters.rotation_dvl_from_body
         velocity = self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
@@ -176,9 +186,17 @@ class Calibration:
         return velocity - np.cross(np.asarray(angular_velocity, dtype=float), self.mounting.xyz_m)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """The selected model over time: time in s since the first DVL sample, states in SI with their σ as *_std.
+        """Give the selected model over time.
 
-        Raises InputError without pandas, or if the replay kept no history.
+        Returns
+        -------
+        pandas.DataFrame
+            ``time_s`` since the first DVL sample, and the states in SI units with their σ as ``*_std``.
+
+        Raises
+        ------
+        InputError
+            Without pandas, or if the replay kept no history.
         """
         try:
             import pandas
@@ -195,7 +213,18 @@ class Calibration:
         return pandas.DataFrame(columns)
 
     def plot(self) -> Figure:
-        """The mounting over time with its ±1σ, and the velocity error before and after, as a matplotlib Figure."""
+        """Draw the mounting over time with its ±1σ, and the velocity error before and after.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            To show or save.
+
+        Raises
+        ------
+        InputError
+            If the replay kept no history.
+        """
         from ..present.calibration_figure import calibration_figure
 
         if self.replayed.history is None:
@@ -203,7 +232,23 @@ class Calibration:
         return calibration_figure(self.replayed)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the result file (YAML), from which the node and `dvl-calib apply` go on. Raises InputError."""
+        """Write the result file, from which the node and `dvl-calib apply` go on.
+
+        Parameters
+        ----------
+        path
+            File to write (YAML); earlier ones are kept beside it.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
         from ..files.result_file import result_document, save_result
 
         target = Path(path)
@@ -212,7 +257,23 @@ class Calibration:
         return target
 
     def report(self, path: str | os.PathLike[str]) -> Path:
-        """Write the report (HTML) with pictures. Raises InputError."""
+        """Write the report with pictures.
+
+        Parameters
+        ----------
+        path
+            File to write (HTML).
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
         from ..present.reports import write_replay_report
 
         target = Path(path)
@@ -220,7 +281,18 @@ class Calibration:
         return target
 
     def document(self, models: Sequence[str] = tuple(MODELS)) -> dict[str, Any]:
-        """All of it as plain data, of the models named: what `dvl-calib replay --json` writes."""
+        """Give all of it as plain data: what `dvl-calib replay --json` writes.
+
+        Parameters
+        ----------
+        models
+            Names of the models to include.
+
+        Returns
+        -------
+        dict
+            As docs/json_schema.json describes.
+        """
         from ..replay.document import replay_document
 
         return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}

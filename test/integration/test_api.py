@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import re
 import subprocess
 import sys
 import textwrap
@@ -262,3 +264,19 @@ def test_the_notebook_runs_from_its_own_folder_and_its_stored_output_is_what_com
     said = [cell.outputs[0].data["text/plain"] for cell in stored.cells if cell.source.endswith("run.mounting")]
     again = [cell.outputs[0].data["text/plain"] for cell in notebook.cells if cell.source.endswith("run.mounting")]
     assert said == again == [str(dc.replay(ROOT / "bags" / "harbour_box", history=False).mounting)]
+
+
+FUNCTIONS = [each for each in map(dc.__dict__.get, PUBLIC) if inspect.isfunction(each)]
+METHODS = [each for name, each in vars(dc.Calibration).items() if inspect.isfunction(each) and name[0] != "_"]
+
+
+@pytest.mark.parametrize("function", [*FUNCTIONS, *METHODS], ids=lambda each: each.__qualname__)
+def test_each_function_says_what_it_takes_gives_and_raises(function):
+    """In sections of numpydoc, which the API page renders; every parameter by its name."""
+    sections = re.split(r"\n(?=[A-Z][a-z]+\n-+\n)", inspect.getdoc(function) or "")
+    texts = {section.partition("\n")[0]: section for section in sections}
+    taken = [name for name in inspect.signature(function).parameters if name != "self"]
+    assert "Returns" in texts and ("Parameters" in texts) is bool(taken)
+    named = re.findall(r"[a-z]\w+", " ".join(re.findall(r"^\S.*$", texts.get("Parameters", ""), re.MULTILINE)))
+    assert set(taken) <= set(named)
+    assert "Raises" in texts or function.__name__ in ("correct", "document")
