@@ -266,7 +266,7 @@ def test_the_notebook_runs_from_its_own_folder_and_its_stored_output_is_what_com
     assert said == again == [str(dc.replay(ROOT / "bags" / "harbour_box", history=False).mounting)]
 
 
-FUNCTIONS = [each for each in map(dc.__dict__.get, PUBLIC) if inspect.isfunction(each)]
+FUNCTIONS = [each for each in (getattr(dc, name) for name in PUBLIC) if inspect.isfunction(each)]
 METHODS = [each for name, each in vars(dc.Calibration).items() if inspect.isfunction(each) and name[0] != "_"]
 
 
