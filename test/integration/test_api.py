@@ -17,6 +17,7 @@ from conftest import ROOT
 from io_fixtures import estimates, run, write_bag
 
 import dvl_calib_ros as dc
+from dvl_calib_ros import api
 from dvl_calib_ros.api import __all__ as PUBLIC  # noqa: N812
 from dvl_calib_ros.cli.main import main
 
@@ -266,7 +267,7 @@ def test_the_notebook_runs_from_its_own_folder_and_its_stored_output_is_what_com
     assert said == again == [str(dc.replay(ROOT / "bags" / "harbour_box", history=False).mounting)]
 
 
-FUNCTIONS = [each for each in (getattr(dc, name) for name in PUBLIC) if inspect.isfunction(each)]
+FUNCTIONS = [each for each in (getattr(api, name) for name in PUBLIC) if inspect.isfunction(each)]
 METHODS = [each for name, each in vars(dc.Calibration).items() if inspect.isfunction(each) and name[0] != "_"]
 
 
