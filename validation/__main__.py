@@ -16,6 +16,7 @@ PROGRAM = "python -m validation"
 # name: what it does. Each is a module of this package with `main(argv) -> int`, imported when it is asked for
 COMMANDS = {
     "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
+    "late_clocks": "late references and late DVLs: that doctor, replay and diagnose name one cause, by its size",
     "mutants": "faults put into ten rules, each of which the tests must see",
     "size": "lines of code, modules, arrows between the rooms of the package",
     "stacks": "bags as real stacks record them, each with its truth, judged through the command line",
