@@ -66,7 +66,7 @@ def _case(manoeuvre: str, clock: str, late: float, rate: float) -> tuple[str, st
         replayed = dc.replay(bag, history=False)
         diagnosed = dc.diagnose(bag)
     clocks = examined.discovery.clocks
-    by_doctor: Said = {} if clocks is None else dict(clocks.offsets)
+    by_doctor: Said = {} if clocks is None else dict(clocks.registration.offsets)
     by_diagnosis = {
         each.name: each.parameters["seconds"][0]
         for each in diagnosed.effects
