@@ -136,7 +136,7 @@ def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
 def _sqlite(path: Path, shown: Path, notes: list[str]) -> Source:
     database = Database(path)
     if database.astray:
-        notes.append(f"{shown}: {database.astray} messages are of topics that it does not name, and left out")
+        notes.append(f"{shown}: {database.astray} messages belong to topics that it does not list; they are left out")
     found = _until_damage(database.batches, path, salvage_sqlite, database.counts)
     return Source(shown, database.counts, database.span_ns, found)
 

@@ -374,9 +374,9 @@ class Parameters:
     )
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
-        "Prior standard deviation of how the heading that turns the reference deviates: with itself (one and two "
-        "cycles, as of a compass), and from first to last (as a gyro drifts) (G1, G2). On one heading it is in the σ "
-        "of yaw; several headings show whether it is smaller or larger. 0: the heading is exact.",
+        "Prior standard deviation of the heading's error: with the course (one and two cycles, as of a compass), and "
+        "over the run (as a gyro drifts) (G1, G2). On one heading the σ of yaw includes it; several headings show its "
+        "true size. 0: the heading is exact.",
         unit="rad",
         low=0.0,
         high=0.5,

@@ -50,7 +50,7 @@ TRACE_SAMPLES = 400
 # Failures that a note names
 NAMED_FAILURES = 5
 
-OWN_NOTES: tuple[str, ...] = ("simulated trajectories: the published figures are of others, so there is no ratio",)
+OWN_NOTES: tuple[str, ...] = ("simulated trajectories: the published figures are for others, so no ratio is given",)
 FORMULA = "-a σ²/(E‖h‖² + a σ²), h the noiseless regressor of the scale, a the number of its noisy axes"
 
 

@@ -195,7 +195,7 @@ class _UrdfReader:
                 "'dvl-calib apply RESULT' prints into them by hand, or expand them first: xacro FILE > robot.urdf"
             )
         if not self._open and name != "robot":
-            raise InputError(f"{self.path}: no URDF, its root is <{name}> and not <robot>")
+            raise InputError(f"{self.path}: not a URDF, its root is <{name}> and not <robot>")
         self._open.append(name)
         if self._open == ["robot", "joint"]:
             self._joint, self._spans = {"joint": attributes}, {"joint": self._span()}

@@ -124,7 +124,7 @@ def _flagged(field: str) -> Rule:
     return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: flag(message) == 0, _CHECK_LOCK)
 
 
-_CHECK_LOCK = "check that the bottom is in range and nothing is before the beams"
+_CHECK_LOCK = "check that the bottom is in range and nothing blocks the beams"
 
 
 def _has_no_altitude(message: Any) -> Any:

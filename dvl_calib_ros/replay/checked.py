@@ -227,7 +227,7 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
         verifications[name] = verification if merge else verification.with_objections(objections)
     if recordings.unchecked:
         names = ", ".join(recordings.unchecked)
-        notes.append(f"{names}: too little to be calibrated alone, so whether its mounting is the others' is not known")
+        notes.append(f"{names}: too little to be calibrated alone, so its mounting cannot be compared with the others'")
     found, counts = _without_pauses(replayed.findings, result.counts, len(recordings.pauses_ns))
     left_out = {str(each) for each in replayed.findings} - {str(each) for each in found}
     kept = [note for note in replayed.notes if note not in left_out]

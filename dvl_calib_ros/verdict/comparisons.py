@@ -71,7 +71,7 @@ _KINDS = (
     Kind(
         "CALIBRATION_DOUBTED",
         "{name}: {remark}",
-        "What its result file says against it.",
+        "Its result file says so.",
         "calibrate it anew, or leave it out of the comparison",
     ),
     Kind(

@@ -45,8 +45,9 @@ FINDINGS = (
     ),
     Kind(
         "CLOCK_TAKEN_OFF",
-        "{clock}: taken off ({parameter}: {value:g}); the calibration began anew with what came from then on",
-        "Two looks at velocities and turns agreed on it. What came before is not kept well enough to be used again.",
+        "{clock}: taken off ({parameter}: {value:g}); the calibration began anew with it",
+        "Two looks at velocities and turns agreed on it. What came before is used again, if that was no more than a "
+        "quarter of an hour.",
         "set that clock right, or give what was found as a parameter, which then stands",
     ),
     Kind(

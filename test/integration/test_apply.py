@@ -267,7 +267,7 @@ def test_another_file_leaves_the_urdf_as_it_is(tmp_path, saved):
         (("</robot>", ""), "not valid XML"),
         (("encoding='UTF-8'", "encoding='klingon'"), "not valid XML: unknown encoding: klingon"),
         (("encoding='UTF-8'", "encoding='utf-7'"), "not valid XML: multi-byte encodings"),
-        (("<robot ", "<sdf "), "no URDF"),
+        (("<robot ", "<sdf "), "not a URDF"),
     ],
 )
 def test_what_cannot_be_edited_is_refused_in_one_line_and_left_alone(tmp_path, saved, capsys, change_text, said):

@@ -69,7 +69,7 @@ def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     if last > count:  # rosbag2 numbers messages from 1
         damage.append(f"{last - count} messages lie on damaged pages")
     if astray:
-        damage.append(f"{astray} messages are of topics that it does not name")
+        damage.append(f"{astray} messages belong to topics that it does not list")
     if damage:
         raise DamagedError(", ".join(damage))
 

@@ -180,7 +180,7 @@ def test_rows_of_topics_that_a_database_does_not_name_are_counted(tmp_path, is_d
         file.write_bytes(content)
     found, notes = raw_and_notes(file)
     assert {topic for topic, _, _ in found} == {"gnss/twist", "imu/data"}
-    assert len(notes) == 1 and f"{n_dvl} messages are of topics that it does not name" in notes[0]
+    assert len(notes) == 1 and f"{n_dvl} messages belong to topics that it does not list" in notes[0]
 
 
 # ---------------------------------------------------------------------- two definitions of one type
