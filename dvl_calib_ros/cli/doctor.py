@@ -1,20 +1,34 @@
 """Look at a recording before it is calibrated: what is in it, what is wrong with it, whether it can calibrate.
 
 One page: topics and rates, where the DVL sits, every fault with its remedy, what the motion shows, what to type next.
+With --live the same of a running system: of its topics so many seconds are recorded, and looked at.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from ..streams import say
 from . import common
 from .reporting import add_report_option, report_writer
+
+LIVE_S = 20.0
+# New topics are looked for so often, s.
+LOOK_S = 0.2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument(
+        "--live", nargs="?", type=float, const=LIVE_S, metavar="S",
+        help="instead of a bag, the topics there are on ROS 2, for so many seconds; without a number: %(const)g",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
     common.add_parameter_options(parser)
@@ -26,12 +40,82 @@ def run(arguments: argparse.Namespace) -> None:
     from ..examination.examine import examine
     from ..present import examination as present
 
+    _check(arguments)
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments)
     parameters = common.load(arguments)
-    examination = examine(common.opened(arguments.bags, parameters), parameters, common.given(arguments))
+    with _recordings(arguments) as bags:
+        examination = examine(common.opened(bags, parameters), parameters, common.given(arguments))
+    is_live = arguments.live is not None
     common.deliver(
-        lambda: common.print_document(present.examination(examination)),
+        lambda: common.print_document(present.examination(examination, is_live)),
         (arguments.json, lambda path: common.write_json(path, examination.document())),
         (arguments.report, lambda path: write_report(path, examination)),
     )
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from ..errors import InputError
+
+    if bool(arguments.bags) == (arguments.live is not None):
+        raise InputError(
+            "name a BAG, or the topics there are: --live" if not arguments.bags else "a BAG or --live, not both"
+        )
+    if arguments.live is not None and not 1.0 <= arguments.live <= 3600.0:
+        raise InputError(f"--live: {arguments.live:g} is outside 1 .. 3600 s")
+
+
+@contextmanager
+def _recordings(arguments: argparse.Namespace) -> Iterator[list[Path]]:
+    """The recordings to look at, of which a live one is gone afterwards. Raises InputError."""
+    if arguments.live is None:
+        yield arguments.bags
+        return
+    with TemporaryDirectory(prefix="dvl_calib_") as folder:
+        path = Path(folder) / "live"
+        _record(path, arguments.live)
+        yield [path]
+
+
+def _record(path: Path, seconds: float) -> None:
+    from ..bags.writer import BagWriter
+    from ..errors import InputError
+    from ..node.ending import Ending
+
+    with Ending() as ending:
+        try:
+            import rclpy
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
+
+            from ..demo.recorder import TopicRecorder
+            from ..node.answering import AnsweringNode
+        except ImportError as error:
+            raise InputError(
+                f"--live needs ROS 2 ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
+            ) from error
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        node = AnsweringNode("dvl_calib_doctor")
+        try:
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            with BagWriter(path) as writer, common.progress("listening") as on_progress:
+                recorder = TopicRecorder(node, writer)
+                began = looked = time.monotonic()
+                recorder.look()
+                while (now := time.monotonic()) < began + seconds and not ending.requested:
+                    if now > looked + LOOK_S:
+                        recorder.look()
+                        looked = now
+                        on_progress((now - began) / seconds)
+                    executor.spin_once(timeout_sec=LOOK_S)
+            for why in recorder.left_out.values():
+                say(f"warning: {why}")
+            if not recorder.counts:
+                raise InputError(
+                    f"no message of a DVL, a reference or an IMU came within {time.monotonic() - began:.0f} s; check "
+                    "that the drivers run (ros2 topic list), ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE"
+                )
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()

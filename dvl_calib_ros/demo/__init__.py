@@ -1,1 +1,1 @@
-"""What the demo plays."""
+"""Bags over DDS, to and from: what the demo plays and shows, and what is recorded of a running system."""

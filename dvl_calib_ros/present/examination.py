@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 
 from ..examination.examine import NO_IMU, Content, Examination, Shown
+from ..files.parameter_edit import as_yaml
+from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import full
 from .document import Answer, Cell, Columns, Commands, Document, FindingLine, Section, Sentence, table_by
@@ -17,8 +19,11 @@ ANSWERS = {
 }
 
 
-def examination(examined: Examination) -> Document:
-    """What is in a recording, what is wrong with it, what its motion shows, and what to type next."""
+def examination(examined: Examination, is_live: bool = False) -> Document:
+    """What is in a recording, what is wrong with it, what its motion shows, and what to type next.
+
+    is_live: it was made of a running system, to be looked at alone.
+    """
     severity, answer = ANSWERS[examined.verdict]
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
@@ -37,7 +42,7 @@ def examination(examined: Examination) -> Document:
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(motion, [table_by(SHOWN, examined.shown, words=4)] if examined.shown else [Sentence(nothing)]),
-            Section("", [Commands(next_commands(examined))]),
+            Section("", [Commands(next_commands(examined, is_live))]),
         ],
         lead=full(found[0].says) if found and found[0].code.startswith(NO_IMU) else "",
     )
@@ -74,8 +79,10 @@ SHOWN: Columns[Shown] = {
 }
 
 
-def next_commands(examined: Examination) -> list[tuple[str, str]]:
+def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[str, str]]:
     """What to type next."""
+    if is_live:
+        return [("next", _live_command(examined))]
     bags = " ".join(shlex.quote(str(path)) for path in examined.paths)
     options = "".join(
         f" {found.remedy[found.remedy.index('-p ') :].split(' leaves')[0]}"
@@ -85,3 +92,17 @@ def next_commands(examined: Examination) -> list[tuple[str, str]]:
     if examined.verdict == "no" and not options:
         return [("next", "dvl-calib doctor BAG   (once it is recorded again)")]
     return [("next", f"dvl-calib replay {bags}{options} --save calibration.yaml")]
+
+
+def _live_command(examined: Examination) -> str:
+    """The node on the topics that were found, with what was found of them."""
+    discovery, default = examined.discovery, Topics()
+    names = {role: getattr(discovery.topics, role) for role in ("dvl", "gnss", "imu")}
+    topics = "".join(
+        f" --{role}-topic {shlex.quote(name)}"
+        for role, name in names.items()
+        if name.lstrip("/") not in ("", getattr(default, role))
+    )
+    found = {name: list(value) if isinstance(value, tuple) else value for name, value in discovery.values.items()}
+    values = "".join(f" -p {shlex.quote(f'{name}:={as_yaml(value)}')}" for name, value in found.items())
+    return f"dvl-calib run --watch{topics}{values} -p result_file:=calibration.yaml"

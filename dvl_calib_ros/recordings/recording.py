@@ -244,7 +244,7 @@ def _read(
 ) -> Recording:
     types = bag.topics
     moving = {topic for topic, kind in types.items() if is_kept(kind)}
-    static = {topic for topic, kind in types.items() if _is_static(topic, kind)}
+    static = {topic for topic, kind in types.items() if is_static(topic, kind)}
     if topics is not None:
         found = topics.found_in(types)
         moving, static = moving & {found.dvl, found.gnss, found.imu}, set()
@@ -287,6 +287,7 @@ def _is_read_in_columns(kind: str) -> bool:
     return kind == IMU_TYPE or VELOCITY_TYPES[kind].is_read_in_columns
 
 
-def _is_static(topic: str, kind: str) -> bool:
+def is_static(topic: str, kind: str) -> bool:
+    """Whether messages of a topic say where the sensors sit."""
     name = topic.rsplit("/", 1)[-1]
     return (kind == TF_TYPE and name == "tf_static") or (kind == STRING_TYPE and name == "robot_description")

@@ -1,0 +1,66 @@
+"""Records what of a running system a calibration may use, bytes as they come over DDS."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+from functools import partial
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import MessageDefinitionFormat
+
+from ..bags.channels import Channel
+from ..bags.definitions import Definition
+from ..bags.writer import BagWriter
+from ..errors import InputError
+from ..node.message_types import message_class
+from ..recordings.columns import is_kept
+from ..recordings.recording import is_static
+
+DEPTH = 1000
+
+
+class TopicRecorder:
+    """Writes messages of a node's graph into a bag. counts: by topic. left_out: of what is not installed, why."""
+
+    def __init__(self, node: Node, writer: BagWriter) -> None:
+        self._node, self._writer = node, writer
+        self._seen: set[tuple[str, str]] = set()
+        self.counts: Counter[str] = Counter()
+        self.left_out: dict[str, str] = {}
+
+    def look(self) -> None:
+        """Subscribe to topics that have turned up."""
+        for topic, kinds in self._node.get_topic_names_and_types():
+            for kind in kinds:
+                if (topic, kind) not in self._seen and (is_kept(kind) or is_static(topic, kind)):
+                    self._seen.add((topic, kind))
+                    try:
+                        self._subscribe(topic, kind)
+                    except InputError as error:
+                        self.left_out[topic] = str(error)
+
+    def _subscribe(self, topic: str, kind: str) -> None:
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        is_reliable = all(each.qos_profile.reliability is ReliabilityPolicy.RELIABLE for each in publishers)
+        is_latched = bool(publishers) and all(
+            each.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for each in publishers
+        )
+        profile = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE,
+        )
+        definition = None  # of a driver's own type what readers know of it
+        with suppress(LookupError):
+            text, _ = self._writer.typestore.generate_msgdef(kind, ros_version=2)
+            definition = Definition(MessageDefinitionFormat.MSG, text)
+        channel = Channel(topic, kind, definition)
+        taken = partial(self._take, channel)
+        self._node.create_subscription(message_class(topic, kind), topic, taken, profile, raw=True)
+
+    def _take(self, channel: Channel, data: bytes) -> None:
+        self._writer.raw(channel, self._node.get_clock().now().nanoseconds, data)
+        self.counts[channel.topic] += 1
