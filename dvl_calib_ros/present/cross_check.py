@@ -52,7 +52,8 @@ def _errors(check: CrossCheck) -> Table:
 
 
 def _drift(check: CrossCheck) -> Table:
-    rows = [("nothing", "as mounted", *(_before(check, bag) for bag in check.bags))]
+    first = (next(iter(_of(check, bag).values()), None) for bag in check.bags)
+    rows = [("nothing", "as mounted", *("–" if each is None else _drifts(each.before) for each in first))]
     for calibrated, model in zip(check.bags, check.selected, strict=True):
         found = [check.navigation.get((calibrated, bag)) for bag in check.bags]
         rows.append((_name(calibrated), model, *("–" if each is None else _drifts(each.after) for each in found)))
@@ -74,11 +75,6 @@ def _drifts(drift: Drift) -> str:
 def _of(check: CrossCheck, bag: str) -> dict[str, Navigation]:
     """Dead reckoning of a bag by what corrected it."""
     return {calibrated: each for (calibrated, verified), each in check.navigation.items() if verified == bag}
-
-
-def _before(check: CrossCheck, bag: str) -> str:
-    found = next(iter(_of(check, bag).values()), None)
-    return "–" if found is None else _drifts(found.before)
 
 
 def _pictures(check: CrossCheck, bag: str) -> list[Item]:

@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 
-from ..calibration.frames import Array
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect
 from ..diagnosis.series import DiagnosisSeries
@@ -33,9 +32,9 @@ from .document import (
     intervals,
     p_value,
     share,
-    signed,
     table_by,
     three,
+    with_std,
 )
 from .twin_table import twin_table
 
@@ -186,8 +185,15 @@ def _numbers(d: Diagnosis) -> list[Number]:
 def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
     lengths = [float(np.ptp(series.time[series.recording_of == i])) for i in range(len(series.recordings))]
     angle_std, scale_std = np.split(series.calibration_std, 2)
-    angles = _with_std(np.degrees(series.phi), np.degrees(angle_std), "°")
-    scales = _with_std(100.0 * series.scale, 100.0 * scale_std, " %")
+    angles, scales = (
+        ", ".join(
+            f"{axis} {with_std(*each, signed=True)}{unit}" for axis, *each in zip("xyz", values, std, strict=True)
+        )
+        for values, std, unit in (
+            (np.degrees(series.phi), np.degrees(angle_std), "°"),
+            (100.0 * series.scale, 100.0 * scale_std, " %"),
+        )
+    )
     held = "whole recordings in turn" if len(series.recordings) > 1 else "a fifth of the run in turn"
     return [
         ("Recordings", ", ".join(f"{n} ({s:.0f} s)" for n, s in zip(series.recordings, lengths, strict=True))),
@@ -200,11 +206,6 @@ def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
 def _axes(series: DiagnosisSeries) -> dict[str, str]:
     """Axes that the reference measures, with what they are called."""
     return {axis: where for (axis, where), measured in zip(BODY_AXES.items(), series.measured, strict=True) if measured}
-
-
-def _with_std(values: Array, std: Array, unit: str) -> str:
-    triples = zip("xyz", values, std, strict=True)
-    return ", ".join(f"{axis} {signed(value)} ± {sigma:.2f}{unit}" for axis, value, sigma in triples)
 
 
 def _left(d: Diagnosis) -> str:

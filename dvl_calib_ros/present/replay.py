@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.quantities import quantities
 from ..calibration.results import Result
 from ..calibration.samples import VelocityFrame
-from ..calibration.verification import HeldOutError, Verification
+from ..calibration.verification import Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag
 from ..replay.navigation import in_words, metres
@@ -31,6 +32,7 @@ from .document import (
     CELL_KINDS,
     Answer,
     Cell,
+    Columns,
     Commands,
     Document,
     Facts,
@@ -48,6 +50,7 @@ from .document import (
     figures,
     fitting_unit,
     parameter_texts,
+    table_by,
 )
 from .terms import estimate_table
 
@@ -65,6 +68,16 @@ _AXES = {
     "lever arm x": "lever arm, ahead",
     "lever arm y": "lever arm, to port",
     "lever arm z": "lever arm, up",
+}
+
+
+HELD_OUT: Columns[Verification] = {
+    "model": lambda each: each.model,
+    "uncorrected": lambda each: "–" if each.held_out is None else f"{each.held_out.uncorrected:.4f}",
+    "corrected": lambda each: "–" if each.held_out is None else f"{each.held_out.corrected:.4f}",
+    "predicted": lambda each: "–" if each.held_out is None else f"{each.held_out.predicted:.4f}",
+    "samples": lambda each: "0" if each.held_out is None else str(each.held_out.samples),
+    "verdict": lambda each: Cell(each.verdict.value, CELL_KINDS[each.verdict]),
 }
 
 
@@ -110,6 +123,12 @@ def replayed(
         drawn = figures("replay_pictures.velocity_pictures", run, history)
         velocities = [Sentence(_velocity_note(run), soft=True), drawn]
         data = [figures("replay_pictures.data_pictures", result, history, shown)]
+    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
+    counted = [
+        ("selected", f"{result.selected} ({result.selected_because.sentence})"),
+        ("dvl data", run.dvl_data),
+        ("samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} with a reference velocity at their time"),
+    ]
     drift = run.navigation
     worth = [] if drift is None else [Worth(metres(drift.before.per_km), metres(drift.after.per_km))]
     said = [
@@ -140,7 +159,7 @@ def replayed(
             Section("Estimates", [estimate_table(result, shown)], where),
             *_families(result, history, shown),
             Section("Velocity before and after correction", velocities, Where.PAGE),
-            Section("Data", [Facts(_selected(run))] if details else [], Where.TERMINAL),
+            Section("Data", [Facts(counted)] if details else [], Where.TERMINAL),
             Section("" if details else "Data", [_stream_table(result)], where),
             Section("", data, Where.PAGE),
         ],
@@ -271,21 +290,8 @@ def _when(result: Result) -> str:
     seconds = (result.last_ns - result.first_ns) * 1e-9
     unit_s, unit = fitting_unit(seconds)
     duration = f"{seconds / unit_s:.1f} {unit}"
-    return f"{_utc(result.first_ns)} to {_utc(result.last_ns)} UTC, {duration}"
-
-
-def _utc(stamp_ns: int) -> str:
-    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
-
-
-def _selected(run: Replayed) -> list[tuple[str, str]]:
-    """For who asks for details."""
-    dvl, pairing = run.result.counts["dvl"], run.result.counts["pairing"]
-    return [
-        ("selected", f"{run.result.selected} ({run.result.selected_because.sentence})"),
-        ("dvl data", run.dvl_data),
-        ("samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} with a reference velocity at their time"),
-    ]
+    first, last = (datetime.fromtimestamp(ns // 10**9, timezone.utc) for ns in (result.first_ns, result.last_ns))
+    return f"{first:%Y-%m-%d %H:%M:%S} to {last:%Y-%m-%d %H:%M:%S} UTC, {duration}"
 
 
 def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
@@ -295,26 +301,15 @@ def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
     if not judged:
         return []
 
-    rows: list[tuple[str | Cell, ...]] = [
-        (name, *_held_out_cells(judged.get(name)), Cell(each.verdict.value, CELL_KINDS[each.verdict]))
-        for name, each in verifications.items()
-    ]
-    head = ("model", "uncorrected", "corrected", "predicted", "samples", "verdict")
     return [
         Sentence(
             "Each block of the run was held back in turn and corrected with a calibration that had not seen it. "
             "Velocity error against the reference, m/s rms, with the noise of the reference in all of them; predicted "
             "is what that noise and the uncertainty of the calibration lead one to expect."
         ),
-        Table(head, rows, marked=list(verifications).index(result.selected)),
+        replace(table_by(HELD_OUT, verifications.values()), marked=list(verifications).index(result.selected)),
         figures("replay_pictures.held_out_picture", judged),
     ]
-
-
-def _held_out_cells(error: HeldOutError | None) -> tuple[str, ...]:
-    if error is None:
-        return ("–", "–", "–", "0")
-    return (f"{error.uncorrected:.4f}", f"{error.corrected:.4f}", f"{error.predicted:.4f}", str(error.samples))
 
 
 def _families(result: Result, history: RunHistory | None, shown: Sequence[str]) -> list[Section]:
