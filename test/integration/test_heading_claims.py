@@ -37,14 +37,14 @@ def claiming(path, sound, degrees, storage="mcap"):
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_what_the_imu_claims_is_taken_and_said(sound, tmp_path, capsys, storage):
     said = " ".join("".join(succeed(capsys, "replay", claiming(tmp_path / "bag", sound, 2.0, storage))).split())
-    assert "the IMU claims its heading to ±2°: taken for how it may deviate (-p heading_deviation_std:=0.035)" in said
+    assert "the IMU claims a heading good to ±2°, which is used (-p heading_deviation_std:=0.035)" in said
 
 
 @pytest.mark.parametrize("degrees", [0.0, 100.0])
 def test_no_claim_and_one_of_anything_are_no_claims(sound, tmp_path, capsys, degrees):
-    assert "claims its heading" not in "".join(succeed(capsys, "replay", claiming(tmp_path / "bag", sound, degrees)))
+    assert "claims a heading" not in "".join(succeed(capsys, "replay", claiming(tmp_path / "bag", sound, degrees)))
 
 
 def test_what_the_user_says_stands(sound, tmp_path, capsys):
     bag = claiming(tmp_path / "bag", sound, 2.0)
-    assert "claims its heading" not in "".join(succeed(capsys, "replay", bag, "-p", "heading_deviation_std:=0.01"))
+    assert "claims a heading" not in "".join(succeed(capsys, "replay", bag, "-p", "heading_deviation_std:=0.01"))
