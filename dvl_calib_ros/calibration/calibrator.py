@@ -43,6 +43,7 @@ from .observability import MEASURES_VERTICAL, convergence, observability
 from .observations import Observations
 from .observe import Observer
 from .parameters import IAC, ParameterError, Parameters
+from .positions import are_positions
 from .register.registration import Registration
 from .results import Day, Estimate, Result
 from .robust import median
@@ -673,7 +674,7 @@ class Calibrator:
             found += [each.weighed(Severity.REJECT) if is_first else each for each in heading_advice(rest.deviation)]
         if rest.in_earth:
             found += one_heading_advice(estimate, self.parameters, rest.followed.speed)
-        return found + left_over_advice(rest.followed)
+        return found + left_over_advice(rest.followed, are_positions(self.parameters))
 
     @property
     def is_level(self) -> bool:

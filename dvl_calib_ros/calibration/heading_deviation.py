@@ -19,8 +19,8 @@ from .results import Estimate
 
 # Its rms (rad) is worth a word from here on, where as much is found by chance so seldom where there is none.
 SAID_FROM, CHANCE = math.radians(0.3), 1e-3
-# From here on (rad) the compass is to be calibrated first (QRev's rule).
-FIRST = math.radians(3.0)
+# From here on (rad), and so many times its σ, the compass is to be calibrated first (QRev's rule).
+FIRST, SURELY = math.radians(3.0), 3.0
 # ... and where more than this share of the samples was gated, which are those that it turns most.
 GATED_FROM = 0.1
 
@@ -72,7 +72,8 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
 
 def comes_first(found: HeadingDeviation, estimate: Estimate) -> bool:
     """Whether the compass is to be calibrated before an estimate is worth anything."""
-    return found.rms > FIRST or estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
+    is_large = found.rms > max(FIRST, SURELY * found.std)
+    return is_large or estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
 
 
 def heading_advice(found: HeadingDeviation | None) -> list[Reason]:
@@ -81,7 +82,7 @@ def heading_advice(found: HeadingDeviation | None) -> list[Reason]:
         return []
     degrees = math.degrees
     course = "with time" if found.by_time else "with the heading"
-    first = "calibrate the compass first: " if found.rms > FIRST and found.rms > found.std else ""
+    first = "calibrate the compass first: " if found.rms > max(FIRST, SURELY * found.std) else ""
     return [
         finding(
             "HEADING_DEVIATION",

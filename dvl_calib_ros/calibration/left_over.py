@@ -61,6 +61,9 @@ FORGOTTEN_S, SLOWEST_S = (0.4, 1.0, 3.0), 0.3
 FORETOLD_BY, NEW_AT_MOST = 12, 4.0
 # So many σ of the noise being followed are no chance, of three that are looked at and one sign; and a share of it.
 FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
+# ... and of it where a reference is positions: their window holds the motion on both sides of its middle, which looks a
+# little like it.
+FOLLOWED_BY_POSITIONS = 0.1
 
 
 class LeftOver(NamedTuple):
@@ -169,7 +172,8 @@ def left_over_advice(found: LeftOver | None, of_positions: bool = False) -> list
     """
     if found is None:
         return []
-    if found.circular > max(FOLLOWED_SURELY * found.circular_std, FOLLOWED_FROM):
+    least = FOLLOWED_BY_POSITIONS if of_positions else FOLLOWED_FROM
+    if found.circular > max(FOLLOWED_SURELY * found.circular_std, least):
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
     seconds = math.sqrt(2.0 * abs(found.smoothed))
     is_ours = of_positions and found.smoothed > 0.0

@@ -535,7 +535,7 @@ class _Search:
             if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
                 left, _ = self._readings.registered(reading, np.eye(3))
                 turned_left, rotation = self._readings.registered(reading, None)
-                if turned_left < CLEARLY * left:
+                if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(left):
                     agree = "where DVL and reference agree best"
                     rotation = self._readings.without_roll(chosen, rotation)
                     rpy = nominal_rpy(rotation.T)

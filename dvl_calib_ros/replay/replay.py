@@ -23,6 +23,7 @@ from ..calibration.left_over import left_over_advice
 from ..calibration.models import MODELS
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
+from ..calibration.positions import are_positions
 from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
@@ -30,7 +31,7 @@ from ..calibration.told_arm import told_arm_advice
 from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import REFERENCE_TYPES, TWIST_TYPE
+from ..messages.drivers import TWIST_TYPE
 from ..recordings.check import check_topics, missing_imu
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
@@ -139,10 +140,7 @@ def replay(
         found += deviates
         if decoder.frame_of_reference is not VelocityFrame.BODY:
             found += one_heading_advice(result.estimate, calibrator.parameters, speed)
-    of_positions = (
-        REFERENCE_TYPES[recording.types[chosen.gnss]].is_position if chosen.gnss in recording.types else False
-    )
-    left = left_over_advice(navigation.followed, of_positions) if navigation is not None else []
+    left = left_over_advice(navigation.followed, are_positions(of_types)) if navigation is not None else []
     found += [each.weighed(Severity.WARNING) for each in left]
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived

@@ -20,7 +20,7 @@ from ..extrinsics import turn_between
 from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..samples import VelocityFrame
 from .curves import GAP_S, Curves
-from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, Fitted, MotionFit, N
+from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion import MotionStreams
 from .registration import Registration
 
@@ -73,7 +73,9 @@ def fitting_configuration(
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
     curves = Curves(motion)
-    as_given = 1.0 if given is None else _left(given.left, given.scale, _shown_turn(given, nominal))
+    as_given = 1.0
+    if given is not None:
+        as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
         return _flipped(motion, curves, nominal, lever_arm, given)
@@ -109,15 +111,15 @@ def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
 
     left: as another measure than its own has it.
     """
-    turned = angle_between(one.rotation_body_from_dvl, nominal)
+    turned = _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN])
     return _left(one.left if left is None else left, float(one.x[SCALE]), turned)
 
 
-def _shown_turn(given: Registration, nominal: Array) -> float:
-    """By what angle (rad) a registration is turned from the mounting given, but for what chance turns it by: a level
+def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
+    """By what angle (rad) a mounting is turned from another, but for what chance turns it by, with σ (3,) rad: a level
     vehicle hardly shows its roll."""
-    about = np.abs(turn_between(nominal, given.rotation_body_from_dvl))
-    return float(np.linalg.norm(np.maximum(about - BY_CHANCE * given.turn_std, 0.0)))
+    about = np.abs(turn_between(nominal, rotation))
+    return float(np.linalg.norm(np.maximum(about - BY_CHANCE * std, 0.0)))
 
 
 def _left(left: float, scale: float, turned: float) -> float:

@@ -32,7 +32,7 @@ from ..samples import VelocityFrame
 from .configuration import DRAWN, angle_between, misfit, nearest
 from .curves import GAP_S, Curves
 from .far import covered, velocity_at
-from .fine import FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit
+from .fine import FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
 from .motion import MotionStreams
 
 # Fewer samples say nothing about frames.
@@ -123,6 +123,11 @@ class Readings:
     def __len__(self) -> int:
         """How many velocities of one time there are."""
         return len(self._at)
+
+    def beside_noise(self, left: float) -> float:
+        """Of a share of the speed that is left what is not the reference's own noise."""
+        square = float((self._dvl**2).sum(axis=1).mean())
+        return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
         """All readings that can be tried, the best first, with clocks in time and no other lever arm.
