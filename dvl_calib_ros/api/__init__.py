@@ -136,7 +136,11 @@ def compare(
     ----------
     *results
         Result files, bags, or what `replay` gave; two or more. A bag is calibrated first.
-    dvl_topic, gnss_topic, imu_topic, params, **parameters
+    dvl_topic, gnss_topic, imu_topic
+        Of bags, as of `replay`.
+    params
+        Of bags, as of `replay`.
+    **parameters
         Of bags, as of `replay`.
 
     Returns
@@ -187,7 +191,13 @@ def doctor(
 
     Parameters
     ----------
-    bags, dvl_topic, gnss_topic, imu_topic, params, **parameters
+    bags
+        As of `replay`.
+    dvl_topic, gnss_topic, imu_topic
+        As of `replay`.
+    params
+        As of `replay`.
+    **parameters
         As of `replay`.
 
     Returns
@@ -220,7 +230,13 @@ def diagnose(
 
     Parameters
     ----------
-    bags, dvl_topic, gnss_topic, imu_topic, params, **parameters
+    bags
+        As of `replay`.
+    dvl_topic, gnss_topic, imu_topic
+        As of `replay`.
+    params
+        As of `replay`.
+    **parameters
         As of `replay`.
     simulator
         Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
@@ -450,9 +466,14 @@ def apply(
     ----------
     result
         Result file, as `Calibration.save` writes it.
-    urdf, joint, output, keep_position
-        URDF whose joint of the DVL is turned and moved; the joint's name where the DVL's frame does not tell; where to
-        write instead; leave the position as it is.
+    urdf
+        URDF whose joint of the DVL is turned and moved.
+    joint
+        Name of that joint, where the DVL's frame does not tell.
+    output
+        URDF to write instead.
+    keep_position
+        Leave the joint's position as it is.
     params, launch, fusion
         Parameter file of the node, launch file with a static transform, parameters of robot_localization.
     force
