@@ -57,7 +57,7 @@ class FoundClocks:
             return self.far.reason
         moves = self.registration.unsteady
         is_left = moves is not None and not MOVING & self.offsets.keys()
-        return moves.reason if moves is not None and is_left else None
+        return moves.reason if moves is not None and is_left else self.registration.not_told_apart
 
     def says(self) -> Iterator[str]:
         """Of each clock that is off how late it is, and what comes of it; one sentence each."""
@@ -74,7 +74,7 @@ class FoundClocks:
                 done = "not taken off"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
             yield f"{r.told(name).says}{which}: {done}"
-        if r.apart.is_shown and not r.offsets:
+        if r.apart.is_shown and not (r.offsets or self.doubt):
             yield (
                 f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; the data do "
                 f"not show whose clock is off: drive turns at two speeds"

@@ -194,7 +194,11 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
         what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
         found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
-    found += [finding("DOCTOR_FRAMES", says=doubt) for doubt in discovery.contradictions]
+    without = None if discovery.clocks is None else discovery.clocks.doubt  # no calibration can be done with that
+    found += [
+        finding("DOCTOR_FRAMES", says=doubt).weighed(Severity.ERROR if doubt == without else Severity.WARNING)
+        for doubt in discovery.contradictions
+    ]
     parameters = discovery.parameters
     speed = np.linalg.norm(velocity, axis=1)
     units = [] if reference is None else _units(dvl, reference)

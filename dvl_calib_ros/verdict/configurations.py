@@ -193,6 +193,12 @@ CONFIGURATIONS = (
         "set {parameter} to {offset:g}",
     ),
     _Said(
+        "CLOCKS_NOT_TOLD_APART",
+        "the stamps of DVL and reference are {seconds:.2f} ± {std:.2f} s apart; whose clock is off does not show",
+        "Legs that repeat at one speed fit more than one clock, and more than one delay.",
+        "set the clocks by one source, or drive turns at two speeds",
+    ),
+    _Said(
         "CLOCK_DRIFTS",
         "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
         "It gains or loses time at a steady rate.",

@@ -78,6 +78,16 @@ def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_all_three(tmp_path, capsys):
+    """Legs that repeat after 80 s: 50 s apart by doctor, who said yes, and replay accepted."""
+    bag = bag_of(tmp_path, {"dvl_time_offset": 30.0}, "lawnmower")
+    told, examined = said("doctor", bag, tmp_path, capsys)
+    assert examined["verdict"] == "no" and "whose clock is off does not show" in told
+    calibration = dc.replay(bag, history=False)
+    assert calibration.verdict == "reject" and "whose clock is off does not show" in calibration.reasons[0]
+
+
+@pytest.mark.slow
 def test_the_function_names_the_clock_that_the_command_names(tmp_path):
     """It took the clock off, and said nothing of it."""
     effects = {

@@ -164,12 +164,19 @@ class Registration:
             return self.unsteady.reason
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
         if not clock.is_shown:
-            return None
+            return self.not_told_apart
         offset = round(getattr(parameters, name) + clock.late, 2)
         off = {"seconds": abs(clock.late), "way": _way(clock), "parameter": name, "offset": offset}
         if clock is self.reference and self.dvl.is_shown:
             return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.late), dvl_way=_way(self.dvl), **off)
         return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
+
+    @property
+    def not_told_apart(self) -> Reason | None:
+        """Clocks that are further apart than a calibration finds, where whose is off does not show."""
+        if self.offsets or not self.apart.is_shown or abs(self.apart.late) < LEFT_TO_CALIBRATION_S:
+            return None
+        return finding("CLOCKS_NOT_TOLD_APART", seconds=abs(self.apart.late), std=self.apart.std)
 
 
 def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
