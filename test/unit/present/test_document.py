@@ -11,7 +11,18 @@ from report_fixtures import comparison as compared
 from rich.console import Console
 
 from dvl_calib_ros.present.comparison import comparison
-from dvl_calib_ros.present.document import Answer, Cell, Document, Section, Sentence, Table, Where, number, with_std
+from dvl_calib_ros.present.document import (
+    Answer,
+    Cell,
+    Document,
+    Section,
+    Sentence,
+    Table,
+    Where,
+    number,
+    table_by,
+    with_std,
+)
 from dvl_calib_ros.present.page import write_document
 from dvl_calib_ros.present.terminal import shown
 from dvl_calib_ros.verdict.kinds import Severity
@@ -76,3 +87,11 @@ def test_a_table_is_a_data_frame():
 def test_numbers_have_no_minus_before_zero_and_a_dash_where_there_is_none(value, said):
     assert number(value) == said
     assert with_std(value, float("nan")) == "–"
+
+
+def test_a_table_is_a_row_for_each_object_by_what_its_columns_hold_of_it():
+    made = table_by({"n": str, "square": lambda n: Cell(str(n * n), "text")}, [2, 3], ("note",))
+    assert made.rows == [["2", Cell("4", "text")], ["3", Cell("9", "text")]]
+    assert made.head == ["n", Cell("square", "text")] and made.notes == (
+        "note",
+    )  # a text's heading is aligned as it is

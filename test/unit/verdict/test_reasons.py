@@ -107,3 +107,13 @@ def test_the_worst_comes_first_and_of_equal_ones_the_first():
     ]
     assert [each.code for each in by_severity(several)] == ["DOCTOR_UNITS", "DVL_DROPOUTS", "GNSS_LOSSES"]
     assert by_severity([several[0], several[1].weighed(Severity.REJECT)])[0].code == "GNSS_LOSSES"
+
+
+def test_a_reason_that_holds_another_says_its_sentence_and_gives_both_codes():
+    late = finding("CLOCK_LATE", whose="the IMU's", seconds=0.5, way="late", parameter="imu_time_offset", offset=0.5)
+    found = finding("CONFIGURATION_WRONG", says=late)
+    assert late.sentence in found.says and found.causes == (late,)
+    written = json.loads(json.dumps(found.as_dict()))
+    assert written["numbers"] == {"says": late.sentence}
+    assert [each["code"] for each in written["causes"]] == ["CLOCK_LATE"]
+    assert written["causes"][0]["numbers"]["offset"] == 0.5
