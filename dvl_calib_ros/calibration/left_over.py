@@ -35,9 +35,10 @@ BEND_S = 1.0
 STRETCH_S, ENOUGH = 15.0, 12
 # So many σ are no chance.
 SURELY = 6.0
-# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s), and of the
-# heading that change with it, once and twice around (rad).
-KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3 + [0.05] * 2 + [0.02] * 2)
+# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s); and errors
+# of the heading that change with it, once and twice around (rad), which look like a bias, but not like what is quick.
+KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3)
+BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2)
 # ... and of what is looked for: shares of tilt, and bend (s²); a bias (m/s), looked for in means of so long, s.
 QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
@@ -130,10 +131,10 @@ def left_over(
     known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
     known[:, :, 5:8] = skew(rates)
     known[:, :, 8] = slope
-    known[:, :, 9:12] = body_from_enu
+    known[:, :, 9:] = body_from_enu
     yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
     around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)])
-    known[:, :, 12:] = known[:, :, 2, None] * around[:, None]
+    by_heading = known[:, :, 2, None] * around[:, None]
     quick = np.zeros((n, 3, 3))
     for axis in range(2):
         about = np.zeros((n, 3))
@@ -148,8 +149,8 @@ def left_over(
     fast = _fitted(time, both, error, np.concatenate([KNOWN, QUICK]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
-    means = [_means(each, starts) for each in (time, np.concatenate([known, constant], axis=2), error)]
-    slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, CONSTANT]))
+    means = [_means(each, starts) for each in (time, np.concatenate([known, by_heading, constant], axis=2), error)]
+    slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, BY_HEADING, CONSTANT]))
     if fast is None or slow is None:
         return None
     tilt, std = fast.x[-3:-1], fast.std[-3:-1]
