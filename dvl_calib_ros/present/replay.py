@@ -135,6 +135,8 @@ def replayed(
         Sentence(f"? {axes}: not shown by this recording; it needs {lacks}")
         for lacks, axes in not_shown(result).items()
     ]
+    # an angle that the data do not show is none to put on a vehicle
+    is_shown = not rejected and any(each.shown for each in quantities(result)[:3])
     return Document(
         title="DVL calibration",
         subtitle=", ".join(bag.name or str(bag) for bag in bags),
@@ -145,8 +147,8 @@ def replayed(
             Section(_headline(run, rejected), _mounting(run, rejected)),
             Section("", [] if rejected else [figures("mounting_figures.mounting_pictures", result)], Where.PAGE),
             Section("", [Facts(_facts(run, bags))], Where.PAGE),
-            Section("", [] if rejected else [Sentence("Corrected mounting, ready to paste:", soft=True)], Where.PAGE),
-            Section("", [] if rejected else [_paste(run)]),
+            Section("", [Sentence("Corrected mounting, ready to paste:", soft=True)] if is_shown else [], Where.PAGE),
+            Section("", [_paste(run)] if is_shown else []),
             Section("", [Warned()], Where.PAGE),
             Section("What it means for navigation", _navigation(run)),
             Section("", said, Where.TERMINAL),

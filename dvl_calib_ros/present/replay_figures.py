@@ -46,6 +46,7 @@ def estimate_over_time(
         value, std = line.value[kept], line.std[kept]
         strong = line.model == selected
         axes.fill_between(t, value - std, value + std, color=colour, alpha=0.25 if strong else 0.12, linewidth=0)
+        dashes = "-" if strong else dashes
         axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=line.model)
     axes.set_ylim(*_settled_range(lines))
     axes.set_ylabel(label)

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from command_line import fail, succeed
 from conftest import few
+from io_fixtures import run, write_bag
 from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.replay.navigation import Drift, Navigation, objections
 from dvl_calib_ros.verdict.kinds import Severity
@@ -256,3 +258,10 @@ def test_the_answer_says_against_what_its_angles_are(tmp_path, capsys, has_refer
     own = "a constant error of its heading is in the yaw, one of its level in roll and pitch"
     crab = "driving astern looks like a DVL turned by 180°"
     assert (own in said, crab in said) == (has_reference, not has_reference)
+
+
+@pytest.mark.parametrize("seconds, is_shown", [(5.0, False), (60.0, True)])
+def test_an_angle_that_no_data_showed_is_not_offered_to_be_pasted(tmp_path, capsys, seconds, is_shown):
+    bag = write_bag(tmp_path / "bag", [sample for sample in run(seconds) if isinstance(sample, DvlSample)])
+    out, _ = succeed(capsys, "replay", bag)
+    assert ("URDF" in out) == is_shown
