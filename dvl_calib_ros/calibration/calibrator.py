@@ -57,6 +57,8 @@ COPIED_AT_ONCE = 64
 OUTLYING = 5.0
 # Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
 OPEN_FROM = 4.0
+# So many σ of the difference between the two are no chance.
+NO_CHANCE = 3.0
 # Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
@@ -520,8 +522,10 @@ class Calibrator:
             return found
         other = estimator.of_recording()
         own, open_arm = np.diag(covariance)[:3], np.diag(other.p)[:3]
+        by_arm = open_arm - own
         away = (state - other.x[: len(state)])[:3] ** 2
-        np.fill_diagonal(found[:3, :3], np.where(open_arm > OPEN_FROM * own, open_arm - own + away, 0.0))
+        is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.maximum(by_arm, 0.0))
+        np.fill_diagonal(found[:3, :3], np.where(is_open & (by_arm > 0.0), by_arm + away, 0.0))
         return found
 
     def states_at(
