@@ -194,7 +194,8 @@ def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_pat
 @pytest.mark.parametrize("seed", few((25036, 32046, 38456), (32046,)))
 def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, seed):
     """By the model that takes it as known yaw was off by 1.9 degrees and claimed to 0.3: on a circle one looks like the
-    other. What the model that finds it says instead is in σ as well (32046: off by 1.1, claimed to 0.28; 38456: by 3.8, 0.70)."""
+    other. What the model that finds it says instead is in σ as well (32046: off by 1.1, claimed to 0.28; 38456: by
+    3.8, claimed to 0.70)."""
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]

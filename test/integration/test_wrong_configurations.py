@@ -120,8 +120,9 @@ WRONG = {
     "z flipped": (lambda: run((math.pi, 0.0, 0.0)), {}, "DVL_AXES_FRD"),
     "x and y swapped": (lambda: run((math.pi, 0.0, math.pi / 2)), {}, "MOUNTING_FITS"),
     "ENU, body claimed": (run, {"gnss_frame": "body"}, "REFERENCE_LOOKS"),
-    "ENU, NED claimed": (run, {"gnss_frame": "ned"}, "REFERENCE_LOOKS"),
-    "NED, ENU claimed": (lambda: references(run(), in_ned), {}, "REFERENCE_LOOKS"),
+    # of the two next ones roll would tell, which a level vehicle does not show: 180 degrees of it are chance
+    "ENU, NED claimed": (run, {"gnss_frame": "ned"}, "REFERENCE_OR_IMU_NED"),
+    "NED, ENU claimed": (lambda: references(run(), in_ned), {}, "REFERENCE_OR_IMU_NED"),
     "NED, body claimed": (
         lambda: references(run(), in_ned), {"gnss_frame": "body"}, "REFERENCE_LOOKS",
     ),
