@@ -85,7 +85,7 @@ class Stream(Enum):
 
 
 # Columns of values: velocity (m/s); of the IMU a quaternion (x, y, z, w) and the angular velocity (rad/s).
-_WIDTH = {Stream.DVL: 3, Stream.REFERENCE: 3, Stream.IMU: 7}
+WIDTH = {Stream.DVL: 3, Stream.REFERENCE: 3, Stream.IMU: 7}
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class SampleBlock:
     def __post_init__(self) -> None:
         n = len(self.stamps_ns)
         shapes = {
-            "values": (self.values.shape, (n, _WIDTH[self.stream])),
+            "values": (self.values.shape, (n, WIDTH[self.stream])),
             "covariances": (self.covariances.index.shape, (n,)),
             **{name: (getattr(self, name).shape, (n,)) for name in ("arrival", "frames", "refused")},
         }
@@ -256,7 +256,7 @@ def sample_block(
     return SampleBlock(
         stream,
         np.asarray(stamps_ns, dtype=np.int64),
-        np.asarray(values, dtype=float).reshape(n, _WIDTH[stream]),
+        np.asarray(values, dtype=float).reshape(n, WIDTH[stream]),
         covariance,
         np.arange(n, dtype=np.int64) if arrival is None else np.asarray(arrival, dtype=np.int64),
         np.full(n, FRAME_CODES[frames], dtype=np.uint8) if isinstance(frames, VelocityFrame) else frames,
@@ -267,7 +267,7 @@ def sample_block(
 
 def no_samples(stream: Stream) -> SampleBlock:
     """A block without rows."""
-    return sample_block(stream, np.zeros(0, dtype=np.int64), np.zeros((0, _WIDTH[stream])))
+    return sample_block(stream, np.zeros(0, dtype=np.int64), np.zeros((0, WIDTH[stream])))
 
 
 class Streams(NamedTuple):

@@ -2,94 +2,108 @@
 
 from __future__ import annotations
 
-from array import array
+from typing import ClassVar
 
 import numpy as np
 
 from ..calibration.frames import Array
 from ..calibration.samples import (
     FRAME_CODES,
+    WIDTH,
+    Codes,
     Covariances,
     ImuSample,
+    Mask,
     ReferenceSample,
     Sample,
     SampleBlock,
+    Stamps,
     Stream,
     Streams,
-    VelocityFrame,
     sample_block,
 )
+from ..calibration.tables import FULL, RowTable
 
-# Messages of all streams, of 80 bytes: an IMU at 100 Hz for a quarter of an hour.
+# Messages of all streams, of 140 bytes: an IMU at 100 Hz for a quarter of an hour.
 MOST = 100_000
 _NOT_GIVEN = (float("nan"),) * 4
+_CODES = {stream: code for code, stream in enumerate(Stream)}
 
 
-class KeptMessages:
-    """All so far, or none once they are more than `MOST`."""
+class KeptMessages(RowTable):
+    """All so far in the order in which they came, or none once they are more than `MOST`.
+
+    The room for `MOST` is taken at once: a node's memory must not grow with what it hears.
+    """
+
+    LAYOUT: ClassVar = {
+        "stream": (np.uint8, ()),
+        "stamps_ns": (np.int64, ()),
+        "values": (np.float64, (7,)),
+        "covariance": (np.float64, (3, 3)),
+        "has_covariance": (np.bool_, ()),
+        "frames": (np.uint8, ()),
+        "refused": (np.uint8, ()),
+    }
+    stream: Codes
+    stamps_ns: Stamps
+    values: Array
+    covariance: Array
+    has_covariance: Mask
+    frames: Codes
+    refused: Codes
 
     def __init__(self) -> None:
-        self._columns: tuple[_Columns, ...] | None = tuple(map(_Columns, Stream))
-        self._by_stream = {each.stream: each for each in self._columns}
-        self._count = 0
+        super().__init__()
+        self.reserve(int(FULL * MOST))  # as nothing is given up at the start, all of the room is filled
+        self._reasons: list[str] = []
+        self._is_kept = True
 
     def add(self, stream: Stream, decoded: Sample | str) -> None:
         """Keep the sample that a message is, or why it is none."""
-        if self._columns is None:
+        if not self._is_kept:
             return
-        self._by_stream[stream].add(decoded, self._count)
-        self._count += 1
-        if self._count > MOST:
+        if self.size == MOST:
             self.forget()
+            return
+        at = self.extend(1).start
+        self.stream[at] = _CODES[stream]
+        self.stamps_ns[at] = self.frames[at] = self.refused[at] = 0
+        self.has_covariance[at] = False
+        if isinstance(decoded, str):
+            if decoded not in self._reasons:
+                self._reasons.append(decoded)
+            self.refused[at] = 1 + self._reasons.index(decoded)
+            return
+        self.stamps_ns[at] = decoded.stamp_ns
+        if isinstance(decoded, ImuSample):
+            self.values[at, :4] = decoded.orientation or _NOT_GIVEN
+            self.values[at, 4:] = decoded.angular_velocity or _NOT_GIVEN[:3]
+            return
+        self.values[at, :3] = decoded.velocity
+        if decoded.covariance is not None:
+            self.covariance[at], self.has_covariance[at] = decoded.covariance, True
+        if isinstance(decoded, ReferenceSample):
+            self.frames[at] = FRAME_CODES[decoded.frame]
 
     def forget(self) -> None:
         """Keep nothing any more."""
-        self._columns, self._by_stream = None, {}
+        self._is_kept = False
+        self.clear()
+        self._move(0)
 
     @property
     def streams(self) -> Streams | None:
         """What came; None where that is not kept any more."""
-        return None if self._columns is None else Streams(*(each.block() for each in self._columns))
+        return Streams(*map(self._block, Stream)) if self._is_kept else None
 
-
-class _Columns:
-    """Of one stream."""
-
-    def __init__(self, stream: Stream) -> None:
-        self.stream = stream
-        self._stamps, self._arrival, self._index = array("q"), array("q"), array("q")
-        self._values, self._frames, self._refused = array("d"), bytearray(), bytearray()
-        self._none = (float("nan"),) * (7 if stream is Stream.IMU else 3)
-        self._distinct: list[Array] = []
-        self._reasons: list[str] = []
-
-    def add(self, decoded: Sample | str, arrival: int) -> None:
-        """Take a message's sample, or why it is none."""
-        stamp_ns, values, covariance, frame, refused = 0, self._none, None, VelocityFrame.BODY, 0
-        if isinstance(decoded, str):
-            if decoded not in self._reasons:
-                self._reasons.append(decoded)
-            refused = 1 + self._reasons.index(decoded)
-        elif isinstance(decoded, ImuSample):
-            stamp_ns = decoded.stamp_ns
-            values = *(decoded.orientation or _NOT_GIVEN), *(decoded.angular_velocity or _NOT_GIVEN[:3])
-        else:
-            stamp_ns, values, covariance = decoded.stamp_ns, decoded.velocity, decoded.covariance
-            frame = decoded.frame if isinstance(decoded, ReferenceSample) else frame
-        if covariance is not None and not (self._distinct and self._distinct[-1] is covariance):
-            self._distinct.append(covariance)
-        self._index.append(-1 if covariance is None else len(self._distinct) - 1)
-        self._stamps.append(stamp_ns)
-        self._arrival.append(arrival)
-        self._values.extend(values)
-        self._frames.append(FRAME_CODES[frame])
-        self._refused.append(refused)
-
-    def block(self) -> SampleBlock:
-        """All of them."""
-        covariances = Covariances(np.reshape(self._distinct, (-1, 3, 3)), np.array(self._index, dtype=np.intp))
+    def _block(self, stream: Stream) -> SampleBlock:
+        (at,) = np.nonzero(self.stream[: self.size] == _CODES[stream])
+        given = self.has_covariance[at]
+        each = Covariances.of(self.covariance[at[given]], int(given.sum()))
+        index = np.full(len(at), -1, dtype=np.intp)
+        index[given] = each.index
         return sample_block(
-            self.stream, np.array(self._stamps, dtype=np.int64), np.array(self._values), covariance=covariances,
-            frames=np.array(self._frames), arrival=np.array(self._arrival, dtype=np.int64),
-            refused=np.array(self._refused), reasons=self._reasons,
+            stream, self.stamps_ns[at], self.values[at, : WIDTH[stream]], covariance=Covariances(each.distinct, index),
+            frames=self.frames[at], arrival=at, refused=self.refused[at], reasons=self._reasons,
         )  # fmt: skip

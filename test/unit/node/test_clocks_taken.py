@@ -128,3 +128,29 @@ def test_what_is_more_than_is_kept_is_not_fed_again(monkeypatch):
     assert messages.streams is not None and len(messages.streams.dvl) == 3
     messages.add(Stream.IMU, "no_data")
     assert messages.streams is None
+
+
+def test_the_room_for_what_is_kept_is_taken_before_it_comes():
+    """It grew by 10 MB in the first hour."""
+    messages = kept.KeptMessages()
+    room = messages.values
+    for i in range(20_000):
+        messages.add(Stream.IMU, ImuSample(i, None, (0.0, 0.0, 0.1)))
+    assert messages.values is room and len(room) == kept.MOST
+    messages.forget()
+    assert not len(messages.values)
+
+
+def test_what_is_kept_is_what_came():
+    came = {
+        Stream.DVL: [DvlSample(3, (1.0, 2.0, 3.0)), "no_data", DvlSample(4, (1.0, 2.0, 4.0), np.eye(3))],
+        Stream.REFERENCE: [ReferenceSample(5, (1.0, 0.0, 0.0), 2.0 * np.eye(3), VelocityFrame.NED)],
+        Stream.IMU: [ImuSample(6, None, (0.1, 0.2, 0.3)), "no_stamp", ImuSample(7, (0.0, 0.0, 0.6, 0.8), None)],
+    }
+    messages = kept.KeptMessages()
+    for stream, samples in came.items():
+        for sample in samples:
+            messages.add(stream, sample)
+    assert {block.stream: str([*block.samples()]) for block in messages.streams} == {
+        stream: str(samples) for stream, samples in came.items()
+    }
