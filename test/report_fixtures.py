@@ -205,7 +205,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
         "where": (GapPlace("y", "turning", (0.0, 150.0), (0.0, 2.5), 0.7, 1e-15),),
         "untestable": {"water_lock": "attitude"},
         "minimum_detectable": {"lever_arm": {"x_m": 0.11, "z_m": 0.9}, OWN_EFFECT: {"gain": 3.0}},
-        "next_manoeuvre": "turns to both sides at two speeds",
+        "next_steps": (finding("NEXT_SHOW", name="lever_arm", manoeuvre="turns to both sides at two speeds"),),
         "notes": ("first: <u>gaps</u>",),
         "series": series,
     }  # fmt: skip

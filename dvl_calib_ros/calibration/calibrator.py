@@ -578,7 +578,7 @@ class Calibrator:
             (estimate.used, estimate.gated),
             self.suggestion if model.aided else None,
             any(each.reference_claims for each in self._further),
-            next((each.doubt for each in self._further if each.doubt), "") if model.aided else "",
+            next((each.doubt for each in self._further if each.doubt), None) if model.aided else None,
             bool(model.estimator) and estimator.claims,
             self._typical_error(model, state) if is_suspect else None,
             calibration_error(model, self.of_recording(name).p, judge.moments, self.parameters.rotation_dvl_from_body),

@@ -80,9 +80,9 @@ class Estimator(ABC):
         return False
 
     @property
-    def doubt(self) -> str:
-        """What is known against models that take for granted what this one finds, in words; ''."""
-        return ""
+    def doubt(self) -> Reason | None:
+        """What is known against models that take for granted what this one finds."""
+        return None
 
     @property
     def heading_deviation(self) -> GaussianState | None:

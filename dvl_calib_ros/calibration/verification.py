@@ -142,7 +142,7 @@ def verify(
     used_and_gated: tuple[int, int] | None = None,
     suggestion: Reason | None = None,
     reference_claims: bool = True,
-    lever_arm_turns: str = "",
+    lever_arm_turns: Reason | None = None,
     finds_lever_arm: bool = False,
     typical_error: float | None = None,
     own_error: float = 0.0,
@@ -159,7 +159,7 @@ def verify(
     used_and_gated: How many samples it used, and threw out; None where that is not known.
     suggestion: What configuration would fit, if the one given does not.
     reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
-    lever_arm_turns: How much of an angle is the lever arm's, in words, if the motion does not tell them apart.
+    lever_arm_turns: How much of an angle is the lever arm's, if the motion does not tell them apart.
     finds_lever_arm: Whether it is in σ of the angles, and not taken as known.
     typical_error: Velocity error without outliers, m/s rms, where that on held-out samples is large.
     own_error: Velocity error that its σ by blocks of time leads one to expect, m/s rms, as of `calibration_error`.
@@ -191,8 +191,8 @@ def use_findings(used_and_gated: tuple[int, int] | None) -> list[Reason]:
     return []
 
 
-def _lever_arm_findings(turns: str, is_found: bool, parameters: Parameters) -> list[Reason]:
-    if not turns:
+def _lever_arm_findings(turns: Reason | None, is_found: bool, parameters: Parameters) -> list[Reason]:
+    if turns is None:
         return []
     if is_found:
         return [finding("LEVER_ARM_NOT_SHOWN", turns=turns)]

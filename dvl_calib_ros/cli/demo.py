@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare."""
     from ..calibration.models import MODELS
-    from ..errors import InputError
+    from ..errors import InputError, needing_ros
     from ..node.domain import private_domain
 
     if not 0.1 <= arguments.speed <= 1000.0:
@@ -48,10 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     common.check_outputs(arguments, "report", also_read=[bag])
     write_report = report_writer(arguments, "write_replay_report")
     os.environ.update(private_domain())
-    try:
+    with needing_ros("demo"):
         import rclpy
-    except ImportError as error:
-        raise InputError(f"the demo runs the ROS 2 node ({error}); pip install 'dvl_calib_ros[ros]'") from error
     out = common.console()
     with tempfile.TemporaryDirectory() as folder:
         saved = Path(folder) / "live.yaml"

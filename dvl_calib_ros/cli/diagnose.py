@@ -1,6 +1,7 @@
 """Diagnose recorded bags: where the DVL differs from what calibration leads to expect, and which effect causes it.
 
-One sentence with the answer comes first. Several bags must be of one vehicle; whole bags are then held out.
+With --simulator: what a simulator's DVL lacks beside the vehicle's. One sentence with the answer comes first. Several
+bags must be of one vehicle; whole bags are then held out.
 """
 
 from __future__ import annotations

@@ -80,42 +80,28 @@ def _recordings(arguments: argparse.Namespace) -> Iterator[list[Path]]:
 def _record(path: Path, seconds: float) -> None:
     from ..bags.writer import BagWriter
     from ..errors import InputError
-    from ..node.ending import Ending
 
-    with Ending() as ending:
-        try:
-            import rclpy
-            from rclpy.executors import SingleThreadedExecutor
-            from rclpy.signals import SignalHandlerOptions
+    with common.ros_node("--live", "dvl_calib_doctor") as (node, ending):
+        from rclpy.executors import SingleThreadedExecutor
 
-            from ..demo.recorder import TopicRecorder
-            from ..node.answering import AnsweringNode
-        except ImportError as error:
+        from ..demo.recorder import TopicRecorder
+
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        with BagWriter(path) as writer, common.progress("listening") as on_progress:
+            recorder = TopicRecorder(node, writer)
+            began = looked = time.monotonic()
+            recorder.look()
+            while (now := time.monotonic()) < began + seconds and not ending.requested:
+                if now > looked + LOOK_S:
+                    recorder.look()
+                    looked = now
+                    on_progress((now - began) / seconds)
+                executor.spin_once(timeout_sec=LOOK_S)
+        for why in recorder.left_out.values():
+            say(f"warning: {why}")
+        if not recorder.counts:
             raise InputError(
-                f"--live needs ROS 2 ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
-            ) from error
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        node = AnsweringNode("dvl_calib_doctor")
-        try:
-            executor = SingleThreadedExecutor()
-            executor.add_node(node)
-            with BagWriter(path) as writer, common.progress("listening") as on_progress:
-                recorder = TopicRecorder(node, writer)
-                began = looked = time.monotonic()
-                recorder.look()
-                while (now := time.monotonic()) < began + seconds and not ending.requested:
-                    if now > looked + LOOK_S:
-                        recorder.look()
-                        looked = now
-                        on_progress((now - began) / seconds)
-                    executor.spin_once(timeout_sec=LOOK_S)
-            for why in recorder.left_out.values():
-                say(f"warning: {why}")
-            if not recorder.counts:
-                raise InputError(
-                    f"no message of a DVL, a reference or an IMU came within {time.monotonic() - began:.0f} s; check "
-                    "that the drivers run (ros2 topic list), ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE"
-                )
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+                f"no message of a DVL, a reference or an IMU came within {time.monotonic() - began:.0f} s; check "
+                "that the drivers run (ros2 topic list), ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE"
+            )

@@ -14,6 +14,8 @@ _TABLES = {
     "configurations": "what the data can fit instead of what was configured",
     "selections": "why a model is selected",
     "diagnoses": "everything that diagnose can conclude",
+    "unpaired": "everything that diagnose --simulator can conclude",
+    "discoveries": "what is passed over or guessed in a recording",
 }
 
 

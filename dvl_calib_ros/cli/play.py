@@ -54,55 +54,36 @@ def run(arguments: argparse.Namespace) -> None:
     """Play until the end, or until Ctrl-C. Raises InputError."""
     from ..bags.reader import BagReader
     from ..errors import InputError
-    from ..node.ending import Ending
 
     _check(arguments)
-    with Ending() as ending:
-        try:
-            import rclpy
-            from rclpy.signals import SignalHandlerOptions
+    start, duration = arguments.start_offset, arguments.playback_duration
+    with common.ros_node("play", "dvl_calib_player") as (node, ending):
+        from ..demo.player import BagPlayer, wait_until
 
-            from ..demo.player import BagPlayer, wait_until
-            from ..node.answering import AnsweringNode
-        except ImportError as error:
-            raise InputError(
-                f"play needs ROS 2 ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
-            ) from error
         with BagReader(arguments.bags) as bag:
             targets = _targets(bag, arguments.topics, arguments.remap)
             seconds = 1e-9 * (bag.span_ns[1] - bag.span_ns[0])
-        end = min(arguments.start_offset + arguments.playback_duration, seconds)
-        if not arguments.start_offset < end:
-            raise InputError(f"--start-offset {arguments.start_offset:g}: the recording has {seconds:.1f} s")
+        if start >= seconds:
+            raise InputError(f"--start-offset {start:g}: the recording has {seconds:.1f} s")
 
         def has_ended() -> bool:
             return ending.requested
 
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        node = AnsweringNode("dvl_calib_player")
-        try:
-            player = BagPlayer(node, arguments.bags, targets, clock_hz=arguments.clock)
-            if arguments.wait:
-                _wait_for_subscribers(player, has_ended)
-            wait_until(time.monotonic() + arguments.delay, has_ended)
-            total = 0
-            with common.progress("playing") as on_progress:
+        player = BagPlayer(node, arguments.bags, targets, clock_hz=arguments.clock)
+        if arguments.wait:
+            _wait_for_subscribers(player, has_ended)
+        wait_until(time.monotonic() + arguments.delay, has_ended)
+        total = 0
+        with common.progress("playing") as on_progress:
 
-                def on_time(at: float, _: object) -> None:
-                    on_progress((at - arguments.start_offset) / (end - arguments.start_offset))
+            def on_time(at: float, _: object) -> None:
+                on_progress((at - start) / min(duration, seconds - start))
 
-                while not ending.requested:
-                    sent = player.play(
-                        arguments.rate, on_time, arguments.start_offset, arguments.playback_duration,
-                        has_ended,
-                    )  # fmt: skip
-                    total += sum(sent.values())
-                    if not arguments.loop:
-                        break
-            print(f"published {total} messages of {len(targets)} topics")
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+            while not ending.requested:
+                total += sum(player.play(arguments.rate, on_time, start, duration, has_ended).values())
+                if not arguments.loop:
+                    break
+        print(f"published {total} messages of {len(targets)} topics")
 
 
 def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> None:
@@ -123,7 +104,9 @@ def _check(arguments: argparse.Namespace) -> None:
         value = getattr(arguments, name)
         if value and not low <= value <= high:
             raise InputError(f"--{name}: {value:g} is outside {low:g} .. {high:g}")
-    for name in ("delay", "start_offset", "playback_duration"):
+    if not arguments.playback_duration > 0.0:
+        raise InputError("--playback-duration: give a number of seconds, above 0")
+    for name in ("delay", "start_offset"):
         if not getattr(arguments, name) >= 0.0:
             raise InputError(f"--{name.replace('_', '-')}: give a number of seconds, 0 or more")
 

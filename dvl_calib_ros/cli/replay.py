@@ -77,12 +77,15 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
     from ..present import replay as present
+    from ..present.typed import options
 
     common.print_found(discovery, arguments.bags)
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])
     known = {str(found) for found in replayed.findings}
     warnings = [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
-    commands = present.next_commands(replayed, arguments.bags, arguments.save, _options(arguments), bool(findings))
+    topics = [(role, getattr(arguments, f"{role}_topic")) for role in ("dvl", "gnss", "imu")]
+    named = options(topics, arguments.overrides, arguments.params)
+    commands = present.next_commands(replayed, arguments.bags, arguments.save, named, bool(findings))
     common.print_document(
         present.replayed(replayed, arguments.bags, models, details=bool(models), warnings=warnings, commands=commands)
     )
@@ -97,14 +100,3 @@ def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[st
         for found in replayed.findings
         if found.code not in settled and not any(found.says.startswith(prefix) for prefix in other)
     ]
-
-
-def _options(arguments: argparse.Namespace) -> list[str]:
-    """Options of this run that say what is calibrated, for the next command."""
-    options = [] if arguments.params is None else ["--params", str(arguments.params)]
-    for override in arguments.overrides:
-        options += ["-p", override]
-    for role in ("dvl", "gnss", "imu"):
-        topic = getattr(arguments, f"{role}_topic")
-        options += [] if topic is None else [f"--{role}-topic", topic]
-    return options

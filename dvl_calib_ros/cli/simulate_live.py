@@ -60,16 +60,12 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
 
 def run(arguments: argparse.Namespace, scenario: Scenario) -> None:
     """Publish until the end, or until Ctrl-C. Raises InputError."""
-    from ..errors import InputError
+    from ..errors import needing_ros
     from ..node.ending import Ending
 
     with Ending() as ending:
-        try:
+        with needing_ros("--live"):
             from ..node.simulator_node import Outputs, run_until
-        except ImportError as error:
-            raise InputError(
-                f"--live needs ROS 2 ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
-            ) from error
         outputs = Outputs(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic, arguments.dvl_type)
         ros_args = ["--ros-args", *arguments.ros_args] if arguments.ros_args else []
         sent = run_until(ending, scenario, outputs, ros_args, arguments.follow, arguments.speed, arguments.wait)

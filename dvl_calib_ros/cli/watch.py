@@ -41,14 +41,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _listener(node: str) -> Listener:
-    from ..errors import InputError
+    from ..errors import needing_ros
 
-    try:
+    with needing_ros("watch"):
         import rich  # noqa: F401
 
         from ..node.listener import Listener
-    except ImportError as error:
-        raise InputError(f"watching needs ROS 2 and rich ({error}); pip install 'dvl_calib_ros[ros]'") from error
     return Listener(node)
 
 

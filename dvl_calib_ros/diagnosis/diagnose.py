@@ -116,7 +116,7 @@ def diagnose_recordings(
         where=tuple(places(selection.fitter, selection.base, selection.fit, columns)) if is_gap else (),
         untestable=untestable,
         minimum_detectable=detectable,
-        next_manoeuvre=_next_manoeuvre(verdict, selection.selected, testable, untestable, detectable),
+        next_steps=_next_steps(verdict, selection.selected, testable, untestable, detectable),
         notes=tuple(notes),
         series=collect_series(selection, residuals, rest, covariance) if with_series else None,
         calibration=tuple(_interval(float(value), std) for value, std in calibration),
@@ -190,7 +190,7 @@ def _nothing_to_say(why: Reason, notes: Sequence[str]) -> Diagnosis:
         where=(),
         untestable={},
         minimum_detectable={},
-        next_manoeuvre="straight legs on several headings and at several speeds, with turns to both sides",
+        next_steps=(finding("NEXT_ANYTHING"),),
         notes=tuple(notes),
     )
 
@@ -296,24 +296,27 @@ def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:
     return mean
 
 
-def _next_manoeuvre(
+def _next_steps(
     verdict: DiagnosisVerdict,
     selected: Sequence[Selected],
     testable: Mapping[str, Effect],
     untestable: Mapping[str, str],
     detectable: Mapping[str, Mapping[str, float]],
-) -> str:
-    """What to fly: to separate what was confounded, else to see what this data sees worst."""
-    confounded = [each for each in selected if each.equivalent]
+) -> tuple[Reason, ...]:
+    """What to drive: to separate what was confounded, else to see what this data sees worst."""
+    confounded = [(each.effect, [testable[name] for name in each.equivalent]) for each in selected if each.equivalent]
     if confounded:
-        sets = [(each.effect, [testable[name] for name in each.equivalent]) for each in confounded]
-        return "; ".join(
-            f"to tell {effect.name} from {', '.join(other.name for other in others)}: "
-            + "; ".join(dict.fromkeys(each.manoeuvre for each in (effect, *others)))
-            for effect, others in sets
+        return tuple(
+            finding(
+                "NEXT_TELL_APART",
+                name=effect.name,
+                others=", ".join(other.name for other in others),
+                manoeuvre="; ".join(dict.fromkeys(each.manoeuvre for each in (effect, *others))),
+            )
+            for effect, others in confounded
         )
     if verdict is DiagnosisVerdict.UNKNOWN:
-        return "the same route again: what stays with the place, the time or the motion tells what it follows"
+        return (finding("NEXT_SAME_ROUTE"),)
 
     def times_typical(name: str) -> float:
         typical = {spec.name: spec.typical for spec in testable[name].parameters}
@@ -322,8 +325,8 @@ def _next_manoeuvre(
     worst = sorted(detectable, key=times_typical, reverse=True)[:2]
     if all(times_typical(name) <= 1.0 for name in worst):
         needs = ", ".join(sorted(set(untestable.values())))
-        return f"record {needs} as well, to test {', '.join(untestable)}" if untestable else "nothing: all effects show"
-    return "; ".join(f"to see {name}: {testable[name].manoeuvre}" for name in worst)
+        return (finding("NEXT_RECORD", needs=needs, names=", ".join(untestable)) if needs else finding("NEXT_NOTHING"),)
+    return tuple(finding("NEXT_SHOW", name=name, manoeuvre=testable[name].manoeuvre) for name in worst)
 
 
 def _reasons(
@@ -352,7 +355,11 @@ def _reasons(
     if is_left and code != "GAP_UNKNOWN":
         reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
     if rest.found and (is_left or is_unknown):
-        reasons.append(finding("REST_FOLLOWS", about=rest.about))
+        about = rest.about
+        is_period = isinstance(about, float)
+        reasons.append(
+            finding("REST_FOLLOWS_PERIOD", seconds=about) if is_period else finding("REST_FOLLOWS", about=about)
+        )
     elif is_unknown:
         reasons.append(finding("REST_FOLLOWS_NOTHING"))
     return tuple(reasons)

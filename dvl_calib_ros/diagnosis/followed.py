@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -17,7 +16,6 @@ from .fitting import Fit
 # Groups of equally many samples in which the mean is told
 GROUPS = 15
 MIN_GROUP = 4
-_PERIOD = re.compile(r"a period of (\d+) s")
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class Followed:
         return at, mean, std, std / np.sqrt([len(part) for part in parts])
 
 
-def what_it_follows(problem: Problem, fit: Fit, about: str) -> Followed | None:
+def what_it_follows(problem: Problem, fit: Fit, about: str | float) -> Followed | None:
     """What a fit leaves beside the regressor it follows most, of those that a name stands for; None if there is none.
 
     That axis and that regressor of which groups' means scatter most, against chance.
@@ -58,11 +56,10 @@ def what_it_follows(problem: Problem, fit: Fit, about: str) -> Followed | None:
     return None if best is None else best[1]
 
 
-def _regressors(problem: Problem, fit: Fit, about: str) -> Mapping[str, Array]:
-    """Label -> (M,) values, of what a name in `unexplained.dictionary` stands for."""
-    period = _PERIOD.match(about)
-    if period:
-        return {f"time within a period of {period[1]} s, s": np.mod(problem.time, float(period[1]))}
+def _regressors(problem: Problem, fit: Fit, about: str | float) -> Mapping[str, Array]:
+    """Label -> (M,) values, of what a name in `dictionary`, or a period in s, stands for."""
+    if isinstance(about, float):
+        return {f"time within a period of {about:.0f} s, s": np.mod(problem.time, about)}
     parts = [_of_motion(each.motion, about) for each in fit.seen]
     return {
         label: np.concatenate([grid.averaged(part[label]) for grid, part in zip(problem.grids, parts, strict=True)])

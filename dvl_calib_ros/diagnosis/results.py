@@ -59,7 +59,7 @@ class Diagnosis(Answering):
     where: tuple[GapPlace, ...]
     untestable: Mapping[str, str]
     minimum_detectable: Mapping[str, Mapping[str, float]]
-    next_manoeuvre: str
+    next_steps: tuple[Reason, ...]
     notes: tuple[str, ...]
     series: DiagnosisSeries | None = None
     calibration: tuple[tuple[float, float, float], ...] = ()
@@ -73,6 +73,11 @@ class Diagnosis(Answering):
     def sentence(self) -> str:
         """The verdict in words."""
         return " ".join(reason.full_sentence for reason in self.reasons)
+
+    @property
+    def next_manoeuvre(self) -> str:
+        """What to record next, in words."""
+        return "; ".join(each.sentence for each in self.next_steps)
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -125,6 +130,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
         "untestable": [{"name": name, "needs": needs} for name, needs in diagnosis.untestable.items()],
         "minimum_detectable": {name: dict(sizes) for name, sizes in diagnosis.minimum_detectable.items()},
         "next_manoeuvre": diagnosis.next_manoeuvre,
+        "next_steps": [each.as_dict() for each in diagnosis.next_steps],
         "calibration": {
             "phi_rad": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[:3], strict=False)},
             "delta_k": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[3:], strict=False)},

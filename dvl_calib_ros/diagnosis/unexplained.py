@@ -42,14 +42,15 @@ INDEPENDENT = 1e-3
 @dataclass(frozen=True)
 class Unexplained:
     """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
-    variance, beyond what chance brings. about: what the rest follows. columns: (M, A, f), the dictionary; empty if
-    nothing is left, since it would only explain noise. clearest: (M, A, c), those of them that are clearest;
-    clear_energy: of these; price: what the best of as many would explain by chance, once in 1 / LEVEL recordings.
+    variance, beyond what chance brings. about: what the rest follows, by name, or a period (s). columns: (M, A, f), the
+    dictionary; empty if nothing is left, since it would only explain noise. clearest: (M, A, c), those of them that are
+    clearest; clear_energy: of these; price: what the best of as many would explain by chance, once in 1 / LEVEL
+    recordings.
     """
 
     log_p: float
     energy: float
-    about: str
+    about: str | float
     columns: Array
     clearest: Array
     clear_energy: float = 0.0
@@ -86,12 +87,11 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
         return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
     grown = _grown(fitter, fit, looks)
     of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
+    tests: list[tuple[float, str | float, Array]]
     tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
-    tests += [
-        (line.log_p, f"a period of {line.period_s:.0f} s", _along_axes(line.waves, problem.axes)) for line in followed
-    ]
+    tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
     recoloured = [replace(each, energy=each.energy / of_group[each.name]) for each in recoloured]
-    others: list[tuple[float, str, Array]] = []
+    others: list[tuple[float, str | float, Array]] = []
     for number, each in enumerate(recoloured):
         if each.log_p() + looked_at < np.log(LEVEL):
             recoloured[number] = each = replace(each, energy=each.energy / _chance(fit, raw[each.name]))
@@ -108,13 +108,13 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     clear_energy = explained(_orthonormal(noise.whiten(fit.columns)), noise.whiten(best[2]), white, 1.0)[1]
-    clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(best[1], 1.0)
+    clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
     cost = float(chi2_isf(LEVEL / np.exp(looked_at), best[2].shape[2]))
     found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
 
-def _first(each: tuple[float, str, Array]) -> float:
+def _first(each: tuple[float, str | float, Array]) -> float:
     return each[0]
 
 

@@ -10,6 +10,7 @@ from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.look import Look, Survey
 from ..recordings.topics import spelled
+from ..verdict.reasons import Reason, finding
 
 NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
@@ -94,7 +95,7 @@ def is_another_dvl(look: Look, dvl: Look) -> bool:
     return is_one and look.topic != dvl.topic and moves and bool(look.frame_id) and look.frame_id != dvl.frame_id
 
 
-def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[str]:
+def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[Reason]:
     """What to say of DVLs beside the one that is calibrated."""
     look = survey.looks.get(dvl)
     if look is None:
@@ -102,36 +103,32 @@ def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[str]:
     others = [each for each in survey.looks.values() if is_another_dvl(each, look)]
     measured = [each for each in others if (difference(look, each) or 0.0) >= SAME_SHARE]
     return [
-        f"two DVLs: {dvl} ({look.frame_id}) is calibrated here, not {each.topic} ({each.frame_id}); calibrate that "
-        f"with --dvl-topic {each.topic}"
+        finding("SECOND_DVL", topic=dvl, frame=look.frame_id, other=each.topic, other_frame=each.frame_id)
         for each in sorted(measured, key=lambda each: each.topic)
     ]
 
 
-def choose_reference(survey: Survey, default: str, dvl: str, difference: Difference) -> tuple[str | None, list[str]]:
-    """The reference's topic, or None; and what was passed over, in sentences."""
+def choose_reference(survey: Survey, default: str, dvl: str, difference: Difference) -> tuple[str | None, list[Reason]]:
+    """The reference's topic, or None; and what was passed over."""
     standard = spelled(default, survey.topics)
     if standard is not None and survey.topics[standard] in REFERENCE_TYPES:
         return standard, []
     dvl_look = survey.looks.get(dvl)
     ranked: list[tuple[tuple[float, ...], Look]] = []
-    said: list[str] = []
+    said: list[Reason] = []
     for look in survey.looks.values():
         if look.topic == dvl or look.msgtype not in REFERENCE_TYPES or _has(look, COMMAND_WORDS):
             continue
         if look.speed < MOVES_FROM:
-            said.append(f"{look.topic} does not move; not taken as a reference")
+            said.append(finding("TOPIC_DOES_NOT_MOVE", topic=look.topic))
             continue
         share = None if dvl_look is None else difference(dvl_look, look)
         if _has(look, DVL_WORDS) or (share is not None and share < SAME_SHARE):
             if dvl_look is None or not is_another_dvl(look, dvl_look) or (share is not None and share < SAME_SHARE):
-                said.append(f"{look.topic} looks as if it was computed from the DVL; not taken as a reference")
+                said.append(finding("TOPIC_FROM_DVL", topic=look.topic))
             continue
         if is_derived(look):
-            said.append(
-                f"{look.topic} may be a filter's output that uses the DVL; not taken as a reference. If it does not "
-                f"use the DVL: --gnss-topic {look.topic}"
-            )
+            said.append(finding("TOPIC_DERIVED", topic=look.topic))
             continue
         kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(look, words)), 3)
         fits = 0.0 if share is None or share < 0.5 else 1.0
@@ -142,7 +139,7 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
     chosen = ranked[0][1]
     others = [look.topic for _, look in ranked[1:]]
     if others:
-        said.append(f"{chosen.topic} is taken as the reference, not {', '.join(others)}; --gnss-topic names another")
+        said.append(finding("SEVERAL_REFERENCES", topic=chosen.topic, others=", ".join(others)))
     return chosen.topic, said
 
 

@@ -73,8 +73,8 @@ class Given:
 class Discovery:
     """What to calibrate with.
 
-    found: what was found and where; notes: what was passed over; contradictions: where the recording's data do not
-    bear out what it declares; sentences. values: the parameters that were found, which are in `parameters`. agreement:
+    found: what was found and where, in sentences; notes: what was passed over; contradictions: where the recording's
+    data do not bear out what it declares. values: the parameters that were found, which are in `parameters`. agreement:
     how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
     knows_imu: whether it is known in which axes the IMU measures. mounting_because: why the mounting is what it is,
     where it is guessed from the data; else ''. clocks_given: the parameters of clocks of which more is taken off in
@@ -84,7 +84,7 @@ class Discovery:
     topics: Topics
     parameters: Parameters
     found: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[Reason, ...] = ()
     contradictions: tuple[Reason, ...] = ()
     values: Mapping[str, Any] = field(default_factory=dict)
     agreement: Agreement | None = None
@@ -104,25 +104,29 @@ class Discovery:
         before, roll_pitch_yaw = self.parameters.mounting_rpy, tuple(map(float, rpy))
         if not self.mounting_because or roll_pitch_yaw == before:
             return self
-        said = _mounting_said(before, self.mounting_because)
-        again = _mounting_said(roll_pitch_yaw, self.mounting_because)
+        again = _mounting_guessed(roll_pitch_yaw, self.mounting_because)
         return replace(
             self,
             parameters=self.parameters.replace(mounting_rpy=roll_pitch_yaw),
             values={**self.values, "mounting_rpy": roll_pitch_yaw},
-            notes=tuple(again if note == said else note for note in self.notes),
+            notes=tuple(again if note.code == again.code else note for note in self.notes),
         )
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """What the user should not overlook."""
-        return (*(each.sentence for each in self.contradictions), *self.notes)
+        return tuple(each.sentence for each in (*self.contradictions, *self.notes))
 
     def document(self) -> dict[str, Any]:
         """Plain data, for JSON: topics, what was found, doubts."""
         topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
-        codes = [each.as_dict() for each in self.contradictions]
-        return {"topics": topics, "found": list(self.found), "doubts": list(self.doubts), "contradictions": codes}
+        return {
+            "topics": topics,
+            "found": list(self.found),
+            "doubts": list(self.doubts),
+            "contradictions": [each.as_dict() for each in self.contradictions],
+            "notes": [each.as_dict() for each in self.notes],
+        }
 
 
 def discover(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
@@ -182,7 +186,7 @@ class _Search:
         self._tree = FrameTree.of(seen.transforms if used else (), seen.descriptions if used else ())
         self._values: dict[str, Any] = {}
         self._found: list[str] = []
-        self._notes: list[str] = list(self._tree.problems)
+        self._notes: list[Reason] = list(self._tree.problems)
         self._contradictions: list[Reason] = []
         self._mounting_because = ""
         self._chosen: Agreement | None = None
@@ -349,7 +353,7 @@ class _Search:
             like = self._tree.likely(choose.DVL_WORDS)
             placed = None if like is None else self._tree.placed(like, base_frame)
             if placed is not None:
-                self._notes.append(f"no transform for the DVL's frame {frame!r}; using frame {placed.frame!r} instead")
+                self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))
         if placed is not None and placed.base != base_frame.strip("/") and not self._gives("base_frame"):
             self._values["base_frame"] = placed.base
         return placed
@@ -515,7 +519,7 @@ class _Search:
         declared = self._declared_reference(reference)
         taken = DeclaredFrame(reading.reference, reading.reference_turned)
         if imu is None and declared is None and chosen.best_left >= FITS:  # no frame could be tried but the body's
-            self._notes.append(f"{reference.topic}: nothing tells its frame, not even the data without an IMU")
+            self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
         elif taken != declared:
             name = self._values["gnss_frame"] = taken.name
             if declared is None:
@@ -585,7 +589,7 @@ class _Search:
             return
         self._values["mounting_rpy"] = rpy
         self._mounting_because = why
-        self._notes.append(_mounting_said(rpy, why))
+        self._notes.append(_mounting_guessed(rpy, why))
 
     def _mounting_from_motion(self, dvl: Look, turned: bool) -> None:
         """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well."""
@@ -620,13 +624,10 @@ class _Search:
             self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
 
 
-def _mounting_said(rpy: Sequence[float], why: str) -> str:
+def _mounting_guessed(rpy: Sequence[float], why: str) -> Reason:
     # of a level vehicle, a heading that counts from elsewhere looks the same
-    quarter = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
-    return (
-        f"mounting {_degrees(rpy)}, {why}: nothing in the bag says how the DVL is mounted (-p "
-        f"mounting_rpy:={_option(rpy)}){quarter}"
-    )
+    also = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
+    return finding("MOUNTING_GUESSED", mounting=_degrees(rpy), why=why, option=_option(rpy), also=also)
 
 
 def _decided(found: Sequence[Agreement], wanted: Reading, declared: bool) -> Agreement | None:

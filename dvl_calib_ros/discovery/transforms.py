@@ -12,6 +12,7 @@ import numpy as np
 from ..calibration.frames import Array, rotation_from_quaternion, rotation_from_rpy
 from ..errors import InputError
 from ..files.urdf import parse_urdf
+from ..verdict.reasons import Reason, finding
 
 # Frames above the vehicle, which are no place to mount a sensor on.
 EARTH_NAMES = ("map", "odom", "world", "earth", "enu", "ned", "utm")
@@ -34,7 +35,7 @@ class FrameTree:
     """Fixed transforms, by child. Names without a leading slash."""
 
     _parents: dict[str, tuple[str, Array, Array, str]] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
+    problems: list[Reason] = field(default_factory=list)
 
     @staticmethod
     def of(transforms: Iterable[Any], descriptions: Iterable[str]) -> FrameTree:
@@ -47,9 +48,7 @@ class FrameTree:
             quaternion = np.array([q.x, q.y, q.z, q.w])
             length = float(np.linalg.norm(quaternion))
             if not 0.5 < length < 2.0 or not np.isfinite([t.x, t.y, t.z]).all():
-                tree.problems.append(
-                    f"/tf_static: the transform of {each.child_frame_id!r} is not a rotation; not used"
-                )
+                tree.problems.append(finding("TRANSFORM_NOT_ROTATION", frame=each.child_frame_id))
                 continue
             rotation = rotation_from_quaternion(quaternion / length)
             parent, child = _plain(each.header.frame_id), _plain(each.child_frame_id)
@@ -60,7 +59,7 @@ class FrameTree:
         try:
             joints = parse_urdf(Path("/robot_description"), text.encode()).joints
         except InputError as error:
-            self.problems.append(f"{error}; not used")
+            self.problems.append(finding("URDF_NOT_READ", reason=error))
             return
         for joint in joints:
             if joint.kind == "fixed":

@@ -38,19 +38,19 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def run_until(ending: Ending, args: Sequence[str]) -> int:
     """As `main`, with what asks it to stop."""
-    try:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
+    from ..errors import InputError, needing_ros
 
-        from ..calibration.parameters import ParameterError
-        from ..errors import InputError
-        from .calibration_node import CalibrationNode
-        from .executor import ReceivingExecutor
-        from .memory import give_back_at_once
-    except ImportError as error:
-        return _refused(
-            f"ROS 2 is not available ({error}); source /opt/ros/jazzy/setup.bash, or pip install 'dvl_calib_ros[ros]'"
-        )
+    try:
+        with needing_ros("the node"):
+            import rclpy
+            from rclpy.signals import SignalHandlerOptions
+
+            from ..calibration.parameters import ParameterError
+            from .calibration_node import CalibrationNode
+            from .executor import ReceivingExecutor
+            from .memory import give_back_at_once
+    except InputError as error:
+        return _refused(error)
     if ending.requested:
         return 0
     try:

@@ -235,7 +235,7 @@ class Document:
     """A result as it is said.
 
     warnings: what to know beside it. sections: in order; those without items are left out. parameters: what it was made
-    with, by name; for the page. lead: what is said before all else. folded: warnings that a page folds away.
+    with, by name; for the page. lead: what is found before all else. folded: warnings that a page folds away.
     """
 
     title: str
@@ -244,7 +244,7 @@ class Document:
     warnings: Sequence[str]
     sections: Sequence[Section]
     parameters: Sequence[tuple[str, str]] = ()
-    lead: str = ""
+    lead: Reason | None = None
     folded: Sequence[str] = ()
 
     @property

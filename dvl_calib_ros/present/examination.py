@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
-
 from ..examination.examine import NO_IMU, Content, Examination, Shown
 from ..files.parameter_edit import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
-from ..verdict.reasons import full
 from .document import Answer, Cell, Columns, Commands, Document, FindingLine, Section, Sentence, table_by
+from .typed import options, typed
 
 BAR = 20
 ANSWERS = {
@@ -27,7 +25,9 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
     severity, answer = ANSWERS[examined.verdict]
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
-    said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *discovery.notes)]
+    lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
+    notes = (note.sentence for note in discovery.notes)
+    said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"What the motion shows of the DVL (median speed {examined.speed_mps:.2f} m/s)"
     nothing = "Without a reference only pitch, and yaw if there are opposite headings."
     return Document(
@@ -38,20 +38,20 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *said]),
             Section(
-                f"Findings: {len(found)}" if found else "Nothing wrong was found",
+                f"Findings: {len(found)}" if found else f"Nothing {'else ' if lead else ''}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(motion, [table_by(SHOWN, examined.shown, words=4)] if examined.shown else [Sentence(nothing)]),
             Section("", [Commands(next_commands(examined, is_live))]),
         ],
-        lead=full(found[0].says) if found and found[0].code.startswith(NO_IMU) else "",
+        lead=lead,
     )
 
 
 def _why(examined: Examination) -> str:
     errors = [each for each in examined.findings if each.severity is Severity.ERROR]
     if errors:
-        return f"{errors[0].says}."
+        return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
     if not examined.has_reference:
         return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
     missing = [each.name for each in examined.shown if each.needs]
@@ -83,26 +83,22 @@ def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[st
     """What to type next."""
     if is_live:
         return [("next", _live_command(examined))]
-    bags = " ".join(shlex.quote(str(path)) for path in examined.paths)
-    options = "".join(
-        f" {found.remedy[found.remedy.index('-p ') :].split(' leaves')[0]}"
+    given = [
+        word
         for found in examined.findings
         if found.code in ("DOCTOR_CLOCKS", "DOCTOR_COVARIANCE") and "-p " in found.remedy
-    )
-    if examined.verdict == "no" and not options:
+        for word in found.remedy[found.remedy.index("-p ") :].split(" leaves")[0].split()
+    ]
+    if examined.verdict == "no" and not given:
         return [("next", "dvl-calib doctor BAG   (once it is recorded again)")]
-    return [("next", f"dvl-calib replay {bags}{options} --save calibration.yaml")]
+    return [("next", typed("replay", examined.paths, *given, "--save", "calibration.yaml"))]
 
 
 def _live_command(examined: Examination) -> str:
     """The node on the topics that were found, with what was found of them."""
     discovery, default = examined.discovery, Topics()
-    names = {role: getattr(discovery.topics, role) for role in ("dvl", "gnss", "imu")}
-    topics = "".join(
-        f" --{role}-topic {shlex.quote(name)}"
-        for role, name in names.items()
-        if name.lstrip("/") not in ("", getattr(default, role))
-    )
+    names = ((role, getattr(discovery.topics, role)) for role in ("dvl", "gnss", "imu"))
+    topics = [(role, name) for role, name in names if name.lstrip("/") not in ("", getattr(default, role))]
     found = {name: list(value) if isinstance(value, tuple) else value for name, value in discovery.values.items()}
-    values = "".join(f" -p {shlex.quote(f'{name}:={as_yaml(value)}')}" for name, value in found.items())
-    return f"dvl-calib run --watch{topics}{values} -p result_file:=calibration.yaml"
+    values = [f"{name}:={as_yaml(value)}" for name, value in found.items()]
+    return typed("run --watch", (), *options(topics, values), "-p", "result_file:=calibration.yaml")

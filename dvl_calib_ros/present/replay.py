@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -27,7 +26,6 @@ from ..replay.navigation import in_words, metres
 from ..replay.recorder import RunHistory
 from ..replay.replay import Replayed
 from ..verdict.kinds import Severity
-from ..verdict.reasons import full
 from .document import (
     CELL_KINDS,
     Answer,
@@ -53,6 +51,7 @@ from .document import (
     table_by,
 )
 from .terms import estimate_table
+from .typed import typed
 
 # What the verdict's word asks of the reader.
 ADVICE = {
@@ -113,8 +112,9 @@ def replayed(
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Severity.REJECT
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
-    own = [note for note in run.notes if not note.startswith(others)] if warnings is None else warnings
     first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
+    notes = [note for note in run.notes if first is None or note != str(first)]
+    own = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
     history = run.history
     velocities: list[Item] = []
@@ -166,7 +166,7 @@ def replayed(
             Section("", data, Where.PAGE),
         ],
         parameters=parameter_texts(result.parameters),
-        lead=full(first.says) if first is not None else "",
+        lead=first,
         folded=[note for note in run.notes if note.startswith(others)] if warnings is None else (),
     )
 
@@ -352,14 +352,12 @@ def next_commands(
     run: Replayed, bags: Sequence[Path], saved: Path | None, options: Sequence[str], doubts: bool
 ) -> list[str]:
     """What to type next, in order. options: of this run, which the next needs as well."""
-    named = " ".join(shlex.quote(str(bag)) for bag in bags)
-    given = "".join(f" {shlex.quote(option)}" for option in options)
     verdict = run.result.verifications[run.result.selected].verdict
-    if verdict is Severity.REJECT and run.recordings is not None and run.recordings.moved:
-        return [f"dvl-calib compare {named}{given}", f"dvl-calib doctor {named}"]
     if verdict is Severity.REJECT:
-        return [f"dvl-calib doctor {named}", f"dvl-calib diagnose {named}{given}"]
+        moved = run.recordings is not None and run.recordings.moved
+        found, doctor = typed("compare" if moved else "diagnose", bags, *options), typed("doctor", bags)
+        return [found, doctor] if moved else [doctor, found]
     if saved is None:
-        return [f"dvl-calib replay {named}{given} --save calibration.yaml"]
-    commands = [f"dvl-calib apply {shlex.quote(str(saved))} --urdf robot.urdf"]
-    return commands + ([f"dvl-calib doctor {named}"] if doubts else [])
+        return [typed("replay", bags, *options, "--save", "calibration.yaml")]
+    commands = [typed("apply", [saved], "--urdf", "robot.urdf")]
+    return commands + ([typed("doctor", bags)] if doubts else [])

@@ -36,7 +36,7 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
     from .terminal_map import terminal_map
 
     if document.lead:
-        yield Text(printable(document.lead), "bold")
+        yield from _found(document.lead)
     answer = document.answer
     if answer is not None:
         sentences = list(map(printable, answer.sentences))

@@ -84,7 +84,7 @@ def unpaired(c: UnpairedComparison) -> Document:
     return Document(
         title="The DVL of a simulator against that of the vehicle",
         subtitle="; ".join(f"{side}: {', '.join(name for name, _ in d.recordings)}" for side, d in sides.items()),
-        answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [c.sentence]),
+        answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [each.full_sentence for each in c.reasons]),
         warnings=c.notes,
         sections=[
             Section("Effect by effect", [effects, *needs] if c.effects else []),

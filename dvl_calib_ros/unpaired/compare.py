@@ -13,6 +13,7 @@ from ..diagnosis.results import DiagnosisVerdict as Explained
 from ..diagnosis.selection import EffectSelection
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
+from ..verdict.reasons import Reason, finding
 from .logs import Log, RecordedSide, read_log
 from .noise import compare_noise, levels_by_regime
 from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
@@ -84,7 +85,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(
         verdict=verdict,
-        sentence=_sentence(verdict, found, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
+        reasons=_reasons(verdict, found, noise, shrunk.rungs, vehicle.diagnosis, simulator.diagnosis),
         effects=tuple(found),
         noise=tuple(noise),
         levels={name: (level, levels[1][name]) for name, level in levels[0].items() if name in levels[1]},
@@ -234,52 +235,48 @@ def _verdict(
     return SimulatorVerdict.NO_DIFFERENCE
 
 
-def _sentence(
+_CLAIMED = {
+    ComparisonStatus.MISSING: "SIMULATOR_LACKS",
+    ComparisonStatus.OTHER_SIZE: "SIMULATOR_OTHER_SIZE",
+    ComparisonStatus.ONLY_SIMULATOR: "SIMULATOR_ALONE_HAS",
+}
+
+
+def _reasons(
     verdict: SimulatorVerdict,
     effects: Sequence[ComparedEffect],
     noise: Sequence[ComparedNoise],
     rungs: Sequence[Rung],
     vehicle: Diagnosis,
     simulator: Diagnosis,
-) -> str:
-    by_name = {rung.name: rung for rung in rungs}
-    before, after = by_name[AS_IT_IS], by_name[NOISE]
-    parts = []
-    for status, verb in (
-        (ComparisonStatus.MISSING, "The simulator lacks {}"),
-        (ComparisonStatus.OTHER_SIZE, "has {} of another size"),
-        (ComparisonStatus.ONLY_SIMULATOR, "has {} which the vehicle has not"),
-    ):
+) -> tuple[Reason, ...]:
+    """The verdict, and what is left."""
+    reasons = []
+    for status, code in _CLAIMED.items():
         named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]
         if named:
-            parts.append(verb.format(" and ".join(named)))
-    if parts:
-        text = ", ".join(parts)
-        text = text if text.startswith("The") else f"The simulator {text}"
-        text += (
-            f"; put right, its error on the vehicle's own motion falls from {1e3 * before.error_mps:.1f} to "
-            f"{1e3 * after.error_mps:.1f} mm/s, held out"
-        )
-    elif verdict is SimulatorVerdict.CANNOT_TELL:
-        text = "These recordings show no difference in effects, and could not have shown some that matter"
+            reasons.append(finding(code, names=" and ".join(named)))
+    if reasons:
+        error = {rung.name: 1e3 * rung.error_mps for rung in rungs}
+        reasons.append(finding("SIMULATOR_PUT_RIGHT", before=error[AS_IT_IS], after=error[NOISE]))
     else:
-        text = "The simulator lacks no effect that these recordings show"
-    differing = [each.name for each in noise if each.status.is_claim]
-    if differing:
-        text += f"; the noise differs in {', '.join(differing)}"
+        is_open = verdict is SimulatorVerdict.CANNOT_TELL
+        reasons.append(finding("SIMULATOR_NOT_SHOWN" if is_open else "SIMULATOR_ALIKE"))
+    if differing := [each.name for each in noise if each.status.is_claim]:
+        reasons.append(finding("SIMULATOR_NOISE", names=", ".join(differing)))
     unknown = [side for side, d in (("vehicle", vehicle), ("simulator", simulator)) if d.verdict is Explained.UNKNOWN]
     if unknown:
-        text += f"; something in the log of the {' and of the '.join(unknown)} follows no effect of the library"
-    return f"{text}."
+        reasons.append(finding("SIMULATOR_UNKNOWN_REST", sides=" and of the ".join(unknown)))
+    return tuple(reasons)
 
 
 def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
-    said = [
-        f"{side}: {diagnosis.sentence}"
+    reasons = tuple(
+        finding("SIMULATOR_NOTHING_COMPARED", side=side, why=diagnosis.reasons)
         for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))
         if diagnosis.selection is None
-    ]
+    )
+    sides: dict[str, dict[str, str]] = {"vehicle": {}, "simulator": {}}
     return UnpairedComparison(
-        SimulatorVerdict.CANNOT_TELL, f"Nothing can be compared. {' '.join(said)}", (), (), {}, (), float("nan"),
-        {"vehicle": {}, "simulator": {}}, vehicle, simulator,
-    )  # fmt: skip
+        SimulatorVerdict.CANNOT_TELL, reasons, (), (), {}, (), float("nan"), sides, vehicle, simulator
+    )

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..diagnosis.results import Diagnosis, diagnosis_document
 from ..verdict.answering import Answering
+from ..verdict.reasons import Reason
 
 Triple = tuple[float, float, float]
 """A value and its 95 per cent interval."""
@@ -114,13 +115,14 @@ class Rung:
 
 @dataclass(frozen=True, repr=False)
 class UnpairedComparison(Answering):
-    """The whole answer. effects and noise: claims first, the strongest first. levels: per regime, m/s rms over the
-    axes: vehicle and simulator. floor_mps: noise that no simulator can take off, of `rungs`. not_shown: for each side
-    the effects that its motions could not have shown at sizes that matter, with the smallest size that they would.
+    """The whole answer. reasons: the verdict first. effects and noise: claims first, the strongest first. levels: per
+    regime, m/s rms over the axes: vehicle and simulator. floor_mps: noise that no simulator can take off, of `rungs`.
+    not_shown: for each side the effects that its motions could not have shown at sizes that matter, with the smallest
+    size that they would.
     """
 
     verdict: SimulatorVerdict
-    sentence: str
+    reasons: tuple[Reason, ...]
     effects: tuple[ComparedEffect, ...]
     noise: tuple[ComparedNoise, ...]
     levels: Mapping[str, tuple[float, float]]
@@ -133,6 +135,11 @@ class UnpairedComparison(Answering):
     series: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        return " ".join(reason.full_sentence for reason in self.reasons)
+
+    @property
     def missing(self) -> tuple[ComparedEffect, ...]:
         """Effects that the vehicle has and the simulator has not, the strongest first."""
         return tuple(each for each in self.effects if each.status is ComparisonStatus.MISSING)
@@ -143,6 +150,7 @@ def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
     return {
         "verdict": comparison.verdict.value,
         "sentence": comparison.sentence,
+        "reasons": [reason.as_dict() for reason in comparison.reasons],
         "effects": [
             {
                 "name": each.name,

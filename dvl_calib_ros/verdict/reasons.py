@@ -14,10 +14,12 @@ from typing import Any
 from .comparisons import COMPARISONS
 from .configurations import CONFIGURATIONS
 from .diagnoses import DIAGNOSES
+from .discoveries import DISCOVERIES
 from .doctor import DOCTOR
 from .findings import FINDINGS
 from .kinds import Kind, Severity
 from .selections import SELECTIONS
+from .unpaired import UNPAIRED
 from .verdicts import VERDICTS
 
 _FIELD = re.compile(r"\{[^{}]*\}")
@@ -30,6 +32,8 @@ TABLES: Mapping[str, Sequence[Kind]] = {
     "configurations": CONFIGURATIONS,
     "selections": SELECTIONS,
     "diagnoses": DIAGNOSES,
+    "unpaired": UNPAIRED,
+    "discoveries": DISCOVERIES,
 }
 KINDS: Mapping[str, Kind] = {kind.code: kind for kinds in TABLES.values() for kind in kinds}
 # The worst first.
@@ -40,7 +44,7 @@ _WORST_FIRST = (Severity.ERROR, Severity.REJECT, Severity.MARGINAL, Severity.WAR
 class Reason:
     """Something that was found: an entry of the tables with what was put in. ``str()`` of it is what people read.
 
-    What is put in may be a reason as well: then its sentence is read in its place.
+    What is put in may be a reason as well, or several: then their sentences are read in its place.
     """
 
     code: str
@@ -74,12 +78,15 @@ class Reason:
 
     @property
     def _words(self) -> dict[str, Any]:
-        return {name: each.sentence if isinstance(each, Reason) else each for name, each in self.numbers.items()}
+        return {
+            name: " and ".join(cause.sentence for cause in causes) if (causes := _causes(each)) else each
+            for name, each in self.numbers.items()
+        }
 
     @property
     def causes(self) -> tuple[Reason, ...]:
         """The reasons that are put into it."""
-        return tuple(each for each in self.numbers.values() if isinstance(each, Reason))
+        return tuple(cause for each in self.numbers.values() for cause in _causes(each))
 
     def __str__(self) -> str:
         remedy = self.remedy
@@ -122,6 +129,11 @@ def table(kinds: Iterable[Kind]) -> str:
         cells = (_FIELD.sub("…", text).replace("|", "\\|") for text in (kind.says, kind.means, kind.remedy))
         lines.append(f"| {code} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _causes(value: object) -> tuple[Reason, ...]:
+    found = value if isinstance(value, tuple) else (value,)
+    return tuple(each for each in found if isinstance(each, Reason))
 
 
 def _plain(value: object) -> object:

@@ -50,5 +50,14 @@ SELECTIONS = (
         "The model that finds lever arm and delay explains them.",
         "",
     ),
+    _Said(
+        "ARM_LOOKS_LIKE_ANGLE",
+        "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",
+        "Turns to one side at one speed do not tell a lever arm from an angle.",
+        "",
+    ),
+    _Said("ARM_SHOWN", "a lever arm of {axes} m", "Another than the one that was given.", ""),
+    _Said("DELAY_SHOWN", "DVL stamps {seconds:.2f} s {way}", "Against the clocks of reference and IMU.", ""),
+    _Said("ARM_OR_DELAY_NOT_TOLD", "a lever arm or a delay", "Neither shows by itself.", ""),
     _Said("NO_EVIDENCE", "{model} explains the data as well", "Nothing speaks for another lever arm or a delay.", ""),
 )

@@ -156,7 +156,7 @@ def test_two_dvls_are_two_and_each_is_calibrated_by_itself(tmp_path):
     told.reference("/gnss/vel", TWIST, "map", "enu")
     told.imu("/imu", "base_link")
     bag = told.write(tmp_path / "bag")
-    (said,) = [note for note in discover([bag], Parameters()).notes if note.startswith("two DVLs")]
+    (said,) = [note.sentence for note in discover([bag], Parameters()).notes if note.code == "SECOND_DVL"]
     assert "/starboard/dvl (starboard_dvl_link)" in said and "--dvl-topic /starboard/dvl" in said
     other = discover([bag], Parameters(), Given(dvl_topic="/starboard/dvl"))
     assert other.topics.dvl == "/starboard/dvl" and other.topics.gnss == "/gnss/vel"

@@ -121,6 +121,7 @@ def test_a_topic_of_a_package_that_is_not_installed_is_said_and_the_others_are_p
         (["--remap", "dvl/twist:=2 x"], "topic '2 x' cannot be had"),
         (["--start-offset", "11"], "the recording has 1"),
         (["--delay", "-1"], "--delay"),
+        (["--playback-duration", "0"], "--playback-duration"),
     ],
 )
 def test_what_cannot_be_played_is_said_in_one_line(bag, capsys, options, said):

@@ -41,6 +41,8 @@ PRINTED: dict[str, tuple[str, ...]] = {
             "comparisons",
             "configurations",
             "selections",
+            "unpaired",
+            "discoveries",
             "diagnoses",
             "commands",
         )

@@ -47,5 +47,5 @@ class Damage:
     def raise_if_any(self) -> None:
         """Raise DamagedError with all of it in one sentence."""
         if self._places:
-            more = f" and {self._places - 1} more damaged places" if self._places > 1 else ""
+            more = f" (the first of {self._places} damaged places)" if self._places > 1 else ""
             raise DamagedError(f"{self._first}{more}, {self.skipped} bytes skipped")

@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...verdict.reasons import Reason
+from ...verdict.reasons import Reason, finding
 from ..assembly import gate_of, prior
 from ..bank import ModelCounts
 from ..estimator import Estimator, EstimatorSetup
@@ -261,27 +261,26 @@ class DelayFilter(Estimator):
         arm = [index for index in at.tolist() if index != DELAY]
         if any(abs(x[index]) > NAMED_FROM * std[index] for index in arm):
             axes = " ".join(f"{AXES[index - LEVER_ARM.start]} {x[index]:+.2f}" for index in arm)
-            found.append(f"a lever arm of {axes} m")
+            found.append(finding("ARM_SHOWN", axes=axes))
         if DELAY in at and abs(x[DELAY]) > NAMED_FROM * std[DELAY]:
-            late = "late" if x[DELAY] > 0.0 else "early"
-            found.append(f"DVL stamps {abs(x[DELAY]):.2f} s {late}")
+            found.append(finding("DELAY_SHOWN", seconds=abs(x[DELAY]), way="late" if x[DELAY] > 0.0 else "early"))
         turns = float(posterior.by_lever_arm.max())
         if turns > chi_square:
-            return Evidence(turns, "ARM_TAKEN_AS_KNOWN", {"turns": _turns_in_words(posterior)})
-        shown = " and ".join(found) or "a lever arm or a delay"
+            return Evidence(turns, "ARM_TAKEN_AS_KNOWN", {"turns": _arm_as_angle(posterior)})
+        shown = tuple(found) or finding("ARM_OR_DELAY_NOT_TOLD")
         return Evidence(chi_square, "ARM_OR_DELAY_SHOWN", {"shown": shown})
 
     @property
-    def doubt(self) -> str:
-        """How much of an angle is the lever arm's, in words; '' if the motion tells them apart.
+    def doubt(self) -> Reason | None:
+        """How much of an angle is the lever arm's; None if the motion tells them apart.
 
         On a circle at one speed a DVL that sits elsewhere looks like a turned one, and σ of a model that takes the
         lever arm as known is worth nothing.
         """
         posterior = self.posterior
         if posterior is None or posterior.by_lever_arm.max() < EXTENDED_FROM:
-            return ""
-        return _turns_in_words(posterior)
+            return None
+        return _arm_as_angle(posterior)
 
     def remember(self, from_ns: int) -> None:
         """Keep the state as of now, for `remembered`."""
@@ -527,7 +526,7 @@ class DelayFilter(Estimator):
         return self._solver
 
 
-def _turns_in_words(posterior: Posterior) -> str:
+def _arm_as_angle(posterior: Posterior) -> Reason:
     index = int(np.argmax(posterior.by_lever_arm))
-    angle, turn = ("roll", "pitch", "yaw")[index], math.degrees(posterior.turned[index])
-    return f"on this track a 0.1 m error of the lever arm looks like {abs(0.1 * turn):.1f}° of {angle}"
+    angle, degrees = ("roll", "pitch", "yaw")[index], abs(0.1 * math.degrees(posterior.turned[index]))
+    return finding("ARM_LOOKS_LIKE_ANGLE", metres=0.1, degrees=degrees, angle=angle)

@@ -75,6 +75,7 @@ def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_side
     assert low < value < high and value == pytest.approx(0.8, abs=0.1)
     assert arm.simulator["x_m"][1] < 0.0 < arm.simulator["x_m"][2]
     assert arm.p < 0.01 and arm.lies is not None and "lever_arm" in compared.sentence
+    assert [each.code for each in compared.reasons][:2] == ["SIMULATOR_LACKS", "SIMULATOR_PUT_RIGHT"]
 
 
 def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_in(compared):
@@ -112,7 +113,7 @@ def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys
     out, _ = succeed(
         capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], "--report", report, "--json", document
     )
-    assert "The simulator lacks lever_arm; put right" in out
+    assert "The simulator lacks lever_arm. Put right" in " ".join(out.split())
     assert json.loads(document.read_text())["verdict"] == "different"
     page = Page(report)
     assert page.row("lever_arm")[1] == "the simulator lacks it"

@@ -1,0 +1,65 @@
+"""What a comparison of a simulator's DVL with the vehicle's concludes, of recordings that are not of one motion."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from .kinds import Kind, Severity
+
+_Said = partial(Kind, page="troubleshooting.md#what-a-comparison-with-a-simulator-says", remedy="")
+UNPAIRED = (
+    _Said(
+        "SIMULATOR_LACKS",
+        "the simulator lacks {names}",
+        "The vehicle's recordings show these effects, and the simulator's do not.",
+        severity=Severity.REJECT,
+    ),
+    _Said(
+        "SIMULATOR_OTHER_SIZE",
+        "the simulator has {names} of another size",
+        "Both show these effects, and their 95 % intervals differ by more than chance.",
+        severity=Severity.REJECT,
+    ),
+    _Said(
+        "SIMULATOR_ALONE_HAS",
+        "the simulator has {names} which the vehicle has not",
+        "The simulator's recordings show these effects, and the vehicle's do not.",
+        severity=Severity.REJECT,
+    ),
+    _Said(
+        "SIMULATOR_PUT_RIGHT",
+        "put right, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
+        "Each side's DVL is simulated on the stretches of the vehicle's motion that were held out.",
+        severity=Severity.ACCEPT,
+    ),
+    _Said(
+        "SIMULATOR_NOT_SHOWN",
+        "these recordings show no difference in effects, and could not have shown some that matter",
+        "One side's motion shows too few effects.",
+        severity=Severity.MARGINAL,
+    ),
+    _Said(
+        "SIMULATOR_ALIKE",
+        "the simulator lacks no effect that these recordings show",
+        "What both can show is of one size.",
+        severity=Severity.ACCEPT,
+    ),
+    _Said(
+        "SIMULATOR_NOISE",
+        "the noise differs in {names}",
+        "Noise, rate, gaps or outliers of the streams.",
+        severity=Severity.MARGINAL,
+    ),
+    _Said(
+        "SIMULATOR_UNKNOWN_REST",
+        "something in the log of the {sides} follows no effect of the library",
+        "The diagnosis of that side alone says unknown.",
+        severity=Severity.MARGINAL,
+    ),
+    _Said(
+        "SIMULATOR_NOTHING_COMPARED",
+        "nothing can be compared: of the {side}, {why}",
+        "That side's recordings cannot be diagnosed.",
+        severity=Severity.MARGINAL,
+    ),
+)
