@@ -232,14 +232,14 @@ def diagnose(
     ----------
     bags
         As of `replay`.
+    simulator
+        Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
     dvl_topic, gnss_topic, imu_topic
         As of `replay`.
     params
         As of `replay`.
     **parameters
         As of `replay`.
-    simulator
-        Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
 
     Returns
     -------
