@@ -15,6 +15,7 @@ from matplotlib.ticker import FixedLocator
 from dvl_calib_ros.calibration.comparison import Comparison, compare
 from dvl_calib_ros.calibration.extrinsics import Extrinsics, rotation_of
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.navigation import Drift, Navigation
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.followed import Followed
@@ -36,7 +37,6 @@ from dvl_calib_ros.evaluation.results import (
     Trace,
 )
 from dvl_calib_ros.present.reports import write_replay_report
-from dvl_calib_ros.replay.navigation import Drift, Navigation
 from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.verdict.reasons import finding
 

@@ -10,7 +10,6 @@ question that is asked of it is a method.)
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -28,10 +27,12 @@ from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
 from .days import day_covariance, offset_covariance
-from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording
+from .delay.clocks import Rest
+from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 from .delay.workers import Worker
 from .error_model import correction_matrix
 from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
+from .folds import folds_of
 from .frames import Array, Vector
 from .heading_deviation import comes_first, heading_advice
 from .headings import EVERY_NS, Headings
@@ -39,6 +40,7 @@ from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
 from .left_over import left_over_advice
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
+from .navigation import Navigation, dead_reckoned, objections
 from .observability import MEASURES_VERTICAL, convergence, observability
 from .observations import Observations
 from .observe import Observer
@@ -46,19 +48,21 @@ from .parameters import IAC, ParameterError, Parameters
 from .positions import are_positions
 from .register.registration import Registration
 from .results import Day, Estimate, Result
-from .robust import median
 from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
 from .selection import Selection
-from .verification import SEVERAL, Verification, calibration_error, verify
+from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
-# An error of so many times the usual one is that of an outlier.
-OUTLYING = 5.0
 # Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
 OPEN_FROM = 4.0
 # So many σ of the difference between the two are no chance.
 NO_CHANCE = 3.0
+# What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
+JUDGED_LIVE = {
+    "HELD_OUT_WORSE", "HELD_OUT_SEVERAL_TIMES", "HELD_OUT_IMPLAUSIBLE", "HELD_OUT_OUTLIERS", "MISALIGNMENT_LARGE",
+    "SCALE_LARGE", "LEVER_ARM_TURNS_ANGLE",
+}  # fmt: skip
 # Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
@@ -564,25 +568,68 @@ class Calibrator:
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         judge = next(group for group in self._groups if group.needs is Needs.REFERENCE)
         self._update(judge)
-        estimator = self._estimators[name]
-        held_out = estimator.held_out_error(judge.moments, self.parameters.rotation_dvl_from_body)
+        held_out = self._estimators[name].held_out_error(judge.moments, self.parameters.rotation_dvl_from_body)
         is_suspect = held_out is not None and held_out.corrected > min(
             SEVERAL * held_out.predicted, held_out.uncorrected
         )
+        typical = self._typical_error(model, state) if is_suspect else None
+        samples, vv, *_ = judge.moments.total
+        return self._judged(estimate, held_out, typical, (float(samples), vv), self.suggestion)
+
+    def _judged(
+        self,
+        estimate: Estimate,
+        held_out: HeldOutError | None,
+        typical: float | None,
+        judged: tuple[float, Array],
+        suggestion: Reason | None,
+    ) -> Verification:
+        """As of `verify`. judged: as of `calibration_error`."""
+        name, p = estimate.model, self.parameters
+        model, estimator = MODELS[name], self._estimators[name]
         return verify(
             model,
-            state,
+            GaussianState(estimate.state, estimate.covariance),
             estimate.convergence,
             held_out,
-            self.parameters,
+            p,
             (estimate.used, estimate.gated),
-            self.suggestion if model.aided else None,
+            suggestion if model.aided else None,
             any(each.reference_claims for each in self._further),
             next((each.doubt for each in self._further if each.doubt), None) if model.aided else None,
             bool(model.estimator) and estimator.claims,
-            self._typical_error(model, state) if is_suspect else None,
-            calibration_error(model, self.of_recording(name).p, judge.moments, self.parameters.rotation_dvl_from_body),
+            typical,
+            calibration_error(model, self.of_recording(name).p, judged, p.rotation_dvl_from_body),
         )
+
+    def _verified_so_far(self, *, fresh: bool) -> Verification:
+        """The same of the selected model, by what the worker looked at; nothing is waited for unless fresh."""
+        estimate = self._without_tilt(self.estimate()) if fresh else self.estimate()
+        rest, suggestion = self._rest(fresh=fresh), self.suggestion if fresh else self.suggestion_so_far
+        if rest is None or not MODELS[estimate.model].aided:
+            return self._judged(estimate, None, None, (0.0, np.zeros((3, 3, 3))), suggestion)
+        return self._judged(estimate, rest.held_out, rest.typical, rest.judged, suggestion)
+
+    def _rest(self, *, fresh: bool) -> Rest | None:
+        return next((rest for each in self._further if (rest := each.rest(fresh=fresh)) is not None), None)
+
+    def navigation(self, name: str) -> Navigation | None:
+        """What one model's calibration is worth to dead reckoning, on data that it had not seen; for one made
+        ``verified``. None without reference, or with hardly any motion."""
+        kept = self.recording
+        if kept is None:
+            return None
+        recording, epoch_ns = kept
+        try:
+            terms = self.held_out_terms(name)
+        except np.linalg.LinAlgError:
+            return None
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
+        # of every fold and day what corrects it
+        n_days = len(terms[0])
+        parts = folds_of(stamps_ns, self.parameters) * n_days + self.day_of(stamps_ns)
+        corrections = [each for of_days in terms for each in of_days]
+        return dead_reckoned(recording, parts, corrections, self.parameters, epoch_ns, self.heading_deviation)
 
     def _typical_error(self, model: Model, state: GaussianState) -> float | None:
         """Velocity error of a state, m/s rms, without outliers; None where nothing was kept."""
@@ -590,24 +637,14 @@ class Calibrator:
         if kept is None:
             return None
         x, recording = state.x, kept[0]
-        every = np.arange(len(recording.dvl.times))
         if model.estimator:
-            error = recording.compared(every, Terms.of_state(x), self.parameters).error
-        else:
-            if self._compared is None or self._compared[0] is not recording:
-                self._compared = recording, recording.compared(every, NO_TERMS, self.parameters)
-            seen, errors, t = (
-                self._compared[1],
-                model.error_terms_from_state @ x,
-                self.parameters.rotation_dvl_from_body,
-            )
-            change = recording.dvl.velocity @ (t.T - correction_matrix(errors[:3], errors[3:], t)).T
-            error = seen.error + np.matmul(seen.measured, change[..., None])[..., 0]
-        square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
-        if not len(square):
-            return None
-        good = square[square <= OUTLYING**2 * median(square)]
-        return math.sqrt(float(good.mean()))
+            return typical_error(recording, Terms.of_state(x), self.parameters)
+        if self._compared is None or self._compared[0] is not recording:
+            every = np.arange(len(recording.dvl.times))
+            self._compared = recording, recording.compared(every, NO_TERMS, self.parameters)
+        seen, errors, t = self._compared[1], model.error_terms_from_state @ x, self.parameters.rotation_dvl_from_body
+        change = recording.dvl.velocity @ (t.T - correction_matrix(errors[:3], errors[3:], t)).T
+        return without_outliers(seen.error + np.matmul(seen.measured, change[..., None])[..., 0])
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """For every fold what one model corrects on every day, had it not seen that fold; for one made ``verified``.
@@ -641,6 +678,7 @@ class Calibrator:
             return self._result()
 
     def _result(self) -> Result:
+        doubts = [] if self._worker is None else self.doubts(fresh=True)
         chosen = self._estimators.get(self.selected)  # None where it is not among the models wanted
         return Result(
             selected=self.selected,
@@ -651,12 +689,23 @@ class Calibrator:
             first_ns=self.first_ns,
             last_ns=self.last_ns,
             parameters=self.parameters.as_dict(),
-            verifications={name: self.verification(name) for name in self._models} if self._verified else {},
+            verifications=self._verifications(doubts),
             suggestion=self.suggestion,
             days=self.days,
             days_of=next((name for name in self._models if self._days_of(name)), ""),
-            doubts=() if self._worker is None else tuple(self.doubts(fresh=True)),
+            doubts=tuple(doubts),
         )
+
+    def _verifications(self, doubts: Sequence[Reason]) -> dict[str, Verification]:
+        """Verdicts by model: live that of the selected one, with all that speaks against it."""
+        if self._verified:
+            return {name: self.verification(name) for name in self._models}
+        if self._worker is None:
+            return {}
+        verification = self._verified_so_far(fresh=True)
+        known = {each.code for each in verification.reasons}
+        against = [each for each in doubts if each.severity is not Severity.WARNING and each.code not in known]
+        return {self.selected: verification.with_objections(against)}
 
     def doubts(self, *, fresh: bool) -> list[Reason]:
         """What the data say against the calibration, as bad as that is to a verdict; of one with a worker.
@@ -669,16 +718,20 @@ class Calibrator:
             finding_it = {name: self.estimate(name) for name in self._models if told_arm.finds_arm(MODELS[name])}
             told = told_arm.told_arm_advice(finding_it, self.parameters)
             found += [each.weighed(Severity.MARGINAL) for each in told]
-        rest = next((rest for each in self._further if (rest := each.rest(fresh=fresh)) is not None), None)
-        if rest is None:
+        rest = self._rest(fresh=fresh)
+        navigation = None if rest is None else rest.navigation
+        if rest is None or navigation is None:
             return found
         estimate = self.estimate()
-        if rest.deviation is not None:
-            is_first = comes_first(rest.deviation, estimate)
-            found += [each.weighed(Severity.REJECT) if is_first else each for each in heading_advice(rest.deviation)]
+        if navigation.deviation is not None:
+            is_first = comes_first(navigation.deviation, estimate)
+            advice = heading_advice(navigation.deviation)
+            found += [each.weighed(Severity.REJECT) if is_first else each for each in advice]
         if rest.in_earth:
-            found += one_heading_advice(estimate, self.parameters, rest.followed.speed)
-        return found + left_over_advice(rest.followed, are_positions(self.parameters))
+            found += one_heading_advice(estimate, self.parameters, navigation.speed)
+        found += left_over_advice(navigation.followed, are_positions(self.parameters))
+        held_out = self._verified_so_far(fresh=fresh).reasons
+        return [*found, *objections(navigation), *(each for each in held_out if each.code in JUDGED_LIVE)]
 
     @property
     def is_level(self) -> bool:

@@ -85,9 +85,14 @@ def held_out_error(
     return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
 
 
-def calibration_error(model: Model, covariance: Array, moments: Moments, rotation_dvl_from_body: Array) -> float:
-    """Velocity error, m/s rms, that a covariance (n, n) of a model's state makes on the samples judged; 0 for none."""
-    samples, vv, *_ = moments.total
+def calibration_error(
+    model: Model, covariance: Array, judged: tuple[float, Array], rotation_dvl_from_body: Array
+) -> float:
+    """Velocity error, m/s rms, that a covariance (n, n) of a model's state makes on the samples judged; 0 for none.
+
+    judged: the first two of the sums of `Moments`.
+    """
+    samples, vv = judged
     of_errors = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
     total = _calibration_variance(of_errors, vv, rotation_dvl_from_body.T)
     return math.sqrt(max(total, 0.0) / float(samples)) if samples else 0.0

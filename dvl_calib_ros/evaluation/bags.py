@@ -17,6 +17,7 @@ from ..calibration.delay.hold_out import Terms, ThinnedRecording
 from ..calibration.error_model import correction_matrix
 from ..calibration.frames import Array
 from ..calibration.models import MODELS, Needs
+from ..calibration.navigation import Navigation, dead_reckoned, navigation_document
 from ..calibration.observe import Observer
 from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate
@@ -27,7 +28,6 @@ from ..recordings.recorded import Recorded
 from ..recordings.recording import open_recording
 from ..recordings.same import hold_the_same
 from ..recordings.topics import Topics
-from ..replay.navigation import Navigation, dead_reckoned, navigation_document
 from ..replay.replay import replay
 from ..verdict.answering import Answering
 from .metrics import RunMoments, vrmse

@@ -24,10 +24,8 @@ from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import position_in_body, scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
-from ..calibration.verification import use_findings
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
-from ..verdict.reasons import finding
 from .parameter_edit import as_yaml, new_file, with_parameters
 from .parameter_files import NODE_NAME, changed_parameters, load_parameters
 from .result_file import load_result, static_transform_arguments
@@ -129,9 +127,8 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         }
         convergence = Convergence(content["models"][model.name]["convergence"])
         objections, doubts = _judged(content.get("verification"), convergence)
-        if "verification" not in content:
-            objections += _unverified(content, model)
-            doubts += _said(content, Severity.MARGINAL, Severity.WARNING)
+        objections += _said(content, Severity.REJECT)
+        doubts += _said(content, Severity.MARGINAL, Severity.WARNING)
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     except ParameterError as error:
@@ -171,20 +168,12 @@ def _judged(
             "its convergence is coarse: standard deviations are above fine_std_misalignment or fine_std_scale"
         )
     if verification is None:
-        doubts.append("it is not verified on held-out data, as the node cannot; `dvl-calib replay` of a recording does")
+        doubts.append("it is not verified on held-out data; `dvl-calib replay` of a recording does that")
         return tuple(objections), tuple(doubts)
     verdict, reason = VERDICT_WORDS[verification["verdict"]], str(verification["reasons"][0])
     if verdict is not Severity.ACCEPT:
         (objections if verdict is Severity.REJECT else doubts).append(f"its verdict is {verdict.value}: {reason}")
     return tuple(objections), tuple(doubts)
-
-
-def _unverified(content: Mapping[str, Any], model: Model) -> tuple[str, ...]:
-    """Objections to what the node saved, which it cannot verify but may know to be wrong."""
-    says = content.get("suggestion")
-    objections = [finding("CONFIGURATION_WRONG", says=says)] if says else []
-    objections += use_findings((int(content["used"]), int(content["gated"]))) if model.aided else []
-    return (*(each.sentence for each in objections), *_said(content, Severity.REJECT))
 
 
 def _said(content: Mapping[str, Any], *severities: Severity) -> tuple[str, ...]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..calibration.navigation import Drift, Navigation
 from ..evaluation.bags import CrossCheck
-from ..replay.navigation import Drift, Navigation
 from .document import Document, Item, Section, Sentence, Table, Where, figures, number, parameter_texts
 
 

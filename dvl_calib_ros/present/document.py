@@ -17,7 +17,7 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
-    from ..replay.navigation import Navigation
+    from ..calibration.navigation import Navigation
     from .style import Picture
 
 

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from ..calibration.frames import Array
-from ..replay.navigation import Navigation
+from ..calibration.navigation import Navigation
 from .exploring import MapTrack
 from .replay_figures import AFTER, BAD
 from .style import INK, WIDTH, Picture, legend_above, new_figure, picture

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from ..calibration.models import MODELS
+from ..calibration.navigation import in_words, metres
 from ..calibration.parameters import Parameters
 from ..calibration.quantities import quantities
 from ..calibration.results import Result
@@ -22,7 +23,6 @@ from ..calibration.samples import VelocityFrame
 from ..calibration.verification import Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag
-from ..replay.navigation import in_words, metres
 from ..replay.recorder import RunHistory
 from ..replay.replay import Replayed
 from ..verdict.kinds import Severity

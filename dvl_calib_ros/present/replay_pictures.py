@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ..calibration.models import MODELS
+from ..calibration.navigation import Navigation
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.verification import HeldOutError
-from ..replay.navigation import Navigation
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
 from . import replay_figures as figures

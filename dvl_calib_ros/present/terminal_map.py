@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..replay.navigation import Navigation
+from ..calibration.navigation import Navigation
 
 if TYPE_CHECKING:
     from rich.text import Text

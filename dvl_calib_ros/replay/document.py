@@ -8,9 +8,9 @@ from typing import Any
 
 from .. import __version__
 from ..calibration.comparison_words import comparison_document
+from ..calibration.navigation import navigation_document
 from ..calibration.verification import verification_document
 from ..files.result_file import days_document, estimate_document
-from .navigation import navigation_document
 from .replay import Replayed
 
 

@@ -21,6 +21,7 @@ from ..calibration.heading_deviation import comes_first, heading_advice
 from ..calibration.kalman import GaussianState
 from ..calibration.left_over import left_over_advice
 from ..calibration.models import MODELS
+from ..calibration.navigation import Navigation, objections
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
 from ..calibration.positions import are_positions
@@ -38,7 +39,6 @@ from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .clocks import StreamClocks
-from .navigation import Navigation, navigation_of, objections
 from .recorder import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
@@ -133,13 +133,12 @@ def replay(
     told = [] if result.suggestion else told_arm_advice(result.estimates, calibrator.parameters)
     found += told
     history = recorder.history(calibrator, result.estimates) if recorder else None
-    navigation = navigation_of(calibrator, result.selected, calibrator.parameters) if judged else None
+    navigation = calibrator.navigation(result.selected) if judged else None
     if navigation is not None:
         deviates = heading_advice(navigation.deviation)
-        speed = navigation.distance_m / max(navigation.seconds, 1e-9)
         found += deviates
         if decoder.frame_of_reference is not VelocityFrame.BODY:
-            found += one_heading_advice(result.estimate, calibrator.parameters, speed)
+            found += one_heading_advice(result.estimate, calibrator.parameters, navigation.speed)
     left = left_over_advice(navigation.followed, are_positions(of_types)) if navigation is not None else []
     found += [each.weighed(Severity.WARNING) for each in left]
     of_drift = objections(navigation)

@@ -486,6 +486,8 @@ class DelayBank:
                 with_states_of(state, unknown, _without(np.where(is_of_day, ended.shown, shown), _BEYOND))
                 for state, ended in zip(before, self._ended, strict=True)
             ]
+            if not shown[BEYOND].any():  # and the rest by it, as of a model that takes lever arm and delay as known
+                last = _given(last, _BEYOND, self.prior.x[BEYOND])
             folds.append([*states, with_states_of(last, known, _without(shown, _BEYOND))])
         return folds
 
@@ -613,6 +615,12 @@ class _Expected:
         rows, stamps_ns, _ = self._blocks[number]
         self.heave.add_sums(stamps_ns, rows.heave, self.use[number])
         return self.heave.sums()
+
+
+def _given(state: GaussianState, which: Index, values: Array) -> GaussianState:
+    """A state x (n,), P (n, n) where some of it (u,) is known."""
+    gain = np.linalg.solve(state.p[np.ix_(which, which)], state.p[which]).T
+    return GaussianState(state.x + gain @ (values - state.x[which]), state.p - gain @ state.p[which])
 
 
 def _without(shown: Mask, of: Index) -> Index:

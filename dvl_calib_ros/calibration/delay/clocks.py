@@ -7,22 +7,31 @@ lever arm of ρ u explains almost as well: so what G2 has kept of each day is re
 from __future__ import annotations
 
 from collections import deque
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...verdict.reasons import Reason
+from ..folds import folds_of
 from ..frames import Array
-from ..heading_deviation import HeadingDeviation, heading_deviation
-from ..left_over import LeftOver, left_over
+from ..navigation import Navigation, dead_reckoned
 from ..parameters import Parameters
 from ..register.configuration import fitting_configuration
 from ..register.motion import MotionStreams, make_motion
 from ..register.registration import Registration, register
 from ..samples import FRAMES, Codes, Mask
 from ..tables import RowTable
-from .hold_out import KEPT_EVERY_S, MEASURED_BELOW, NOT_MEASURED, Terms, ThinnedBlock, ThinnedRecording
+from ..verification import HeldOutError
+from .bank import DelayBank
+from .hold_out import (
+    KEPT_EVERY_S,
+    MEASURED_BELOW,
+    Terms,
+    ThinnedBlock,
+    ThinnedRecording,
+    held_out_error,
+    typical_error,
+)
 from .known import Posterior
 from .rows import DvlColumns, ImuColumns, ReferenceColumns
 
@@ -36,23 +45,31 @@ MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
 
 class _DvlVelocities(RowTable):
-    """times s and velocities m/s of the DVL."""
+    """times s and velocities m/s of the DVL, and the trace of its noise, (m/s)²."""
 
     IS_REUSED = True  # a motion has copies
-    LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,))}
+    LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,)), "noise": (np.float64, ())}
     times: Array
     velocity: Array
+    noise: Array
 
 
 class _Reference(RowTable):
-    """The same of references, whether they are in the body and which axes they measure."""
+    """The same of references, with the variance (m/s)² of each axis, as of `ReferenceColumns`."""
 
     IS_REUSED = True  # a motion has copies
-    LAYOUT: ClassVar = {**_DvlVelocities.LAYOUT, "in_body": (np.bool_, ()), "is_measured": (np.bool_, (3,))}
+    LAYOUT: ClassVar = {
+        "times": (np.float64, ()),
+        "velocity": (np.float64, (3,)),
+        "variance": (np.float64, (3,)),
+        "in_body": (np.bool_, ()),
+        "claimed": (np.bool_, ()),
+    }
     times: Array
     velocity: Array
+    variance: Array
     in_body: Mask
-    is_measured: NDArray[np.bool_]
+    claimed: Mask
 
 
 class _Imu(RowTable):
@@ -70,7 +87,7 @@ class _Imu(RowTable):
 
 
 class _Registered:
-    """What is registered of the newest blocks, without what is of no use here: covariances alone are half of it."""
+    """What is looked at of the newest blocks, without what is of no use here, such as covariances between axes."""
 
     def __init__(self) -> None:
         self._streams = _DvlVelocities(), _Reference(), _Imu()
@@ -87,8 +104,9 @@ class _Registered:
     def add(self, kept: ThinnedBlock) -> None:
         """Take a block; of more than `MOST` the oldest is forgotten."""
         r = kept.reference
-        is_measured = np.diagonal(r.noise, axis1=1, axis2=2) < MEASURED_BELOW
-        columns = kept.dvl, (r.times, r.velocity, r.in_body, is_measured), kept.imu
+        variance = np.diagonal(r.noise, axis1=1, axis2=2)
+        own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
+        columns = (*kept.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), kept.imu
         for stream, own in zip(self._streams, columns, strict=True):
             at = stream.extend(len(own[0]))
             for name, column in zip(stream.LAYOUT, own, strict=True):
@@ -105,22 +123,15 @@ class _Registered:
             stream.clear()
 
     def recording(self) -> ThinnedRecording:
-        """All that is there, as for verification; of noise it says which axes are measured."""
-        dvl, reference, imu = (
-            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
-        )
-        times, velocity, in_body, is_measured = reference
-        noise = np.where(is_measured, 1.0, NOT_MEASURED)[:, :, None] * np.eye(3)
-        claimed = np.zeros(len(times), dtype=bool)
-        of_reference = ReferenceColumns(times, velocity, noise, in_body, claimed)
-        return ThinnedRecording(DvlColumns(*dvl), np.zeros(len(dvl[0])), of_reference, ImuColumns(*imu))
+        """All that is there, as for verification."""
+        (dvl_times, dvl, own_noise), (times, velocity, variance, in_body, claimed), imu = self._columns()
+        reference = ReferenceColumns(times, velocity, variance[:, :, None] * np.eye(3), in_body, claimed)
+        return ThinnedRecording(DvlColumns(dvl_times, dvl), own_noise, reference, ImuColumns(*imu))
 
     def motion(self) -> MotionStreams | None:
         """All that is there, without references that are not like most; None where that is too little."""
-        dvl, reference, imu = (
-            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
-        )
-        times, velocity, in_body, is_measured = reference
+        dvl, (times, velocity, variance, in_body, _), imu = self._columns()
+        is_measured = variance < MEASURED_BELOW
         alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
         x, y, z = (2 * np.count_nonzero(is_measured[alike], axis=0) > np.count_nonzero(alike)).tolist()
         return make_motion(
@@ -131,13 +142,29 @@ class _Registered:
             ImuColumns(*(column.copy() for column in imu)),
         )
 
+    def _columns(self) -> tuple[list[Any], ...]:
+        return tuple(
+            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
+        )
+
+
+class ToldSoFar(NamedTuple):
+    """What blocks have told so far: the bank, what it found, and the stamp (ns) of their time 0."""
+
+    bank: DelayBank
+    posterior: Posterior
+    epoch_ns: int
+
 
 class Rest(NamedTuple):
-    """What a calibration leaves: what the velocity that is left follows, how the heading deviates, and whether the
-    reference is in the earth's frame."""
+    """What a calibration leaves on data held out: the velocity error; with all data, without outliers (m/s rms; None
+    for none); what was judged, as of `calibration_error`; the drift of dead reckoning with what is left and how the
+    heading deviates; and whether the reference is in the earth's frame."""
 
-    followed: LeftOver
-    deviation: HeadingDeviation | None
+    held_out: HeldOutError | None
+    typical: float | None
+    judged: tuple[float, Array]
+    navigation: Navigation | None
     in_earth: bool
 
 
@@ -179,12 +206,12 @@ class KeptClocks:
         self._seen.clear()
         self._blocks, self._latest = 0, Looked()
 
-    def look_again(self, posterior: Posterior | None) -> None:
-        """Look if there is so much more to see than the last time. posterior: what the blocks have told."""
+    def look_again(self, told: ToldSoFar | None) -> None:
+        """Look if there is so much more to see than the last time. told: by the blocks; None for nothing."""
         if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
-            self._latest = self._look(posterior)
+            self._latest = self._look(told)
 
-    def looked(self, posterior: Posterior | None = None, *, fresh: bool = True) -> Looked:
+    def looked(self, told: ToldSoFar | None = None, *, fresh: bool = True) -> Looked:
         """What the blocks so far show, or a day that is over, where something was off.
 
         fresh: all of them, else those there were when `look_again` looked.
@@ -192,14 +219,14 @@ class KeptClocks:
         if self._over is not None:
             return self._over
         if fresh and self._blocks > self._latest.blocks:
-            self._latest = self._look(posterior)
+            self._latest = self._look(told)
         return self._latest
 
     def contradiction(self, looked: Looked) -> Reason | None:
         """What clocks fit what was seen, where one is off."""
         return None if looked.registration is None else looked.registration.contradiction(self._parameters)
 
-    def _look(self, posterior: Posterior | None) -> Looked:
+    def _look(self, told: ToldSoFar | None) -> Looked:
         motion = self._seen.motion() if len(self._seen) >= ENOUGH else None
         if motion is None:
             return Looked(self._blocks)
@@ -208,23 +235,22 @@ class KeptClocks:
         try:
             found = register(motion, nominal, lever_arm)
             configuration = fitting_configuration(motion, declared, nominal, lever_arm, found)
-            rest = self._rest(posterior) if self._is_live and posterior is not None else None
+            rest = self._rest(told) if self._is_live and told is not None else None
             return Looked(self._blocks, found, configuration, rest)
         except np.linalg.LinAlgError:  # numbers that ran away
             return Looked(self._blocks)
 
-    def _rest(self, posterior: Posterior) -> Rest | None:
-        """Of all that is kept, corrected by what the blocks have told; None where some of it has no attitude."""
-        recording = self._seen.recording()
-        every = np.arange(len(recording.dvl.times))
-        seen = recording.compared(every, Terms.of_state(posterior.state.x), self._parameters)
-        use = np.isfinite(seen.error[:, 0])
-        if not (use.any() and seen.oriented[use].all()):
-            return None
-        times, rotation = recording.dvl.times[use], seen.rotation_enu_from_body[use]
-        followed = left_over(times, rotation, seen.body[use], seen.error[use], seen.rates[use])
-        if followed is None:
-            return None
-        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-        deviation = None if posterior.heading is None else heading_deviation(times, yaw, posterior.heading)
-        return Rest(followed, deviation, not recording.reference.in_body.any())
+    def _rest(self, told: ToldSoFar) -> Rest:
+        """Of all that is kept, corrected by what the blocks have told without each fold."""
+        recording, p = self._seen.recording(), self._parameters
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + told.epoch_ns
+        without = [[states[-1]] for states in told.bank.without_folds()]
+        terms = [Terms.of_state(state.x) for [state] in without]
+        held_out = held_out_error(recording, stamps_ns, np.zeros(len(stamps_ns), dtype=np.intp), without, p)
+        return Rest(
+            held_out,
+            typical_error(recording, Terms.of_state(told.posterior.state.x), p),
+            recording.judged(p),
+            dead_reckoned(recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, told.posterior.heading),
+            not recording.reference.in_body.any(),
+        )

@@ -518,8 +518,11 @@ class DelayFilter(Estimator):
             return None
         recording, epoch_ns = kept
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-        bank = self._idle_solver().bank
-        return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), bank, self._parameters)
+        try:
+            without = self._idle_solver().bank.without_folds()
+        except np.linalg.LinAlgError:  # as in `posterior`
+            return None
+        return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), without, self._parameters)
 
     def _idle_solver(self) -> BlockSolver:
         self._newest()

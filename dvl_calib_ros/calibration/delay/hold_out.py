@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,15 +11,17 @@ import numpy as np
 from ..error_model import CORRECTION_JACOBIAN, correction_matrix
 from ..folds import folds_of
 from ..frames import Array, cross, skew
+from ..kalman import GaussianState
 from ..parameters import Parameters
-from ..robust import steps
+from ..robust import median, steps
 from ..samples import Index, Mask, Stamps
 from ..verification import HeldOutError, held_out_from_sums
-from .bank import DelayBank
 from .rows import DELAY, LEVER_ARM, DvlColumns, ImuColumns, ReferenceColumns, attitude_at
 
 # What is kept comes no faster than this, s: a velocity error is judged as well by five a second.
 KEPT_EVERY_S = 0.19
+# An error of so many times the usual one is that of an outlier.
+OUTLYING = 5.0
 # An axis that the reference does not measure says nothing: (m/s)²
 NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
 
@@ -51,23 +54,23 @@ class ThinnedBlock(NamedTuple):
 
 
 def held_out_error(
-    recording: ThinnedRecording, stamps_ns: Stamps, days: Index, bank: DelayBank, p: Parameters
+    recording: ThinnedRecording,
+    stamps_ns: Stamps,
+    days: Index,
+    without_folds: Sequence[Sequence[GaussianState]],
+    p: Parameters,
 ) -> HeldOutError | None:
     """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
 
-    stamps_ns, days: (N,) of the DVL's samples.
+    stamps_ns, days: (N,) of the DVL's samples. without_folds: for every fold the state of every day.
 
     As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
     less its delay, and the lever arm away from the reference point.
     """
     folds = folds_of(stamps_ns, p)
-    nominal = np.zeros(len(bank.prior.x))
+    nominal = np.zeros(len(without_folds[0][0].x))
     sums = np.zeros(5)
     samples = 0
-    try:
-        without_folds = bank.without_folds()
-    except np.linalg.LinAlgError:  # as in `posterior`
-        return None
     for fold, states in enumerate(without_folds):
         for day, state in enumerate(states):
             at = np.flatnonzero((folds == fold) & (days == day))
@@ -82,6 +85,20 @@ def held_out_error(
             sums += [*squares, noise + calibration, calibration, interpolated]
             samples += int(np.count_nonzero(both))
     return held_out_from_sums(samples, sums)
+
+
+def typical_error(recording: ThinnedRecording, terms: Terms, p: Parameters) -> float | None:
+    """Velocity error with these terms, m/s rms, without outliers; None where nothing can be compared."""
+    return without_outliers(recording.compared(np.arange(len(recording.dvl.times)), terms, p).error)
+
+
+def without_outliers(error: Array) -> float | None:
+    """Errors (N, 3) m/s rms without outliers; None where all are nan."""
+    square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
+    if not len(square):
+        return None
+    good = square[square <= OUTLYING**2 * median(square)]
+    return math.sqrt(float(good.mean()))
 
 
 class _Errors(NamedTuple):
@@ -165,6 +182,13 @@ class ThinnedRecording(NamedTuple):
         share = np.where(seen.claimed, np.trace(seen.measured, axis1=1, axis2=2) / 3.0, 0.0)
         noise = seen.variance + self.noise_dvl[at] * share
         return _Errors(seen.error, seen.measured @ jacobian, noise, seen.interpolated)
+
+    def judged(self, p: Parameters) -> tuple[float, Array]:
+        """The first two of the sums of `Moments` over all that can be compared."""
+        seen = self.compared(np.arange(len(self.dvl.times)), NO_TERMS, p)
+        use = np.isfinite(seen.error[:, 0])
+        v, along = self.dvl.velocity[use], np.diagonal(seen.measured[use], axis1=1, axis2=2) > 0.5
+        return float(np.count_nonzero(use)), np.einsum("nk,ni,nj->kij", along, v, v)
 
     def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
         """Some DVL samples beside the reference, corrected, interpolated as pairing does."""

@@ -27,7 +27,7 @@ from ..shared_noise import SharedNoise
 from .bank import DelayBank
 from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
-from .clocks import KeptClocks, Looked, Rest
+from .clocks import KeptClocks, Looked, Rest, ToldSoFar
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, ThinnedBlock
 from .known import After, BlockRows, Known, Likely, Posterior
@@ -78,7 +78,7 @@ class _Comparison(NamedTuple):
 class BlockSolver:
     """Takes blocks in order. restarted: how often what was found was not finite, and that of before is kept.
 
-    kept: what verification needs, None where nobody verifies.
+    kept: what verification needs; None where nobody verifies, or live, where that is what clocks are looked at by.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class BlockSolver:
         self._parameters = parameters
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
-        self.bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified, parameters)
+        self.bank = DelayBank(prior, unknown, gate, np.diag(rate) if rate.any() else None, verified or live, parameters)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
         self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
@@ -127,7 +127,7 @@ class BlockSolver:
         """
         if own := self._dvl_stream.contradiction():
             return own
-        looked = self._clocks.looked(self._posterior, fresh=fresh)
+        looked = self._clocks.looked(self._so_far, fresh=fresh)
         contradiction, found = self._attitude_rates.contradiction(), looked.configuration
         if contradiction:  # of what follows from it only what mends it is worth a word
             is_mended = found is not None and found.code in ("IMU_LOOKS_NED", "REFERENCE_OR_IMU_NED")
@@ -136,11 +136,15 @@ class BlockSolver:
 
     def registration(self) -> Registration | None:
         """How the instruments stand; None where the data do not show it."""
-        return self._clocks.looked(self._posterior).registration
+        return self._clocks.looked(self._so_far).registration
 
     def rest(self) -> Rest | None:
         """What the calibration leaves, live; None where that is not looked at."""
-        return self._clocks.looked(self._posterior).rest
+        return self._clocks.looked(self._so_far).rest
+
+    @property
+    def _so_far(self) -> ToldSoFar | None:
+        return None if self._posterior is None else ToldSoFar(self.bank, self._posterior, self.epoch_ns)
 
     @property
     def is_level(self) -> bool:
@@ -172,7 +176,7 @@ class BlockSolver:
                 self._narrow()
             at = end
         if self._is_live:
-            self._clocks.look_again(self._posterior)
+            self._clocks.look_again(self._so_far)
         looked = self._clocks.looked(fresh=False)
         return [outcome._replace(looked=looked) for outcome in outcomes]
 

@@ -14,17 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.calibrator import Calibrator
-from ..calibration.delay.hold_out import NO_TERMS, Terms, ThinnedRecording
-from ..calibration.folds import folds_of
-from ..calibration.frames import Array
-from ..calibration.heading_deviation import HeadingDeviation, heading_deviation
-from ..calibration.kalman import GaussianState
-from ..calibration.left_over import LeftOver, left_over
-from ..calibration.parameters import Parameters
-from ..calibration.robust import median
-from ..calibration.samples import Index
 from ..verdict.reasons import Reason, finding
+from .delay.hold_out import NO_TERMS, Terms, ThinnedRecording
+from .frames import Array
+from .heading_deviation import HeadingDeviation, heading_deviation
+from .kalman import GaussianState
+from .left_over import LeftOver, left_over
+from .parameters import Parameters
+from .robust import median
+from .samples import Index
 
 # Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
@@ -107,23 +105,10 @@ class Navigation:
     deviation: HeadingDeviation | None = None
     followed: LeftOver | None = None
 
-
-def navigation_of(calibrator: Calibrator, model: str, parameters: Parameters) -> Navigation | None:
-    """Of a finished calibration that was made ``verified``; None without reference, or with hardly any motion."""
-    kept = calibrator.recording
-    if kept is None:
-        return None
-    recording, epoch_ns = kept
-    try:
-        terms = calibrator.held_out_terms(model)
-    except np.linalg.LinAlgError:
-        return None
-    stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-    # of every fold and day what corrects it
-    n_days = len(terms[0])
-    parts = folds_of(stamps_ns, parameters) * n_days + calibrator.day_of(stamps_ns)
-    corrections = [each for of_days in terms for each in of_days]
-    return dead_reckoned(recording, parts, corrections, parameters, epoch_ns, calibrator.heading_deviation)
+    @property
+    def speed(self) -> float:
+        """m/s, mean over the track."""
+        return self.distance_m / max(self.seconds, 1e-9)
 
 
 def dead_reckoned(
