@@ -299,7 +299,7 @@ class _Search:
 
     def _look_at_gravity(self, imu: Look) -> None:
         """Say where acceleration and orientation contradict what the IMU's data are taken for."""
-        gravity, taken = Gravity.of(imu), self._parameters.replace(**self._values)
+        gravity, taken = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
             found := gravity.contradiction(imu.topic, rotation_from_rpy(taken.imu_rpy), taken.imu_frame)
         ):
@@ -430,7 +430,7 @@ class _Search:
         frames = [upright, marine, ImuFrame(at, "ned", f"in NED, {says}")]
         if placed is not None and not np.allclose(at, np.eye(3)):
             frames.append(ImuFrame(np.eye(3), "enu", "as the body, whatever its transform says"))
-        gravity = Gravity.of(imu)
+        gravity = Gravity.of(imu.values[:, :4], imu.values[:, 7:])
         if gravity is None:
             return frames
         frames.append(ImuFrame(at @ FLU_FROM_FRD, "enu", f"turned over, {says}"))

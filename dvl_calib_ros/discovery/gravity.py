@@ -13,7 +13,6 @@ import numpy as np
 
 from ..calibration.frames import Array, rotation_from_quaternion
 from ..calibration.screening import unit_quaternions
-from ..recordings.look import Look
 from ..verdict.reasons import Reason, finding
 
 # Fewer samples, and an acceleration below this (m/s²), tell nothing.
@@ -38,9 +37,10 @@ class Gravity(NamedTuple):
     inverted: float
 
     @staticmethod
-    def of(imu: Look) -> Gravity | None:
-        """None where the IMU gives no acceleration, or no orientation."""
-        quaternion, acceleration = unit_quaternions(imu.values[:, :4]), imu.values[:, 7:]
+    def of(orientation: Array, acceleration: Array) -> Gravity | None:
+        """Of an IMU's quaternions (N, 4) x, y, z, w and accelerations (N, 3) m/s²; None where it gives one of them to
+        no message, or to too few."""
+        quaternion = unit_quaternions(orientation)
         use = np.isfinite(quaternion).all(axis=1) & np.isfinite(acceleration).all(axis=1)
         size = float(np.linalg.norm(acceleration[use].mean(axis=0))) if np.count_nonzero(use) >= ENOUGH else 0.0
         if size < LEAST:

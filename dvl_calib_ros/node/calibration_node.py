@@ -56,6 +56,7 @@ from ..verdict.reasons import Reason, finding
 from .answering import AnsweringNode
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
+from .gravity_seen import GravitySeen
 from .inbox import Arrived, in_order_of_arrival, take
 from .late_clocks import LateClocks
 from .message_types import velocity_class
@@ -101,7 +102,7 @@ class CalibrationNode(AnsweringNode):
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
         self._given = not_default(parameters)
         self._heading_is_open = "heading_deviation_std" not in self._given
-        self._late_clocks = LateClocks(named)
+        self._late_clocks, self._gravity = LateClocks(named), GravitySeen()
         # what every DVL message asks for; none of it changes at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._correction: Correction | None = None
@@ -270,6 +271,7 @@ class CalibrationNode(AnsweringNode):
     def _feed_imu(self, message: Any, received_ns: int) -> None:
         if self._heading_is_open:
             self._believe_heading(message)
+        self._gravity.add(message)
         self._feed.imu(message, received_ns)
 
     def _believe_heading(self, message: Any) -> None:
@@ -372,6 +374,7 @@ class CalibrationNode(AnsweringNode):
         self._publish_mounting()
         decoder = self._feed.decoder
         problems = [*decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
+        problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
         if self._save_problem:
             problems.append(self._save_problem)
@@ -399,6 +402,7 @@ class CalibrationNode(AnsweringNode):
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._calibrator.reset()
         self._feed.forget()
+        self._gravity = GravitySeen()
         self._recent = RecentCounts()
         self._pauses.forget()
         self._correction, self._mounting_published = None, ("", 0)
