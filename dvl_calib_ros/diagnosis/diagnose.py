@@ -355,11 +355,7 @@ def _reasons(
     if is_left and code != "GAP_UNKNOWN":
         reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
     if rest.found and (is_left or is_unknown):
-        about = rest.about
-        is_period = isinstance(about, float)
-        reasons.append(
-            finding("REST_FOLLOWS_PERIOD", seconds=about) if is_period else finding("REST_FOLLOWS", about=about)
-        )
+        reasons.append(rest.follows)
     elif is_unknown:
         reasons.append(finding("REST_FOLLOWS_NOTHING"))
     return tuple(reasons)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf, chi2_logsf
 from ..calibration.frames import Array
+from ..verdict.reasons import Reason, finding
 from .composed import Problem, Seen
 from .dictionary import ALTERNATIVES, dictionary
 from .fitting import Fit, Fitter
@@ -60,6 +61,13 @@ class Unexplained:
     def found(self) -> bool:
         """Whether something is left."""
         return self.log_p < np.log(LEVEL)
+
+    @property
+    def follows(self) -> Reason:
+        """What the rest follows, as it is said."""
+        if isinstance(self.about, float):
+            return finding("REST_FOLLOWS_PERIOD", seconds=self.about)
+        return finding("REST_FOLLOWS", about=self.about)
 
 
 def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:

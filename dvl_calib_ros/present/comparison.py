@@ -17,6 +17,7 @@ from .document import Answer, Document, Section, Sentence, Table, Where, figures
 
 # Of more pairs than these a terminal shows the neighbours in time.
 MOST_PAIRS = 10
+OWN_NOTE = "± is 1σ as each calibration states it; – was not shown by its data."
 _DEGREE = math.degrees(1.0)
 
 
@@ -53,6 +54,12 @@ def comparison(result: Comparison) -> Document:
     neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
     near = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
     few = len(pairs) <= MOST_PAIRS
+    columns = shown_quantities(result)
+    own = [
+        (each.name, date(each.first_ns), each.model, str(each.used), *_cells(values_of(each), each.std, columns))
+        for each in ordered
+    ]
+    head = ("", "from (UTC)", "model", "samples", *(f"{each.name}, {each.unit}" for each in columns))
     return Document(
         title="DVL calibrations compared",
         subtitle=", ".join(each.name for each in ordered),
@@ -67,7 +74,7 @@ def comparison(result: Comparison) -> Document:
                 ],
                 Where.PAGE,
             ),
-            Section("Calibrations", [_calibrations(result)]),
+            Section("Calibrations", [Table(head, own, dense=True, notes=(OWN_NOTE,), words=3)]),
             Section(
                 "Differences, the later less the earlier",
                 [_differences(pairs, by_name)],
@@ -94,20 +101,6 @@ def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
 def values_of(each: Extrinsics) -> Array:
     """(8,) in SI: roll, pitch, yaw, lever arm, scale, delay."""
     return np.array([*rpy_from_rotation(each.rotation_body_from_dvl), *each.lever_arm, each.scale, each.time_offset])
-
-
-def _calibrations(result: Comparison) -> Table:
-    columns = shown_quantities(result)
-    return Table(
-        ("", "from (UTC)", "model", "samples", *(f"{each.name}, {each.unit}" for each in columns)),
-        [
-            (each.name, date(each.first_ns), each.model, str(each.used), *_cells(values_of(each), each.std, columns))
-            for each in result.calibrations
-        ],
-        dense=True,
-        notes=("± is 1σ as each calibration states it; – was not shown by its data.",),
-        words=3,
-    )
 
 
 def _cells(values: Array, stds: Array, columns: Sequence[ComparedQuantity], signed: bool = False) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..calibration.navigation import Drift, Navigation
+from ..calibration.navigation import Navigation
 from ..evaluation.bags import CrossCheck
 from .document import Document, Item, Section, Sentence, Table, Where, figures, number, parameter_texts
 
@@ -52,11 +52,15 @@ def _errors(check: CrossCheck) -> Table:
 
 
 def _drift(check: CrossCheck) -> Table:
-    first = (next(iter(_of(check, bag).values()), None) for bag in check.bags)
-    rows = [("nothing", "as mounted", *("–" if each is None else _drifts(each.before) for each in first))]
+    first = [next(iter(_of(check, bag).values()), None) for bag in check.bags]
+    drifts = [("nothing", "as mounted", [None if each is None else each.before for each in first])]
     for calibrated, model in zip(check.bags, check.selected, strict=True):
         found = [check.navigation.get((calibrated, bag)) for bag in check.bags]
-        rows.append((_name(calibrated), model, *("–" if each is None else _drifts(each.after) for each in found)))
+        drifts.append((_name(calibrated), model, [None if each is None else each.after for each in found]))
+    rows = [
+        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in of_bags))
+        for name, model, of_bags in drifts
+    ]
     return Table(
         ("calibrated on", "model", *map(_name, check.bags)),
         rows,
@@ -66,10 +70,6 @@ def _drift(check: CrossCheck) -> Table:
         ),
         words=2,
     )
-
-
-def _drifts(drift: Drift) -> str:
-    return f"{drift.per_km:.1f} ({drift.percent:.2g} %)"
 
 
 def _of(check: CrossCheck, bag: str) -> dict[str, Navigation]:

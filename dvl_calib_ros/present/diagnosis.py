@@ -220,10 +220,10 @@ def _left(d: Diagnosis) -> str:
         return amount
     rest = series.rest
     if rest.found:
-        return f"{amount} It still follows {rest.about} (p = {p_value(math.exp(rest.log_p))})."
-    return (
-        f"{amount} Nothing in it follows motion or time more than chance would (p = {p_value(math.exp(rest.log_p))})."
-    )
+        said = rest.follows.full_sentence.removesuffix(".")
+    else:
+        said = "Nothing in it follows motion or time more than chance would"
+    return f"{amount} {said} (p = {p_value(math.exp(rest.log_p))})."
 
 
 # ------------------------------------------------------------------ tables

@@ -80,9 +80,8 @@ class Table:
         """The table as a pandas DataFrame of texts. Raises ImportError without pandas."""
         import pandas
 
-        return pandas.DataFrame(
-            [[_text(cell) for cell in row] for row in self.rows], columns=[_text(cell) for cell in self.head]
-        )
+        head, *rows = ([getattr(cell, "text", cell) for cell in row] for row in (self.head, *self.rows))
+        return pandas.DataFrame(rows, columns=head)
 
 
 T = TypeVar("T")
@@ -96,10 +95,6 @@ def table_by(columns: Columns[T], of: Iterable[T], notes: Sequence[str] = (), wo
     texts = [isinstance(cell, Cell) and cell.kind.startswith("text") for cell in rows[0]] if rows else ()
     head = [Cell(name, "text") if is_text else name for name, is_text in zip(columns, texts, strict=False)]
     return Table(head, rows, notes=notes, words=words)
-
-
-def _text(cell: str | Cell) -> str:
-    return cell if isinstance(cell, str) else cell.text
 
 
 @dataclass(frozen=True)
@@ -259,11 +254,6 @@ def number(value: float, digits: int = 2, *, signed: bool = False) -> str:
         return "–"
     rounded = round(value, digits) + 0.0  # no minus before zero
     return f"{rounded:{'+' if signed else ''}.{digits}f}".replace("-", "−")
-
-
-def signed(value: float, digits: int = 2) -> str:
-    """A number with its sign."""
-    return number(value, digits, signed=True)
 
 
 def with_std(value: float, std: float, digits: int = 2, *, signed: bool = False) -> str:

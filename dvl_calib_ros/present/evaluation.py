@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -33,7 +34,6 @@ from .document import (
     figures,
     number,
     parameter_texts,
-    signed,
 )
 
 # Deviation from a published figure up to which a cell is coloured so
@@ -47,6 +47,8 @@ BASELINES_NOTE = (
     "reference velocity, whose noise grows with time, where they had positions), and of velocities (Troni and "
     "Whitcomb, 2010). They have neither scale nor prior."
 )
+# How names of states begin, and how people read them
+SYMBOLS = {"phi_": "φ", "delta_k": "δk", "delta_k_": "δk "}
 # Shares that the intervals claim, and from where to where a share that was found is as claimed
 CLAIMED = ((0.68, (0.60, 0.76)), (0.95, (0.91, 0.98)))
 
@@ -79,7 +81,7 @@ def evaluation(e: Evaluation) -> Document:
         sections=[
             Section("", [Sentence(f"{e.source}: {len(e.trajectories)} trajectories")], Where.TERMINAL),
             Section("", list(map(Sentence, _summary(e)))),
-            Section("", [Numbers(list(_numbers(e)))]),
+            Section("", [Numbers(_numbers(e))]),
             Section("", [Facts(_facts(e))]),
             Section("", [Warned()], Where.PAGE),
             Section("Velocity error after calibration", [_score_table(e)]),
@@ -110,7 +112,15 @@ def evaluation(e: Evaluation) -> Document:
             *_pull(e.errors_in_variables),
             *(each for study, title in studies for each in _study(e, study, title)),
             *_held_out(e.held_out),
-            *map(_trace, e.traces),
+            *(
+                _pictures(
+                    f"Velocity before and after correction: {trace.trajectory}, calibrated on {trace.calibrated_on}",
+                    figures("evaluation_pictures.trace_pictures", trace),
+                    list(trace.corrected),
+                    f"Errors put in: {trace.combination}. Corrected by {best_of_trace(trace)}, the best on it.",
+                )
+                for trace in e.traces
+            ),
         ],
         parameters=parameter_texts(e.parameters),
     )
@@ -131,36 +141,32 @@ def published_of(e: Evaluation) -> Array:
 # ------------------------------------------------------------------ summary
 
 
-def _best(values: Array, columns: Sequence[str], aided: bool) -> tuple[str, float] | None:
-    """Name and value of the best model with or without GNSS among the columns."""
-    found = [
-        (name, float(value))
-        for name, value in zip(columns, values, strict=True)
-        if name in MODELS and MODELS[name].aided == aided and math.isfinite(value)
-    ]
-    return min(found, key=lambda pair: pair[1]) if found else None
-
-
-_KINDS = ((True, "with GNSS"), (False, "without GNSS"))
+def _best(values: Array, columns: Sequence[str]) -> dict[str, tuple[str, float]]:
+    """Name and value of the best model with and without GNSS among the columns, where there is one."""
+    found = {
+        words: [
+            (name, float(value))
+            for name, value in zip(columns, values, strict=True)
+            if name in MODELS and MODELS[name].aided == aided and math.isfinite(value)
+        ]
+        for words, aided in (("with GNSS", True), ("without GNSS", False))
+    }
+    return {words: min(each, key=lambda pair: pair[1]) for words, each in found.items() if each}
 
 
 def _summary(e: Evaluation) -> Iterable[str]:
     """What was found, in sentences."""
     uncalibrated = e.set_mean[e.columns.index(UNCALIBRATED)]
-    for aided, words in _KINDS:
-        best = _best(e.set_mean, e.columns, aided)
-        if best is None:
-            continue
-        name, value = best
+    published = _best(published_of(e).mean(axis=0), e.columns)
+    for words, (name, value) in _best(e.set_mean, e.columns).items():
         gain = 100.0 * (1.0 - value / uncalibrated)
         sentence = f"Best {words}: {name} with {value:.4f} m/s, {gain:.0f} % less than uncalibrated"
-        published = _best(published_of(e).mean(axis=0), e.columns, aided)
-        if published is not None:
-            sentence += f"; best published: {published[0]} with {published[1]:.4f} m/s"
+        if words in published:
+            sentence += "; best published: {} with {:.4f} m/s".format(*published[words])
         yield sentence + "."
     if e.each is not None and e.each.runs:
-        medians = ((words, _best(e.each.median(), e.columns, aided)) for aided, words in _KINDS)
-        found = ", ".join(f"{best[0]} {best[1]:.4f} m/s {words}" for words, best in medians if best is not None)
+        medians = _best(e.each.median(), e.columns).items()
+        found = ", ".join(f"{name} {value:.4f} m/s {words}" for words, (name, value) in medians)
         yield f"Calibrated on each of {len(e.each.runs)} runs with attitude, best medians: {found}."
     if e.own_generator:
         yield "The trajectories are simulated: the published figures do not apply to them."
@@ -171,14 +177,14 @@ def _summary(e: Evaluation) -> Iterable[str]:
             yield f"{near} of {len(ratio)} published cells are met within 25 %."
 
 
-def _numbers(e: Evaluation) -> Iterable[Number]:
+def _numbers(e: Evaluation) -> list[Number]:
     where = "mean over the sets" if len(e.sets) > 1 else f"set {e.sets[0].name}"
     value = e.set_mean[e.columns.index(UNCALIBRATED)]
-    yield Number("uncalibrated", f"{value:.4f} m/s", note=f"Avg.VRMSE, {where}")
-    for aided, words in _KINDS:
-        best = _best(e.set_mean, e.columns, aided)
-        if best is not None:
-            yield Number(f"best {words}", f"{best[1]:.4f} m/s", note=best[0])
+    best = _best(e.set_mean, e.columns).items()
+    return [
+        Number("uncalibrated", f"{value:.4f} m/s", note=f"Avg.VRMSE, {where}"),
+        *(Number(f"best {words}", f"{value:.4f} m/s", note=name) for words, (name, value) in best),
+    ]
 
 
 def _facts(e: Evaluation) -> list[tuple[str, str]]:
@@ -260,7 +266,7 @@ def _coverage_table(coverages: Sequence[Coverage]) -> Table:
             for share, (_, (low, high)) in zip((coverage.pooled_68, coverage.pooled_95), CLAIMED, strict=True)
         ]
         rows.append((coverage.model, *pooled, *(shares.get(name, "–") for name in states), str(coverage.n_errors)))
-    named = [_state_in_words(name) for name in states]
+    named = [re.sub("^(phi_|delta_k_?)", lambda found: SYMBOLS[found[0]], name) for name in states]
     return Table(
         ("model", "68 % interval", "95 % interval", *named, "errors each"),
         rows,
@@ -271,14 +277,6 @@ def _coverage_table(coverages: Sequence[Coverage]) -> Table:
     )
 
 
-def _state_in_words(name: str) -> str:
-    """phi_x -> φx, delta_k_x -> δk x."""
-    for prefix, symbol in (("phi_", "φ"), ("delta_k", "δk")):
-        if name.startswith(prefix):
-            return symbol + name[len(prefix) :].replace("_", " ")
-    return name
-
-
 def _pull(study: ErrorsInVariables | None) -> list[Section]:
     if study is None:
         return []
@@ -286,7 +284,7 @@ def _pull(study: ErrorsInVariables | None) -> list[Section]:
         (
             f"{std:g}",
             *(
-                f"{signed(100 * study.predicted[i, j])} / {signed(100 * study.measured[i, j])}"
+                " / ".join(number(100 * each[i, j], signed=True) for each in (study.predicted, study.measured))
                 for i in range(len(study.models))
             ),
         )
@@ -345,22 +343,20 @@ def best_of_trace(trace: Trace) -> str:
     return min(errors, key=lambda name: errors[name])
 
 
-def _trace(trace: Trace) -> Section:
-    return _pictures(
-        f"Velocity before and after correction: {trace.trajectory}, calibrated on {trace.calibrated_on}",
-        figures("evaluation_pictures.trace_pictures", trace),
-        list(trace.corrected),
-        f"Errors put in: {trace.combination}. Corrected by {best_of_trace(trace)}, the best on it.",
-    )
-
-
 def _held_out(held_out: Sequence[HeldOut]) -> list[Section]:
     if not held_out:
         return []
     sets = list(dict.fromkeys(each.set_name for each in held_out))
     models = list(dict.fromkeys(each.model for each in held_out))
-    found = {(each.model, each.set_name): each for each in held_out}
-    rows = [(model, *(_held_out_cell(found.get((model, name))) for name in sets)) for model in models]
+    cells = {
+        (each.model, each.set_name): Cell(
+            f"{each.corrected:.4f}",
+            CELL_KINDS[VERDICT_WORDS[each.verdict]],
+            f"{each.uncorrected:.4f} → {each.predicted:.4f}, {each.verdict}",
+        )
+        for each in held_out
+    }
+    rows = [(model, *(cells.get((model, name), "–") for name in sets)) for model in models]
     notes = (
         "Velocity error on held-out data, m/s rms; below: uncorrected → predicted, and the verdict. Each block of a "
         "calibration run was held back in turn and corrected with a calibration that had not seen it; the noise of the "
@@ -370,10 +366,3 @@ def _held_out(held_out: Sequence[HeldOut]) -> list[Section]:
     by_set = {name: [each for each in held_out if each.set_name == name] for name in sets}
     drawn = [_pictures("", figures("evaluation_pictures.held_out_picture", *each)) for each in by_set.items()]
     return [Section("Held-out verification", [Table(("model", *sets), rows, notes=notes)]), *drawn]
-
-
-def _held_out_cell(each: HeldOut | None) -> str | Cell:
-    if each is None:
-        return "–"
-    below = f"{each.uncorrected:.4f} → {each.predicted:.4f}, {each.verdict}"
-    return Cell(f"{each.corrected:.4f}", CELL_KINDS[VERDICT_WORDS[each.verdict]], below)

@@ -47,14 +47,11 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
     environment = _environment()
     # uPlot (MIT, uplot.LICENSE) draws, explore.js gives it the data of the figures
     scripts = [Markup(environment.get_template(name).render().strip()) for name in ("uplot.js", "explore.js")]
-    sources = Markup(" ".join(f"'sha256-{_digest(script)}'" for script in scripts))
+    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
+    sources = Markup(" ".join(f"'sha256-{digest}'" for digest in digests))
     return environment.get_template(template).render(
         version=__version__, styles=MODEL_STYLES, scripts=scripts, script_sources=sources, **context
     )
-
-
-def _digest(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def write_document(path: Path, document: Document) -> None:
@@ -64,9 +61,4 @@ def write_document(path: Path, document: Document) -> None:
         sections.insert(0, Section("", [Warned()]))
     context = {"title": document.title, "subtitle": document.subtitle, "document": document, "sections": sections}
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
-    write_page(path, "document.html", context | {"written": written})
-
-
-def write_page(path: Path, template: str, context: Mapping[str, Any]) -> None:
-    """Write a page, whole or not at all; raises InputError if it cannot be written."""
-    save_text(path, render_page(template, context))
+    save_text(path, render_page("document.html", context | {"written": written}))

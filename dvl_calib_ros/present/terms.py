@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
 from ..calibration.results import Estimate, Result
-from .document import Table, signed
+from .document import Table, with_std
 
 
 class Term(NamedTuple):
@@ -95,5 +95,5 @@ def estimate_cells(estimate: Estimate, terms: Sequence[Term] = (*ANGLES, ANY_SCA
         mark = "" if estimate.observability[state_of(model, term)].observed else " ?"
         is_one = model.scale_axes and term is ANY_SCALE and not estimated[4:].any()
         axis = " (x)" if is_one else ""
-        cells.append(f"{signed(term.factor * value[term.row])} ± {term.factor * std[term.row]:.2f}{axis}{mark}")
+        cells.append(with_std(*(term.factor * each[term.row] for each in (value, std)), signed=True) + axis + mark)
     return cells

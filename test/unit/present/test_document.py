@@ -23,7 +23,7 @@ from dvl_calib_ros.present.document import (
     table_by,
     with_std,
 )
-from dvl_calib_ros.present.page import write_document
+from dvl_calib_ros.present.page import breakable, write_document
 from dvl_calib_ros.present.terminal import shown
 from dvl_calib_ros.verdict.kinds import Severity
 
@@ -95,3 +95,8 @@ def test_a_table_is_a_row_for_each_object_by_what_its_columns_hold_of_it():
     assert made.head == ["n", Cell("square", "text")] and made.notes == (
         "note",
     )  # a text's heading is aligned as it is
+
+
+def test_a_topic_is_broken_between_its_parts_only():
+    assert breakable("/a50/dvl_data") == "/<wbr>a50/<wbr>dvl_<wbr>data"
+    assert breakable("<b> _ /") == "&lt;b&gt; _ /"
