@@ -31,9 +31,12 @@ class Aligner(OneByOne):
 
     def take(self, streams: Streams) -> None:
         """Take a stretch of all streams, as if its rows came one by one in their order of arrival."""
-        few = sum(map(len, streams)) < COLUMNS_FROM
-        if few or self._before_restart or not self._take_columns(screened(streams, self.parameters.max_speed)):
+        count = sum(map(len, streams))
+        if count < COLUMNS_FROM or self._before_restart:
             self._take_rows(streams)
+        elif not self._take_columns(screened(streams, self.parameters.max_speed)):
+            for half in streams.halves():  # the leap is in one of them
+                self.take(half)
 
     def _take_rows(self, streams: Streams) -> None:
         take = {Stream.DVL: self.take_dvl, Stream.REFERENCE: self.take_reference, Stream.IMU: self.take_imu}

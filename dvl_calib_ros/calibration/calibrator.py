@@ -101,7 +101,7 @@ class Calibrator:
     them. on_restart: called when all of them are to be forgotten. verified: keep what hold-out verification needs.
     trace: filled with the models' states over time. recordings_ns: stamps between one recording and the next, each of
     which is a day of its own. worker: does what would hold up live messages; None: all is done at once, and comes to
-    the same.
+    the same. registration: how the instruments stand, where it was asked of the data before.
     """
 
     def __init__(
@@ -119,6 +119,7 @@ class Calibrator:
         recordings_ns: Sequence[int] = (),
         worker: Worker | None = None,
         models: Collection[str] = tuple(MODELS),
+        registration: Registration | None = None,
     ) -> None:
         if BROKEN:
             raise ParameterError(BROKEN[0])
@@ -136,6 +137,7 @@ class Calibrator:
         self._verified = verified
         self._trace = trace
         self._worker = worker
+        self._registration = registration
         self._recordings_ns = recordings_ns
         self._observer = Observer(parameters)
         self._day_covariances: dict[str, Array] = {}
@@ -191,6 +193,7 @@ class Calibrator:
                 verified=self._verified,
                 worker=self._worker,
                 together=together,
+                registration=self._registration,
             )
         )
 

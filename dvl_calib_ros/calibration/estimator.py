@@ -42,7 +42,8 @@ class EstimatorSetup:
     base: the estimator of the model that this one extends; None where it extends none. initial: a state to start from,
     of the model. on_evidence: to be told, once something new takes effect, of the stamp from which on DVL samples may
     go by it. verified: keep what hold-out needs. worker: does what would hold up live messages; None: at once.
-    together: how many blocks of time may be gathered before they are looked at, unless somebody asks.
+    together: how many blocks of time may be gathered before they are looked at, unless somebody asks. registration: how
+    the instruments stand, where that is known.
     """
 
     model: Model
@@ -54,6 +55,7 @@ class EstimatorSetup:
     verified: bool
     worker: Worker | None
     together: int
+    registration: Registration | None = None
 
 
 class Estimator(ABC):

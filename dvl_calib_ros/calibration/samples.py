@@ -277,6 +277,15 @@ class Streams(NamedTuple):
     reference: SampleBlock = no_samples(Stream.REFERENCE)
     imu: SampleBlock = no_samples(Stream.IMU)
 
+    def halves(self) -> tuple[Streams, Streams]:
+        """The rows that arrived first, and the others."""
+        middle = np.sort(np.concatenate([each.arrival for each in self]))[sum(map(len, self)) // 2]
+        at = [int(np.searchsorted(each.arrival, middle)) for each in self]
+        return (
+            Streams(*(each.part(slice(end)) for each, end in zip(self, at, strict=True))),
+            Streams(*(each.part(slice(first, None)) for each, first in zip(self, at, strict=True))),
+        )
+
     def arriving_by_stamp(self) -> Streams:
         """The same as if every message arrived when it was stamped; at the same stamp IMU, reference, DVL."""
         blocks = (self.imu, self.reference, self.dvl)

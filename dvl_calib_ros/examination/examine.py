@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
-from ..calibration.observability import MEASURES_VERTICAL
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
-from ..calibration.screening import measured_axes
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.look import Look
@@ -25,6 +23,7 @@ from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from . import checks
+from .expected import Shown, expected
 
 # A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
@@ -48,21 +47,6 @@ class Content:
     rate_hz: float
     frame_id: str
     covariance: str
-
-
-@dataclass(frozen=True)
-class Shown:
-    """What the motion shows of one error.
-
-    std: standard deviation to expect, degrees or per cent. share: of the way from knowing nothing (0) to fine (1).
-    needs: the manoeuvre that shows more, '' if it is shown.
-    """
-
-    name: str
-    unit: str
-    std: float
-    share: float
-    needs: str
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,7 +116,8 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     seconds = 1e-9 * (end_ns - start_ns)
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
-    usable = not any(found.code == "DOCTOR_NO_ORIENTATION" for found in findings)
+    usable = "reference" in streams and not any(found.code == "DOCTOR_NO_ORIENTATION" for found in findings)
+    registration = None if discovery.clocks is None else discovery.clocks.registration
     return Examination(
         recording.paths,
         seconds,
@@ -143,7 +128,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         discovery,
         tuple(findings),
         float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
-        tuple(_shown(velocity, streams, discovery.parameters)) if usable else (),
+        expected(recording, topics, discovery.parameters, registration) if usable else (),
         recording.notes,
     )
 
@@ -247,51 +232,3 @@ def _disagreement(discovery: Discovery, noise: float) -> list[Reason]:
     if discovery.agreement is None or discovery.agreement.best_left**2 - 3.0 * noise**2 < FITS**2:
         return []
     return [finding("DOCTOR_DISAGREE", left=discovery.agreement.best_left)]
-
-
-_NEEDS = {
-    "roll": "motion across the bow: turns, a box or a figure eight",
-    "pitch": "longer legs, faster",
-    "yaw": "longer legs, faster",
-    "scale": "longer legs, faster",
-}
-
-
-def _shown(velocity: Array, streams: dict[str, Recorded], parameters: Parameters) -> list[Shown]:
-    """Standard deviations to expect with the reference there is, from the sums of squares of the motion."""
-    reference = streams.get("reference")
-    if reference is None or not len(reference) or not len(velocity):
-        return []
-    variance = parameters.gnss_aided_std**2
-    given = reference.variances[np.isfinite(reference.variances).all(axis=1)]
-    if parameters.use_message_covariance and len(given):
-        variance = float(np.median(given.mean(axis=1)))
-    x, y, z = (velocity**2).mean(axis=0) * min(len(velocity), len(reference)) / variance
-    prior, fine = parameters.initial_std_misalignment, parameters.fine_std_misalignment
-    needs = _NEEDS
-    about = {"roll": y + z, "pitch": x + z, "yaw": x + y}
-    if not measured_axes(reference.values, reference.unmeasured, parameters.gnss_axes)[2]:
-        # as a calibration claims nothing of them
-        about, z = about | {"roll": 0.0, "pitch": 0.0}, 0.0
-        needs = _NEEDS | dict.fromkeys(("roll", "pitch"), MEASURES_VERTICAL)
-    rows = [
-        _row(name, "°", information, (prior, fine), math.degrees(1.0), needs) for name, information in about.items()
-    ]
-    scale = parameters.initial_std_scale, parameters.fine_std_scale
-    return [*rows, _row("scale", "%", x + y + z, scale, 100.0, needs)]
-
-
-def _row(
-    name: str,
-    unit: str,
-    information: float,
-    known: tuple[float, float],
-    shown_as: float,
-    needs: Mapping[str, str],
-) -> Shown:
-    """known: σ without data, and from which on it is fine."""
-    prior, fine = known
-    std = 1.0 / math.sqrt(information + prior**-2)
-    share = min(1.0, max(0.0, math.log(prior / std) / math.log(prior / fine)))
-    # half the prior's standard deviation: the data then holds three times what was known before
-    return Shown(name, unit, std * shown_as, share, "" if std <= 0.5 * prior else needs[name])

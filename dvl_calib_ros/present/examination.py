@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ..examination.examine import NO_IMU, Content, Examination, Shown
+from ..examination.examine import NO_IMU, Content, Examination
+from ..examination.expected import Shown
 from ..files.parameter_edit import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity

@@ -105,6 +105,17 @@ class Recording:
                 spans.append((start_ns, end_ns))
         return spans
 
+    @property
+    def between_ns(self) -> list[int]:
+        """Log times between one path's recording and the next."""
+        between = []
+        until_ns: int | None = None
+        for start_ns, end_ns in sorted(span for span in self.path_spans_ns if span is not None):
+            if until_ns is not None and start_ns > until_ns:
+                between.append((until_ns + start_ns) // 2)
+            until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
+        return between
+
     @cached_property
     def survey(self) -> Survey:
         """A first look at all that may be of use."""
@@ -129,9 +140,12 @@ class Recording:
         """All messages of a topic that is kept, as they are."""
         return recorded(self.columns[topic], parameters)
 
-    def stretches(self, topics: Mapping[str, Stream], decoder: MessageDecoder) -> Iterator[Stretch]:
-        """All messages of some topics as samples, stretch by stretch, in their order of arrival."""
-        return stretches({stream: self.columns.get(name, ()) for name, stream in topics.items()}, decoder)
+    def stretches(self, topics: Mapping[str, Stream], decoder: MessageDecoder, share: float = 1.0) -> Iterator[Stretch]:
+        """All messages of some topics as samples, stretch by stretch, in their order of arrival.
+
+        share: so many of them, in a few windows.
+        """
+        return stretches({stream: self.columns.get(name, ()) for name, stream in topics.items()}, decoder, share=share)
 
     def streams(self, topics: Topics, decoder: MessageDecoder) -> Streams:
         """All messages of three topics as samples."""

@@ -29,6 +29,8 @@ from .columns import Laid, TopicColumns
 
 # Messages of a stretch: enough for columns to pay, few enough for what is made of them to stay in the caches.
 STRETCH_MESSAGES = 4096
+# A share of a recording comes from so many places of it, each in so many stretches at least.
+WINDOWS, STRETCHES_OF_A_WINDOW = 3, 10
 Decoded = DvlSample | ReferenceSample | ImuSample | Refusal
 Row = tuple[int, int, Any, str]
 """Arrival, log time (ns), message (None if it cannot be decoded) and then why."""
@@ -42,18 +44,26 @@ class Stretch(NamedTuple):
 
 
 def stretches(
-    columns: Mapping[Stream, Sequence[TopicColumns]], decoder: MessageDecoder, size: int | None = None
+    columns: Mapping[Stream, Sequence[TopicColumns]],
+    decoder: MessageDecoder,
+    size: int | None = None,
+    share: float = 1.0,
 ) -> Iterator[Stretch]:
     """All messages of streams, so many at a time; `SampleBlock.arrival` has their order of log time.
 
-    columns: of each stream's topic, a part for each recording.
+    columns: of each stream's topic, a part for each recording. share: of them, in `WINDOWS`; the last ends with the
+    recording.
     """
     at_once = STRETCH_MESSAGES if size is None else size
     all_parts = [part for parts in columns.values() for part in parts]
     arrival = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *(part.arrivals[0] for part in all_parts)]))
+    if share < 1.0:  # what follows a gap goes row by row, which is to be little of a window
+        at_once = min(at_once, 1 + int(len(arrival) * share / (WINDOWS * STRETCHES_OF_A_WINDOW)))
     ends = [*arrival[at_once::at_once].tolist(), int(arrival[-1]) + 1] if len(arrival) else []
     cut = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
     for index in range(len(ends)):
+        if (len(ends) - 1 - index) * WINDOWS % len(ends) >= share * len(ends):
+            continue
         log_ns = max(each.newest_ns(index) for cuts in cut.values() for each in cuts)
         dvl, reference, imu = (
             _block(

@@ -118,7 +118,7 @@ def replay(
         on_restart=recorder.start if recorder else on_restart,
         verified=judged,
         trace=recorder.trace if recorder else None,
-        recordings_ns=_between(recording),
+        recordings_ns=recording.between_ns,
     )
     decoder = MessageDecoder(calibrator.parameters)
     clocks = _feed_all(recording, chosen, decoder, calibrator, on_progress)
@@ -168,17 +168,6 @@ def replay(
         decoder.turns_dvl,
         navigation=navigation,
     )
-
-
-def _between(recording: Recording) -> list[int]:
-    """Log times between one recording and the next."""
-    between = []
-    until_ns: int | None = None
-    for start_ns, end_ns in sorted(span for span in recording.path_spans_ns if span is not None):
-        if until_ns is not None and start_ns > until_ns:
-            between.append((until_ns + start_ns) // 2)
-        until_ns = end_ns if until_ns is None else max(until_ns, end_ns)
-    return between
 
 
 def _named(days: Sequence[Day], recording: Recording) -> tuple[Day, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from conftest import ROOT
 from io_fixtures import TOPICS, mcap_bytes, write_bag
 
 import dvl_calib_ros as dc
@@ -18,9 +20,13 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.observability import MEASURES_VERTICAL
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
+from dvl_calib_ros.examination.expected import EXPECTED_FROM_S
+from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.verdict.doctor import DOCTOR
@@ -238,7 +244,8 @@ def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claim
 def test_nothing_is_found_wrong_with_a_sound_recording(sound, tmp_path):
     examined = examine([simulated(tmp_path / "bag", **SOUND_RUNS[sound])], Parameters())
     assert [str(found) for found in examined.findings] == []
-    assert examined.verdict == ("partly" if sound == "no reference" else "yes")
+    # at 45 degrees a roll that this motion does not show is in the URDF's pitch as well: replay claims neither
+    assert examined.verdict == ("partly" if sound in ("no reference", "a DVL at 45 degrees") else "yes")
 
 
 def test_the_page_says_whether_it_can_calibrate_and_what_to_type_next(tmp_path, capsys):
@@ -253,15 +260,29 @@ def test_the_page_says_whether_it_can_calibrate_and_what_to_type_next(tmp_path, 
     assert "█" in out
 
 
-def test_the_standard_deviations_to_expect_are_those_that_the_replay_gives(tmp_path):
-    from dvl_calib_ros.calibration.observability import body_angle_std
-    from dvl_calib_ros.replay.replay import replay
+CLAIMED_RUNS: dict[str, dict[str, Any]] = {
+    "a figure eight, arm unknown": {"trajectory": "figure8", "effects": (injection("lever_arm:x_m=-0.5"),)},
+    "a mounting at 45 degrees": {"mounting_rpy": (0.0, 0.0, math.pi / 4)},
+    "half an hour": {"seconds": 1800.0, "imu_rate": 5.0},
+}
 
-    bag = simulated(tmp_path / "bag")
-    expected = {each.name: each.std for each in examine([bag], Parameters()).shown}
-    result = replay([bag], Parameters()).result
-    given = np.degrees(body_angle_std(result.estimate.covariance, Parameters()))
-    assert [expected[name] for name in ("roll", "pitch", "yaw")] == pytest.approx(given.tolist(), rel=0.5)
+
+@pytest.mark.parametrize(
+    "name",
+    ["harbour_box", "straight_leg", "a figure eight, arm unknown",
+     *(pytest.param(name, marks=pytest.mark.slow) for name in ("a mounting at 45 degrees", "half an hour"))],
+)  # fmt: skip
+def test_the_standard_deviations_to_expect_are_those_that_the_replay_claims(name, tmp_path):
+    """It expected ±0.02° of the yaw of harbour_box where ±0.12° were claimed, and 0.32° of roll for 1.18°."""
+    run = CLAIMED_RUNS.get(name)
+    bag = ROOT / "bags" / name if run is None else simulated(tmp_path / "bag", **run)
+    examined = examine([bag], Parameters(mounting_rpy=(run or {}).get("mounting_rpy", (0.0, 0.0, 0.0))))
+    parameters = examined.discovery.parameters
+    claimed = {each.name: each for each in quantities(replay([bag], parameters).result)}
+    factor = 1.4 if examined.seconds > EXPECTED_FROM_S else 1.1  # a part of it only
+    for each in examined.shown:
+        assert 1.0 / factor < each.std / claimed[each.name].std < factor, each
+        assert claimed[each.name].shown == (each.needs == ""), each
 
 
 def test_a_bag_without_a_dvl_is_refused_in_one_line(tmp_path, capsys):

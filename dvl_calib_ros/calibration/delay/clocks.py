@@ -181,9 +181,9 @@ class Looked(NamedTuple):
 class KeptClocks:
     """What registration says of clocks and frames, of the days that are over and of this one."""
 
-    def __init__(self, parameters: Parameters, live: bool) -> None:
-        """live: they go on for hours."""
-        self._parameters, self._is_live = parameters, live
+    def __init__(self, parameters: Parameters, live: bool, known: Registration | None = None) -> None:
+        """live: they go on for hours. known: what registration says, where nobody has to ask."""
+        self._parameters, self._is_live, self._known = parameters, live, known
         self._seen = _Registered()
         if live:
             self._seen.take_room()
@@ -227,9 +227,9 @@ class KeptClocks:
         return None if looked.registration is None else looked.registration.contradiction(self._parameters)
 
     def _look(self, told: ToldSoFar | None) -> Looked:
-        motion = self._seen.motion() if len(self._seen) >= ENOUGH else None
+        motion = self._seen.motion() if self._known is None and len(self._seen) >= ENOUGH else None
         if motion is None:
-            return Looked(self._blocks)
+            return Looked(self._blocks, self._known)
         nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
         declared = FRAMES[int(self._declared.argmax())]
         try:

@@ -83,6 +83,7 @@ class DelayFilter(Estimator):
         unknown, gate = prior(model, parameters), gate_of(model.n_measurement, parameters)
         self._solver = BlockSolver(
             parameters, given.initial or unknown, unknown, gate, given.verified, live=given.worker is not None,
+            registration=given.registration,
         )  # fmt: skip
         self._worker = AtOnce() if given.worker is None else given.worker
         self._state_names = model.state_names

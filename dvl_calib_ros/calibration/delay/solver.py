@@ -90,8 +90,12 @@ class BlockSolver:
         verified: bool,
         *,
         live: bool = False,
+        registration: Registration | None = None,
     ) -> None:
-        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way."""
+        """As `DelayFilter`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way.
+
+        registration: how the instruments stand, where that is known.
+        """
         self._parameters = parameters
         rate = np.zeros(len(prior.x))
         rate[:3], rate[3:5] = parameters.process_std_misalignment**2, parameters.process_std_scale**2
@@ -101,7 +105,7 @@ class BlockSolver:
         self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
         self._dvl_stream = DvlStream()
         self._turned = False
-        self._clocks = KeptClocks(parameters, live)
+        self._clocks = KeptClocks(parameters, live, registration)
         self._is_live = live
         x, y, z = parameters.lever_arm
         self._lever_arm = (x, y, z)
