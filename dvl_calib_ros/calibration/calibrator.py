@@ -38,7 +38,7 @@ from .heading_deviation import comes_first, heading_advice
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
-from .left_over import left_over_advice
+from .left_over import left_over_advice, nil_lag
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
 from .navigation import Navigation, dead_reckoned, objections
 from .observability import MEASURES_VERTICAL, convergence, observability
@@ -732,7 +732,8 @@ class Calibrator:
             found += [each.weighed(Severity.REJECT) if is_first else each for each in advice]
         if rest.in_earth:
             found += one_heading_advice(estimate, self.parameters, navigation.speed)
-        found += left_over_advice(navigation.followed, are_positions(self.parameters))
+        lag_s = nil_lag(estimate, self.parameters)
+        found += left_over_advice(navigation.followed, are_positions(self.parameters), lag_s)
         held_out = self._verified_so_far(fresh=fresh).reasons
         return [*found, *objections(navigation), *(each for each in held_out if each.code in JUDGED_LIVE)]
 

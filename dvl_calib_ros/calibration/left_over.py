@@ -24,6 +24,9 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .attitude_rates import LEVEL_BELOW
 from .frames import Array, cross, skew
+from .models import MODELS
+from .parameters import Parameters
+from .results import Estimate
 from .robust import median, robust_std
 from .samples import Index
 
@@ -57,11 +60,17 @@ OUTLYING, ROUNDS = 4.0, 3
 # What is left is noise of so much at least, m/s.
 QUIETEST_MPS = 1e-3
 # A filter forgets the DVL over one of these, s. Of slower streams (s) what is new in a sample is the motion's.
-FORGOTTEN_S, SLOWEST_S = (0.4, 1.0, 3.0), 0.3
+FORGOTTEN_S, SLOWEST_S = (0.5, 1.0, 3.0), 0.3
 # Samples that foretell the next; more than so many σ of it is no noise but an outlier.
 FORETOLD_BY, NEW_AT_MOST = 12, 4.0
 # So many σ of the noise being followed are no chance, of three that are looked at and one sign; and a share of it.
 FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
+# ... where that the reference is a filter's shows by how it smooths, in so many σ: both are rare by chance, not one.
+FOLLOWED_BY_FILTER, FILTER_SHOWN = 2.4, 2.4
+# A filter lags by what it smooths over, within this factor; by less than this (s) so does anything.
+LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
+# A calibration with less than this to correct, rad for an angle and a share for a scale, or so many σ, finds nothing.
+NO_ANGLE, NO_SCALE, BY_CHANCE = math.radians(0.35), 0.005, 3.0
 # ... and of it where a reference is positions: their window holds the motion on both sides of its middle, which looks a
 # little like it.
 FOLLOWED_BY_POSITIONS = 0.1
@@ -166,17 +175,33 @@ def left_over(
     )  # fmt: skip
 
 
-def left_over_advice(found: LeftOver | None, of_positions: bool = False) -> list[Reason]:
+def nil_lag(estimate: Estimate, parameters: Parameters) -> float:
+    """By what (s) the reference lags behind the DVL where a calibration finds nothing else to correct; else 0."""
+    terms = MODELS[estimate.model].error_terms_from_state
+    found = np.abs(terms @ estimate.state)
+    std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
+    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, BY_CHANCE * std)).any():
+        return 0.0
+    own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True)).get("time_offset", 0.0)
+    return parameters.reference_time_offset - parameters.dvl_time_offset - own
+
+
+def left_over_advice(found: LeftOver | None, of_positions: bool = False, nil_lag_s: float = 0.0) -> list[Reason]:
     """What to say of it, as bad as it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
+    nil_lag_s: as of `nil_lag`.
     """
     if found is None:
         return []
     least = FOLLOWED_BY_POSITIONS if of_positions else FOLLOWED_FROM
-    if found.circular > max(FOLLOWED_SURELY * found.circular_std, least):
-        return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
     seconds = math.sqrt(2.0 * abs(found.smoothed))
+    is_filter = not of_positions and found.smoothed > FILTER_SHOWN * found.smoothed_std
+    surely = FOLLOWED_BY_FILTER if is_filter else FOLLOWED_SURELY
+    if found.circular > max(surely * found.circular_std, least):
+        return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
+    if is_filter and nil_lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and nil_lag_s < LAGS_WITHIN * seconds:
+        return [finding("FILTER_FINDS_NOTHING", late=nil_lag_s).weighed(Severity.REJECT)]
     is_ours = of_positions and found.smoothed > 0.0
     if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
         word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
@@ -244,33 +269,53 @@ def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float
     step = float(median(np.diff(time)))
     if step > SLOWEST_S:
         return 0.0, math.inf, 0.0
-    new = np.column_stack([_unforetold(each) for each in dvl.T])
-    new[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
-    weighted = columns * fit.weight[:, None, None]
-    found = []
+    noise = np.column_stack([_between(each) for each in dvl.T])
+    noise[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
+    weight, weighted = fit.weight, columns * fit.weight[:, None, None]
+
+    def without_columns(values: Array) -> Array:
+        return np.asarray(values - columns @ (fit.p @ np.einsum("nij,ni->j", weighted, values)))
+
+    now = without_columns(noise)
+    level = np.maximum(np.einsum("n,ni,ni->i", weight, now, now), 1e-18)
+
+    def without_now(values: Array) -> Array:
+        return np.asarray(values - now * (np.einsum("n,ni,ni->i", weight, now, values) / level))
+
+    rest, found = without_now(fit.rest), []
     for seconds in FORGOTTEN_S:
-        kernel = np.exp(-np.arange(1.0, math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
-        past = np.column_stack([np.convolve(np.append(0.0, each), kernel)[: len(time)] for each in new.T])
-        past -= columns @ (fit.p @ np.einsum("nij,ni->j", weighted, past))
-        square = float(np.einsum("n,ni,ni->", fit.weight, past, past))
-        if square <= 0.0:
-            continue
-        share = float(np.einsum("n,ni,ni->", fit.weight, past, fit.rest)) / square
-        scores = np.add.reduceat(fit.weight * (past * (fit.rest - share * past)).sum(axis=1), fit.starts)
-        found.append((share, float(_std(scores[None] / square)[0]), seconds))
+        for late in (0.0, seconds):  # that lag is taken for a late clock, and off
+            past = without_now(without_columns(_followed(noise, step, seconds, late)))
+            square = float(np.einsum("n,ni,ni->", weight, past, past))
+            if square <= 0.0:
+                continue
+            share = float(np.einsum("n,ni,ni->", weight, past, rest)) / square
+            scores = np.add.reduceat(weight * (past * (rest - share * past)).sum(axis=1), fit.starts)
+            found.append((share, float(_std(scores[None] / square)[0]), seconds))
     return max(found, key=lambda each: each[0] / max(each[1], 1e-12), default=(0.0, math.inf, 0.0))
 
 
-def _unforetold(values: Array) -> Array:
-    """What the samples before do not foretell of each (N,); without outliers."""
+def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
+    """What a filter that forgets over so many seconds makes of noise (N, 3) before, or, late, until then, but now."""
+    kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
+    ahead = int(late / step + 1e-6)
+    kernel[ahead] = 0.0
+    made = np.column_stack([np.convolve(np.append(each, np.zeros(ahead)), kernel) for each in noise.T])
+    return np.asarray(made[ahead : ahead + len(noise)])
+
+
+def _between(values: Array) -> Array:
+    """What the samples on both sides do not foretell of each (N,), which is nearly its noise; without outliers."""
     values = values - values.mean()
-    before = np.lib.stride_tricks.sliding_window_view(values, FORETOLD_BY)[:-1]
-    after = values[FORETOLD_BY:]
-    square = before.T @ before
+    if len(values) < 4 * FORETOLD_BY:
+        return np.zeros(len(values))
+    around = np.lib.stride_tricks.sliding_window_view(values, 2 * FORETOLD_BY + 1)
+    own, others = around[:, FORETOLD_BY], np.delete(around, FORETOLD_BY, axis=1)
+    square = others.T @ others
     level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # a simulator's may be foretold exactly
-    new = after - before @ np.linalg.solve(square + level * np.eye(FORETOLD_BY), before.T @ after)
+    new = own - others @ np.linalg.solve(square + level * np.eye(2 * FORETOLD_BY), others.T @ own)
     most = NEW_AT_MOST * float(robust_std(new))
-    return np.concatenate([np.zeros(FORETOLD_BY), np.clip(new, -most, most)])
+    return np.pad(np.clip(new, -most, most), FORETOLD_BY)
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:

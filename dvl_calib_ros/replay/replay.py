@@ -19,7 +19,7 @@ from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.heading_deviation import comes_first, heading_advice
 from ..calibration.kalman import GaussianState
-from ..calibration.left_over import left_over_advice
+from ..calibration.left_over import left_over_advice, nil_lag
 from ..calibration.models import MODELS
 from ..calibration.navigation import Navigation, objections
 from ..calibration.new_days import SHORTEST_PAUSE_NS
@@ -139,7 +139,10 @@ def replay(
         found += deviates
         if decoder.frame_of_reference is not VelocityFrame.BODY:
             found += one_heading_advice(result.estimate, calibrator.parameters, navigation.speed)
-    left = left_over_advice(navigation.followed, are_positions(of_types)) if navigation is not None else []
+    left = []
+    if navigation is not None:
+        lag_s = nil_lag(result.estimate, calibrator.parameters)
+        left = left_over_advice(navigation.followed, are_positions(of_types), lag_s)
     found += [each.weighed(Severity.WARNING) for each in left]
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived

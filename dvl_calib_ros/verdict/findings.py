@@ -352,6 +352,14 @@ FINDINGS = (
         "take a reference that has not seen the DVL: velocity or positions of GNSS alone",
     ),
     Kind(
+        "FILTER_FINDS_NOTHING",
+        "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
+        "have made it from this DVL",
+        "A filter that takes the DVL in shows none, whatever the mounting is; nor does a smooth instrument of its own "
+        "where the DVL is well mounted. These data do not tell them apart.",
+        "take a reference that has not seen the DVL: velocity or positions of GNSS alone",
+    ),
+    Kind(
         "LEVER_ARM_CONTRADICTED",
         "the data show another lever arm than the one that was given: {axes}",
         "The place that was given is wrong, or something else is that looks like it: heading, turn rates or clock of "

@@ -135,6 +135,33 @@ def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seco
     assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
 
 
+def made_by_a_filter(vehicle):
+    """A reference that is the DVL smoothed over 0.5 s; that it is late has been taken off."""
+    seen = vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, vehicle.noise[1])
+    kept = smoothed(seen, 0.5)
+    return vehicle.found(
+        reference=np.column_stack([np.interp(vehicle.time + 0.5, vehicle.time, each) for each in kept.T])
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_filter_of_the_dvl_is_named_where_its_lag_was_taken_for_a_late_clock(seed):
+    found = made_by_a_filter(Vehicle(np.random.default_rng(seed)))
+    (said,) = left_over_advice(found)
+    assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
+
+
+def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
+    """Beside noise of 0.06 m/s that of the DVL does not show any more; an instrument as smooth says the same."""
+    vehicle = Vehicle(rng)
+    vehicle.noise = 2.0 * vehicle.noise[0], vehicle.noise[1]
+    found = made_by_a_filter(vehicle)._replace(circular=0.05, circular_std=0.05)
+    assert [each.code for each in left_over_advice(found)] != ["FILTER_FINDS_NOTHING"]
+    assert [each.code for each in left_over_advice(found, nil_lag_s=2.5)] != ["FILTER_FINDS_NOTHING"]
+    (said,) = left_over_advice(found, nil_lag_s=0.45)
+    assert said.severity is Severity.REJECT and said.code == "FILTER_FINDS_NOTHING"
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_noise_of_their_own_is_not_followed(seed):
     rng = np.random.default_rng(seed)
