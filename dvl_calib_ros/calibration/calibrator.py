@@ -10,6 +10,7 @@ question that is asked of it is a method.)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -33,7 +34,7 @@ from .delay.workers import Worker
 from .error_model import correction_matrix
 from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
 from .folds import folds_of
-from .frames import Array, Vector
+from .frames import Array, Vector, rotation_from_quaternion
 from .heading_deviation import comes_first, heading_advice
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
@@ -48,9 +49,23 @@ from .parameters import IAC, ParameterError, Parameters
 from .positions import are_positions
 from .register.registration import Registration
 from .results import Day, Estimate, Result
-from .samples import AlignedBlock, DvlSample, ImuSample, Index, Mask, Pairing, ReferenceSample, Stamps, Stream, Streams
+from .samples import (
+    FRAME_CODES,
+    AlignedBlock,
+    DvlSample,
+    ImuSample,
+    Index,
+    Mask,
+    Pairing,
+    ReferenceSample,
+    Stamps,
+    Stream,
+    Streams,
+    VelocityFrame,
+)
 from .selection import Selection
 from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
+from .worth import RecentMotion
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
@@ -462,6 +477,21 @@ class Calibrator:
     def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:
         """Newest angular velocity (rad/s, body), if not older than imu_timeout: for output without delay."""
         return self._aligner.latest_angular_velocity(stamp_ns)
+
+    def latest_motion(self) -> RecentMotion | None:
+        """How the vehicle moves, by its newest samples; None before the first. Its noise is not known here."""
+        rows, imu, reference = self._aligner.rows, self._aligner.imu, self._aligner.reference
+        if rows.size == rows.begin:
+            return None
+        heading = None
+        if imu.newest_ns is not None and not np.isnan(quaternion := imu.values[imu.size - 1, :4]).any():
+            forward = rotation_from_quaternion(quaternion[None])[0, :, 0]
+            heading = float(np.arctan2(forward[1], forward[0]))
+        in_earth = reference.newest_ns is not None and bool(
+            reference.frames[reference.size - 1] != FRAME_CODES[VelocityFrame.BODY]
+        )
+        speed = float(np.linalg.norm(rows.velocity_dvl[rows.size - 1]))
+        return RecentMotion(speed, heading, in_earth, math.nan)
 
     @property
     def selection(self) -> Selection:

@@ -514,6 +514,15 @@ class Parameters:
         high=0.5,
         read_only=False,
     )
+    target_drift: float = _parameter(
+        2.0,
+        "Drift of dead reckoning, predicted for a straight leg, from which on the live view says that the calibration "
+        "is good enough.",
+        unit="m/km",
+        low=0.01,
+        high=1000.0,
+        read_only=False,
+    )
     verification_block: float = _parameter(
         10.0,
         "Length of the blocks that hold-out verification deals out to its folds.",

@@ -15,6 +15,7 @@ _TABLES = {
     "selections": "why a model is selected",
     "diagnoses": "everything that diagnose can conclude",
     "unpaired": "everything that diagnose --simulator can conclude",
+    "manoeuvres": "everything that the live view can say is to be driven next",
     "discoveries": "what is passed over or guessed in a recording",
 }
 

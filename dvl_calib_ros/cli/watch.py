@@ -1,6 +1,7 @@
-"""Watch a calibration node that runs somewhere on the ROS domain: estimates, progress, which manoeuvre is missing.
+"""Watch a calibration node that runs somewhere on the ROS domain: mounting, what it is worth, what to drive next.
 
-Ctrl-C ends the view, not the node. ``dvl-calib run --watch`` starts a node and watches it.
+Ctrl-C or q ends the view, not the node; s saves, r twice forgets all. ``dvl-calib run --watch`` starts a node and
+watches it; there they end both.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
     from .live_view import show
 
     with Ending() as ending, _listener(arguments.node or NODE_NAME) as listener:
-        show(common.console(), listener.latest, lambda: not ending.requested)
+        show(common.console(), listener, lambda: not ending.requested)
 
 
 def _listener(node: str) -> Listener:
@@ -67,8 +68,8 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
         try:
             assert process.stdout is not None  # a pipe
             log = _Log(process.stdout)
-            show(common.console(), listener.latest, lambda: process.poll() is None and not ending.requested, log.lines)
-            said = len(log.lines) if ending.requested else 0  # lines that are on the screen already
+            show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines)
+            said = len(log.lines) if process.poll() is None else 0  # lines that are on the screen already
         finally:
             code = _ended(process)
         for text in log.finished()[said:]:

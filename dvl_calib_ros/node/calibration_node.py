@@ -54,6 +54,7 @@ from ..streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .answering import AnsweringNode
+from .card import Card
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .graph import input_problems, output_problems, twin_problems
 from .gravity_seen import GravitySeen
@@ -137,7 +138,8 @@ class CalibrationNode(AnsweringNode):
         self._subscribe(Imu, "imu/data")
         topics = {own: subscription.topic_name for own, subscription in self._inputs.items()}
         _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
-        self._silence, self._recent = Silence(self._pauses.running_s(steady_s()), topics), RecentCounts()
+        now_s = self._pauses.running_s(steady_s())
+        self._silence, self._recent, self._card = Silence(now_s, topics), RecentCounts(), Card(now_s)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -381,7 +383,7 @@ class CalibrationNode(AnsweringNode):
         now_s = self._pauses.running_s(steady_s())
         status = diagnose(
             self._calibrator, decoder.dvl_type, problems, self._silence, self._recent, now_s,
-            self._pauses.within(RECENT_S),
+            self._pauses.within(RECENT_S), self._card,
         )  # fmt: skip
         status.name = status_name(self.get_fully_qualified_name())
         message = DiagnosticArray(status=[status])
@@ -403,8 +405,8 @@ class CalibrationNode(AnsweringNode):
         self._calibrator.reset()
         self._feed.forget()
         self._gravity = GravitySeen()
-        self._recent = RecentCounts()
         self._pauses.forget()
+        self._recent, self._card = RecentCounts(), Card(self._pauses.running_s(steady_s()))
         self._correction, self._mounting_published = None, ("", 0)
         self._publish_estimate()
         response.success, response.message = True, "all samples forgotten"

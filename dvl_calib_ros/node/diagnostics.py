@@ -27,6 +27,7 @@ from ..calibration.samples import Stream
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
+from .card import Card
 
 # A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0
@@ -129,11 +130,12 @@ def diagnose(
     recent: RecentCounts,
     now_s: float,
     pauses_s: Sequence[float] = (),
+    card: Card | None = None,
 ) -> DiagnosticStatus:
     """Status of the running calibration, still without a name.
 
     dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock. pauses_s: how long
-    this process did not run, of late.
+    this process did not run, of late. card: what an operator has to know beside.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     grown = recent.grown(counts, now_s)
@@ -146,11 +148,10 @@ def diagnose(
     found += reference_advice(estimate)
     if says := calibrator.suggestion_so_far:
         found.append(finding("CONFIGURATION_WRONG", says=says))
+    doubts = calibrator.doubts(fresh=False)
+    rejected = bool(says) or any(each.severity is Severity.REJECT for each in doubts)
     # what a replay rejects is an error here
-    found += [
-        each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING)
-        for each in calibrator.doubts(fresh=False)
-    ]
+    found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
     status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"
@@ -160,10 +161,12 @@ def diagnose(
         "gnss": selection.gnss.reason.sentence,
         "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
+        "usable": "no" if rejected else "yes",
         **_estimate_values(estimate),
         **_beside_the_pose(estimate, calibrator.parameters),
         **_count_values(estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
+        **({} if card is None else card.values(calibrator, estimate, counts, now_s)),
     }
     for number, each in enumerate(found, start=1):
         values[f"finding {number}"] = str(each)

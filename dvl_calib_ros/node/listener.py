@@ -1,17 +1,22 @@
-"""Hears what a calibration node says of itself in /diagnostics, wherever on the ROS domain it runs."""
+"""Hears what a calibration node says of itself in /diagnostics, wherever on the domain it runs; calls its services."""
 
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import Trigger
 
-from ..errors import InputError
+from ..errors import InputError, printable
 from .answering import AnsweringNode
 from .status import Status, status_name
+
+# What a node can be asked for.
+SERVICES = ("save", "reset")
 
 
 class Listener:
@@ -22,6 +27,9 @@ class Listener:
 
     def __init__(self, node: str) -> None:
         self._status_name = status_name(node)
+        self._full_name = f"/{node.strip('/')}"
+        self.answer = ""
+        """What the last call came to."""
 
     def __enter__(self) -> Listener:
         self._context = rclpy.Context()
@@ -33,6 +41,7 @@ class Listener:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._latest: Status | None = None
+        self._clients = {name: self._node.create_client(Trigger, f"{self._full_name}/{name}") for name in SERVICES}
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         return self
 
@@ -47,6 +56,19 @@ class Listener:
         while (left := deadline - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left)
         return self._latest
+
+    def call(self, service: str) -> None:
+        """Ask the node for one of `SERVICES`; what comes of it is in `answer`, once `latest` has heard it."""
+        client = self._clients[service]
+        if not client.service_is_ready():
+            self.answer = f"{service}: the node does not answer"
+            return
+        self.answer = f"{service} ..."
+        client.call_async(Trigger.Request()).add_done_callback(self._on_answer)
+
+    def _on_answer(self, future: Any) -> None:
+        error = future.exception()
+        self.answer = future.result().message if error is None else printable(str(error))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -20,12 +20,6 @@ class Status:
     values: Mapping[str, str]
     received_s: float
 
-    @property
-    def parameters(self) -> list[tuple[str, str]]:
-        """(name, unit) of what the running model estimates, in the order of its state."""
-        keys = [key.removeprefix("std ") for key in self.values if key.startswith("std ")]
-        return [(name, unit.rstrip("]")) for name, _, unit in (key.partition(" [") for key in keys)]
-
     def get(self, key: str) -> str:
         """A value, '-' if there is none."""
         return self.values.get(key, "-")

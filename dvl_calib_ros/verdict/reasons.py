@@ -18,6 +18,7 @@ from .discoveries import DISCOVERIES
 from .doctor import DOCTOR
 from .findings import FINDINGS
 from .kinds import Kind, Severity
+from .manoeuvres import MANOEUVRES
 from .selections import SELECTIONS
 from .unpaired import UNPAIRED
 from .verdicts import VERDICTS
@@ -34,6 +35,7 @@ TABLES: Mapping[str, Sequence[Kind]] = {
     "diagnoses": DIAGNOSES,
     "unpaired": UNPAIRED,
     "discoveries": DISCOVERIES,
+    "manoeuvres": MANOEUVRES,
 }
 KINDS: Mapping[str, Kind] = {kind.code: kind for kinds in TABLES.values() for kind in kinds}
 # The worst first.

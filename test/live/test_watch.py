@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
@@ -22,18 +23,22 @@ from runs import MatchedRun, calibrate, make_samples
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.observability import observability
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.cli.live_view import LINE_S, SILENCE_S, line, rendered, show
+from dvl_calib_ros.cli.live_view import LINE_S, SILENCE_S, SURE_S, Keys, line, rendered, show
 from dvl_calib_ros.node.status import Status
 
 PATIENCE_S = 30.0
 VALUES = {
-    "model": "G1", "why": "auto: GNSS is available", "gnss": "GNSS is available", "convergence": "coarse",
-    "phi_x [deg]": "0.8834", "std phi_x [deg]": "1.4004", "progress phi_x [%]": "25.0",
-    "observed phi_x": "no (roll); needs turns or a figure eight",
-    "phi_z [deg]": "-3.0797", "std phi_z [deg]": "0.0487", "progress phi_z [%]": "100.0", "observed phi_z": "yes",
-    "heave [m/s]": "0.0000", "std heave [m/s]": "0.0200",
-    "mean NIS": "2.104 of 3 (99 %: 2.829 .. 3.140)", "samples used": "1583", "samples gated": "2", "dvl invalid": "0",
+    "model": "G1", "convergence": "coarse", "elapsed [s]": "754",
+    "dvl rate [Hz]": "5.0", "dvl age [s]": "0", "gnss rate [Hz]": "1.0", "gnss age [s]": "3", "imu age [s]": "-",
+    "mounting roll [deg]": "0.108", "sigma mounting roll [deg]": "1.177",
+    "mounting yaw [deg]": "3.036", "sigma mounting yaw [deg]": "0.116",
+    "mounting arm x [m]": "0.300", "sigma mounting arm x [m]": "not estimated",
+    "worth": "3.45", "worth to the side": "2.83", "worth ahead": "1.96", "target": "2",
+    "goal worth [%]": "75", "goal side [%]": "60", "goal ahead [%]": "100",
+    "next": "drive straight, west (270°)", "next code": "NEXT_LEG", "seconds": "75",
+    "driven N [s]": "120", "driven E [s]": "60",
 }  # fmt: skip
+GOOD = {"next": "good enough: save", "next code": "NEXT_IS_GOOD", "seconds": "-"}
 
 
 def status(level=0, message="", received_s=100.0, **changes) -> Status:
@@ -49,35 +54,53 @@ def drawn(*arguments, width=110) -> str:
 # ---------------------------------------------------------------- drawing
 
 
-def test_the_view_shows_estimates_convergence_and_what_to_fly():
+def test_the_view_shows_the_mounting_what_it_is_worth_and_what_to_drive():
     text = drawn(status(), 100.5)
-    rows = {words[0]: row for row in text.splitlines() if len(words := row.split()) > 2}
-    assert "0.8834" in rows["phi_x"] and "1.4004" in rows["phi_x"] and "turns or a figure eight" in rows["phi_x"]
-    assert "-3.0797" in rows["phi_z"] and "needs" not in rows["phi_z"]
-    assert "0.0200" in rows["heave"]
-    assert text.startswith("G1: auto: GNSS is available\ncoarse   1583 used, 2 gated, NIS 2.104")
+    assert text.startswith("G1 coarse   12 min 34 s\nDVL 5.0 Hz, 0 s ago   reference 1.0 Hz, 3 s ago   IMU none yet\n")
+    assert "yaw     3.036 ±0.116°" in text and "arm x   0.300 m, as set" in text
+    assert re.search(r"dead reckoning  █{18}░{6}  75 %  3.45 m per km, goal 2\n", text)
+    assert re.search(r"by scale      █{24} 100 %  1.96 m per km\n", text)
+    assert "N█  NE   E▄  SE   S   SW   W   NW " in text
+    assert "next: drive straight, west (270°), about 75 s until good enough" in text
+    assert "phi" not in text and "skid" not in text
 
 
-@pytest.mark.parametrize(("percent", "full"), [(0.0, 0), (25.0, 5), (99.0, 19), (100.0, 20)])
-def test_the_bar_is_as_long_as_the_convergence(percent, full):
-    console = Console(file=io.StringIO(), width=110, force_terminal=True, color_system="standard", legacy_windows=False)
-    console.print(rendered(status(**{"progress phi_x [%]": str(percent)}), 100.0))
-    row = next(row for row in console.file.getvalue().splitlines() if "phi_x" in row)
-    bars = re.findall(r"\x1b\[(33|32)m(━+)", row)
-    assert sum(len(bar) for _, bar in bars) == full
-    assert all(colour == ("32" if percent == 100.0 else "33") for colour, _ in bars)
+def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_used():
+    assert "next: good enough: save\n" in drawn(status(**GOOD), 100.0)
+    assert "not to be used" not in drawn(status(2, "no DVL message for 7 s"), 100.0)
+    wrong = drawn(status(2, "the data contradict the configuration", usable="no", **GOOD), 100.0)
+    assert "not to be used" in wrong and "good enough: save" not in wrong
 
 
 def test_what_another_process_says_can_neither_style_the_view_nor_move_the_cursor():
     evil = "[bold]\x1b[2J[/] \x07"
-    changes = {"why": evil, "phi_x [deg]": evil, "observed phi_x": f"no (roll); needs {evil}", "convergence": evil}
-    text = drawn(status(1, evil, **changes), 100.0, [evil])
+    text = drawn(status(1, evil, **dict.fromkeys(VALUES, evil)), 100.0, [evil], evil)
     assert text.count("[bold]") >= 4 and not {"\x1b", "\x07"} & set(text)
+    assert drawn(status(**dict.fromkeys(VALUES, "nan")), 100.0) and drawn(status(**dict.fromkeys(VALUES, "inf")), 100.0)
 
 
-def test_before_the_first_sample_there_is_no_nis():
-    text = drawn(status(**{"samples used": "0", "mean NIS": "nan of 3 (99 %: -3.041 .. 7.013)"}), 100.0)
-    assert "0 used, 2 gated" in text and "nan" not in text
+class Asked:
+    """A listener that remembers what was asked for."""
+
+    answer = "saved to x.yaml"
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def call(self, service: str) -> None:
+        self.calls.append(service)
+
+
+def test_keys_save_and_leave_and_forget_only_when_pressed_twice():
+    listener = Asked()
+    keys = Keys(listener)
+    assert keys.press("s", 0.0) and listener.calls == ["save"] and keys.said == "saved to x.yaml"
+    assert keys.press("r", 1.0) and listener.calls == ["save"] and "again" in keys.said
+    assert keys.press("r", 1.0 + SURE_S) and listener.calls == ["save"]
+    assert keys.press("r", 2.0 + SURE_S) and listener.calls == ["save", "reset"]
+    keys.press("r", 9.0), keys.press("s", 9.1), keys.press("r", 9.2)
+    assert listener.calls == ["save", "reset", "save"]
+    assert not keys.press("q", 10.0)
 
 
 def test_faults_silence_and_waiting_are_said():
@@ -95,7 +118,7 @@ def test_only_the_last_lines_of_the_log_are_shown_whatever_is_in_them():
 
 @pytest.mark.parametrize("width", [20, 60, 80, 300])
 def test_the_view_fits_any_terminal(width):
-    text = drawn(status(1, "[red]" * 50, why="[/]"), 100.0, width=width)
+    text = drawn(status(1, "[red]" * 50, model="[/]"), 100.0, width=width)
     assert max(map(len, text.splitlines())) <= width
 
 
@@ -106,10 +129,10 @@ def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and
     monkeypatch.setattr("dvl_calib_ros.cli.live_view.time.monotonic", lambda: next(clock))
     running = iter([True] * 7 + [False])
     out = io.StringIO()
-    show(Console(file=out, width=40), lambda _: next(statuses), lambda: next(running))
+    show(Console(file=out, width=40), SimpleNamespace(latest=lambda _: next(statuses)), lambda: next(running))
     lines = out.getvalue().splitlines()
     assert len(lines) == 4
-    assert lines[0] == line(status()) and lines[0].startswith("G1 coarse: phi_x 0.8834 ± 1.4004 deg, ")
+    assert lines[0] == line(status()) and lines[0].startswith("G1 coarse: roll 0.108 ±1.177°, ")
     assert lines[1].startswith("G1 fine:") and lines[2].endswith("; check") and lines[3] == lines[2]
 
 
@@ -212,9 +235,12 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
             message.header.stamp.sec, message.header.frame_id = 1000 + i, "dvl_link"
             message.twist.twist.linear.x = 1.5
             publisher.publish(message)
-        for text in ("20 used", "still to drive", "phi_x deg", ": model auto"):
+        for text in ("mounting now", "dead reckoning", "next: ", ": model auto", "s save"):
             screen.until(text)
         assert not saved.exists()
+        screen.key(b"s")
+        screen.until(f"saved to {saved}"[:40])
+        saved.unlink()
         screen.key(b"\x03")
         text = screen.rest()
         assert screen.process.wait(30) == 0
@@ -236,7 +262,7 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
         first = watching.stdout.readline()
         watching.send_signal(signal.SIGINT)
         _, errors = watching.communicate(timeout=30)
-        assert first.startswith("F1 collecting: phi_x 0.0000 ± ")
+        assert first.startswith("F1 collecting: roll 0.000 ±")
         assert (watching.returncode, errors) == (0, "")
         assert node.poll() is None
 

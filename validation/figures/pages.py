@@ -43,6 +43,7 @@ PRINTED: dict[str, tuple[str, ...]] = {
             "selections",
             "unpaired",
             "discoveries",
+            "manoeuvres",
             "diagnoses",
             "commands",
         )

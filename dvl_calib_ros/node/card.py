@@ -1,0 +1,128 @@
+"""What an operator has to know of a running calibration: the mounting, what it is worth, what to drive next.
+
+Looked at once for each status of /diagnostics, so that it costs nothing per message.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..calibration.calibrator import Calibrator
+from ..calibration.frames import rpy_from_rotation
+from ..calibration.kalman import GaussianState
+from ..calibration.models import MODELS
+from ..calibration.mounting_pose import rpy_std, scale_and_delay
+from ..calibration.results import Estimate
+from ..calibration.worth import KM, Outlook, RecentMotion, noise_of_a_second, outlook, predicted_drift
+
+# What to drive next is thought of anew so often, s: it takes a few milliseconds.
+THOUGHT_OF_EVERY_S = 5.0
+# Rates are means over so many statuses.
+RATED_OVER = 10
+SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+_STREAMS = {"dvl": "dvl", "reference": "gnss", "imu": "imu"}
+
+
+class Card:
+    """The values of one status after the other. now_s: a clock that does not go back."""
+
+    def __init__(self, now_s: float) -> None:
+        self._began_s = now_s
+        self._received: deque[tuple[float, Mapping[str, int]]] = deque(maxlen=RATED_OVER)
+        self._came_s: dict[str, float] = {}
+        self._driven_s = dict.fromkeys(SECTORS, 0.0)
+        self._squares, self._looks = 0.0, 0
+        self._outlook: Outlook | None = None
+        self._thought_s = -math.inf
+
+    def values(
+        self, calibrator: Calibrator, estimate: Estimate, counts: Mapping[str, Mapping[str, int]], now_s: float
+    ) -> dict[str, str]:
+        """By key of /diagnostics."""
+        return {
+            "elapsed [s]": f"{now_s - self._began_s:.0f}",
+            **self._streams({name: counts[name]["received"] for name in _STREAMS}, now_s),
+            **_mounting(calibrator, estimate),
+            **self._next(calibrator, estimate, now_s),
+            **{f"driven {name} [s]": f"{seconds:.0f}" for name, seconds in self._driven_s.items()},
+        }
+
+    def _streams(self, received: Mapping[str, int], now_s: float) -> dict[str, str]:
+        """Rates and ages."""
+        before_s, before = self._received[0] if self._received else (now_s, received)
+        last = self._received[-1][1] if self._received else dict.fromkeys(received, 0)
+        values = {}
+        for stream, count in received.items():
+            if count != last[stream]:
+                self._came_s[stream] = now_s
+            name, elapsed = _STREAMS[stream], now_s - before_s
+            values[f"{name} rate [Hz]"] = f"{max(count - before[stream], 0) / elapsed:.1f}" if elapsed > 0.0 else "-"
+            values[f"{name} age [s]"] = f"{now_s - self._came_s[stream]:.0f}" if stream in self._came_s else "-"
+        self._received.append((now_s, received))
+        return values
+
+    def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float) -> dict[str, str]:
+        parameters, model = calibrator.parameters, MODELS[estimate.model]
+        motion = calibrator.latest_motion()
+        if motion is not None and motion.speed > 0.0:
+            self._squares, self._looks = self._squares + motion.speed**2, self._looks + 1
+            if motion.heading is not None and self._received[-1][0] == self._came_s.get("dvl"):
+                sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
+                self._driven_s[SECTORS[sector]] += now_s - (self._received[-2][0] if len(self._received) > 1 else now_s)
+        if now_s - self._thought_s >= THOUGHT_OF_EVERY_S or self._outlook is None:
+            self._thought_s = now_s
+            first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
+            seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
+            noise = noise_of_a_second(estimate, parameters, seconds, self._squares / max(self._looks, 1))
+            still = RecentMotion(0.0, None, False, noise)
+            moving = still if motion is None else motion._replace(noise=noise)
+            self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
+        drift = predicted_drift(model, estimate.recording_covariance, parameters)
+        unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
+        goals = {
+            "side": _done(drift.side, unknown[0], parameters.target_drift / math.sqrt(2.0)),
+            "ahead": _done(drift.ahead, unknown[1], parameters.target_drift / math.sqrt(2.0)),
+            "worth": _done(drift.both, math.hypot(*unknown), parameters.target_drift),
+        }
+        return {
+            "worth": f"{drift.both:.2f}",
+            "worth to the side": f"{drift.side:.2f}",
+            "worth ahead": "-" if math.isnan(drift.ahead) else f"{drift.ahead:.2f}",
+            "target": f"{parameters.target_drift:g}",
+            **{f"goal {name} [%]": f"{share:.0f}" for name, share in goals.items() if not math.isnan(share)},
+            "next": self._outlook.next.sentence,
+            "next code": self._outlook.next.code,
+            "seconds": "-" if self._outlook.seconds is None else f"{self._outlook.seconds:.0f}",
+        }
+
+
+def _done(drift: float, unknown: float, target: float) -> float:
+    """Per cent of the way from what is not known at all to the target, by the logarithm."""
+    if drift <= target:
+        return 100.0
+    return max(0.0, min(99.0, 100.0 * math.log(unknown / drift) / max(math.log(unknown / target), 1e-9)))
+
+
+def _mounting(calibrator: Calibrator, estimate: Estimate) -> dict[str, str]:
+    """The DVL's mounting as a URDF has it, and what a pose does not hold; of what the model does not know, no σ."""
+    parameters, model = calibrator.parameters, MODELS[estimate.model]
+    rotation = estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
+    angles = np.degrees(rpy_from_rotation(rotation))
+    stds = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
+    found = {name: (a, s, "deg") for name, a, s in zip(("roll", "pitch", "yaw"), angles, stds, strict=True)}
+    arm = estimate.lever_arm(parameters.lever_arm)
+    arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
+    for index, axis in enumerate("xyz"):
+        found[f"arm {axis}"] = (arm[index], math.nan if arm_std is None else arm_std[index], "m")
+    beside = scale_and_delay(model, GaussianState(estimate.state, estimate.covariance), parameters)
+    found["scale"] = (100.0 * beside.scale, 100.0 * (beside.scale_std or math.nan), "%")
+    found["delay"] = (beside.time_offset, beside.time_offset_std or math.nan, "s")
+    values = {}
+    for name, (value, std, unit) in found.items():
+        values[f"mounting {name} [{unit}]"] = f"{value:.3f}"
+        values[f"sigma mounting {name} [{unit}]"] = "not estimated" if math.isnan(std) else f"{std:.3f}"
+    return values
