@@ -43,7 +43,7 @@ class RecentMotion(NamedTuple):
     noise: float
 
 
-class Drift(NamedTuple):
+class PredictedDrift(NamedTuple):
     """Predicted drift of dead reckoning on a straight leg, m per km, 1σ: to the side, ahead (nan where the model does
     not know the scale), and both together."""
 
@@ -59,11 +59,11 @@ class Outlook(NamedTuple):
     seconds: float | None
 
 
-def predicted_drift(model: Model, covariance: Array, parameters: Parameters) -> Drift:
+def predicted_drift(model: Model, covariance: Array, parameters: Parameters) -> PredictedDrift:
     """Drift by what a model's state may be off, by its covariance (n, n)."""
     rows = _rows(model, parameters)
     side, ahead = (KM * math.sqrt(max(float(row @ covariance @ row), 0.0)) for row in rows)
-    return Drift(side, ahead if model.scale_axes else math.nan, math.hypot(side, ahead))
+    return PredictedDrift(side, ahead if model.scale_axes else math.nan, math.hypot(side, ahead))
 
 
 def _rows(model: Model, parameters: Parameters) -> Array:
