@@ -54,6 +54,22 @@ def few(cases: Iterable[Any], waited_for: Container[Any]) -> list[Any]:
     return [case if case in waited_for else pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of a test that is marked `spread(n)`, n of its cases are waited for, evenly spread; the others are slow."""
+    cases: dict[tuple[Path, str], list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("spread") and not item.get_closest_marker("slow"):
+            cases.setdefault((item.path, item.name.partition("[")[0]), []).append(item)
+    for each in cases.values():
+        mark = each[0].get_closest_marker("spread")
+        assert mark is not None  # by what they were chosen
+        waited_for = mark.args[0]
+        for number, item in enumerate(each):
+            if number and number * waited_for // len(each) == (number - 1) * waited_for // len(each):
+                item.add_marker(pytest.mark.slow)
+
+
 def made_once(path: Path, make: Callable[[Path], Any]) -> Path:
     """A file or folder that several processes of one run of the suite share, made by the first that asks."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -151,6 +151,7 @@ def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.slow
 def test_a_vehicle_is_diagnosed_against_a_simulator(tmp_path):
     real = dc.simulate(tmp_path / "real", seconds=200.0, seed=1, effects={"lever_arm": {"x_m": 1.0}})
     made = dc.simulate(tmp_path / "made", seconds=200.0, seed=2, trajectory="figure8")
@@ -202,6 +203,7 @@ def test_what_was_found_is_exported_as_by_the_command(calibration, tmp_path, cap
         dc.export("matlab", saved, tmp_path / "none")
 
 
+@pytest.mark.slow
 def test_results_become_pages_and_json(calibration, bag, tmp_path, capsys):
     assert dc.report(calibration, tmp_path / "r.html").read_text().startswith("<!DOCTYPE html>")
     both = ["--json", tmp_path / "command.json", "--report", tmp_path / "command.html"]  # which keeps the history, too

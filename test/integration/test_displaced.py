@@ -65,6 +65,7 @@ def recorded(
     return write_bag(path, tuple(heapq.merge(samples, key=lambda sample: sample.stamp_ns)))
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("lever_arm", "late_s", "waves_mps"),
     [((1.3, 0.0, 0.0), 0.0, 0.02), ((1.3, -0.3, 0.0), -2.2, 0.02), ((1.0, 0.2, 0.0), 2.5, 0.15)],
@@ -79,6 +80,7 @@ def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp
     np.testing.assert_allclose(mounting.rpy_deg[1:], 0.0, atol=0.5)
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("ahead_m", [-1.9, -0.3, 0.3, 1.9])
 def test_on_a_circle_a_displaced_dvl_is_not_taken_for_a_turned_one_and_its_yaw_is_not_claimed(tmp_path, ahead_m):
     calibration = dc.replay(recorded(tmp_path / "bag", (ahead_m, 0.0, 0.0), 0.0, motion=circle), history=False)

@@ -220,6 +220,7 @@ def codes(examined: Examination) -> set[str]:
     return {found.code for found in examined.findings}
 
 
+@pytest.mark.spread(5)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
     code, change = FAULTS[fault]
@@ -240,6 +241,7 @@ def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claim
     assert {each.axis for each in claimed if each.missing == MEASURES_VERTICAL} == {"roll", "pitch"}
 
 
+@pytest.mark.spread(3)
 @pytest.mark.parametrize("sound", SOUND_RUNS)
 def test_nothing_is_found_wrong_with_a_sound_recording(sound, tmp_path):
     examined = examine([simulated(tmp_path / "bag", **SOUND_RUNS[sound])], Parameters())

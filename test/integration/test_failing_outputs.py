@@ -42,6 +42,7 @@ def shell(redirected: str, *arguments, before: str = "", module: str = "cli.main
 CLOSED = ["<&- ", ">&- ", "2>&- ", ">&- 2>&- ", "<&- >&- 2>&- "]
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("closed", CLOSED)
 def test_closed_streams_are_as_good_as_nowhere(bag, tmp_path, closed):
     done = shell(closed, "replay", bag, "--json", tmp_path / "out.json", "--verbose")
@@ -60,6 +61,7 @@ def warned_of(tmp_path_factory) -> Path:
     return bag
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full", "2</dev/null", "2> >(true)"])
 def test_warnings_that_nobody_can_read_cost_no_result(warned_of, tmp_path, stream):
     done = shell(stream, "replay", warned_of, "--json", tmp_path / "o.json")
@@ -67,6 +69,7 @@ def test_warnings_that_nobody_can_read_cost_no_result(warned_of, tmp_path, strea
     assert "models" in json.loads((tmp_path / "o.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_comparison_of_which_only_the_first_line_is_read_still_says_by_its_code_that_the_mounting_moved(
     tmp_path, capsys
 ):
@@ -122,6 +125,7 @@ def test_a_link_that_leads_nowhere_is_refused_before_any_work(bag, tmp_path, mon
     assert sorted(os.listdir(tmp_path)) == before
 
 
+@pytest.mark.spread(6)
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("compression", ["none", "message", "file"])
 @pytest.mark.parametrize("command", ["salvage", "simulate", "import"])
@@ -175,6 +179,7 @@ def test_that_the_folder_it_was_started_in_is_gone_is_said(bag, tmp_path, monkey
     assert error.endswith("the folder that this was started in is gone, change to another\n")
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("what", "storage"), [("grows", "mcap"), ("grows", "sqlite3"), ("replaced", "mcap"), ("journal", "sqlite3")]
 )
@@ -222,6 +227,7 @@ def test_a_folder_that_cannot_be_made_is_said_before_any_work_with_a_remedy_that
     assert os.listdir(tmp_path) == ["T.csv"]
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_command_that_is_ended_half_way_leaves_no_half_of_a_bag(tmp_path, number):
     command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "simulate", str(tmp_path / "new"), "--duration", "200"]

@@ -46,6 +46,7 @@ def passes(monkeypatch) -> Counter[str]:
     return counted
 
 
+@pytest.mark.spread(5)
 @pytest.mark.parametrize(
     "words",
     [
@@ -79,6 +80,7 @@ def test_what_is_wrong_with_the_last_is_said_before_the_first_is_read(bags, pass
     assert not any(what.startswith("read") for what in passes)
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("words", "expected", "calibrated"),
     [

@@ -201,6 +201,7 @@ def refused(capsys, words: list[str]) -> str:
     return error
 
 
+@pytest.mark.spread(6)
 @pytest.mark.parametrize("name", COMMAND)
 def test_no_output_of_a_command_can_be_one_of_its_inputs_by_any_name(scratch, capsys, name):
     command = COMMAND[name]
@@ -340,6 +341,7 @@ PATHS = st.sampled_from(
 HARMLESS = {"out", "bag.mcap", "loose/x"}
 
 
+@pytest.mark.slow
 @example(outputs=["out", "up/out"], target="out")  # one file by two names
 @example(outputs=["out.bak", "out"], target="out")
 @example(outputs=["link"], target="bag/bag.mcap")

@@ -32,6 +32,7 @@ def odometry_down(told: Told, frame: str, child: str, rates: bool) -> None:
         told.say(stamp, "/ins/odometry", ODOMETRY, message)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("frame", "child", "rates"),
     [
@@ -165,6 +166,7 @@ def test_two_dvls_are_two_and_each_is_calibrated_by_itself(tmp_path):
 ANTENNA = (-0.3, 0.0, 0.4)
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("frame", "position"), [("gps_link", LEVER_ARM), ("map", LEVER_ARM), ("base_link", LEVER_ARM), ("", None)]
 )
@@ -229,6 +231,7 @@ def pulls(told: Told) -> None:
             row[3].linear_acceleration.z *= -1.0
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("tell", "code"),
     [

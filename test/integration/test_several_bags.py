@@ -67,6 +67,7 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     assert "the mounting differs" in fail(capsys, "apply", tmp_path / "r.yaml", "--launch", tmp_path / "x.xml")
 
 
+@pytest.mark.slow
 def test_who_asks_to_merge_gets_it_with_a_note(place):
     run = dc.replay([place / "monday", place / "wednesday"], merge=True)
     assert run.verdict != "reject"
@@ -97,6 +98,7 @@ def test_a_recording_too_short_to_be_calibrated_alone_is_said_to_be_unchecked(pl
     assert any(note.startswith("short: too little to be calibrated alone") for note in replayed.notes)
 
 
+@pytest.mark.slow
 def test_an_initial_calibration_that_the_data_contradict_is_said_and_left_out(place, tmp_path, capsys):
     for name in ("monday", "wednesday"):
         succeed(capsys, "replay", place / name, "--save", tmp_path / f"{name}.yaml")

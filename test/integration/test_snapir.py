@@ -41,6 +41,7 @@ def calibrate_on(folder: Path, time, velocity, errors, rng):
     return replay([folder / "bag"], Parameters()).result, counts
 
 
+@pytest.mark.spread(4)
 @pytest.mark.parametrize("name", TRAJECTORIES)
 def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, tmp_path, rng):
     result, written = calibrate_on(tmp_path, *trajectories[name], COMBINATIONS[5], rng)

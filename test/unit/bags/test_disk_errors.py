@@ -107,6 +107,7 @@ KINDS = {
 }
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("options", KINDS.values(), ids=KINDS)
 def test_behind_an_unreadable_sector_anywhere_in_a_file_reading_goes_on(tmp_path, messages, options):
     content = mcap_bytes(messages, **options)

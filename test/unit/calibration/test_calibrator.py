@@ -655,6 +655,7 @@ def test_no_variance_makes_a_state_that_is_not_finite(variances, stream):
         check_finite(calibrate(claimed, block_size=block_size, verified=True))
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     "options",
     [

@@ -59,6 +59,7 @@ def causes(found):
     return [*held, *(cause for each in held for cause in each.causes)]
 
 
+@pytest.mark.spread(3)
 @pytest.mark.parametrize(
     ("wrong", "code", "numbers"),
     [
@@ -151,6 +152,7 @@ def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
     assert found.mounting.numbers["degrees"] == pytest.approx(2.9, abs=0.05)
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_axes_that_hardly_show_are_not_said_to_be_turned_round(seed):
     """A DVL that is turned by little, in a vehicle that keeps level: either reading of its axes fits as well."""

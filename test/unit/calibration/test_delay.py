@@ -439,6 +439,7 @@ def slow(samples, off_every=0):
     return left
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("seconds", [0.0, -1.4, 2.5])
 def test_a_slow_dvl_that_is_off_now_and_then_costs_no_calibration(seconds):
     samples = slow(late(seconds), off_every=24)

@@ -45,6 +45,7 @@ def deviation(*args, **more):
     return heading_deviation(time, yaw, calibrator.heading_deviation)
 
 
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, -0.009)])
 def test_a_constant_error_of_the_heading_or_of_the_reference_is_no_deviation(seed, offset):

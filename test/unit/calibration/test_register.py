@@ -58,6 +58,7 @@ def registered(*args, **late) -> Registration:
     return found
 
 
+@pytest.mark.spread(8)
 @pytest.mark.parametrize("trajectory", ["box", "figure8", "free"])
 @pytest.mark.parametrize(
     "rate", [pytest.param(1.0, marks=pytest.mark.slow), 5.0, pytest.param(10.0, marks=pytest.mark.slow)]
@@ -145,6 +146,7 @@ def leg_in_moving_water(share: float, seed: int) -> MotionStreams:
     return made
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_stretch_of_bad_velocities_is_no_clock_that_pushes_it_out_of_the_overlap(seed):
     """Less was left of the rest there, and 42 s were taken off clocks that were in time."""

@@ -58,6 +58,7 @@ def test_noise_that_lasts_as_long_as_blocks_of_a_stretch_is_no_drift():
     assert found(3.5) is None
 
 
+@pytest.mark.spread(3)
 @pytest.mark.parametrize("seconds", [0.3, 1.0, -3.0, 5.0])
 @pytest.mark.parametrize("whose", ["dvl", "reference"])
 def test_one_leap_is_found_with_its_size_and_time(whose, seconds):
@@ -69,6 +70,7 @@ def test_one_leap_is_found_with_its_size_and_time(whose, seconds):
     assert found.lever_arm[0] == pytest.approx(ARM, abs=0.05)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("whose", ["dvl", "reference", "imu"])
 def test_a_drift_is_found_with_its_size(whose):
     found = registered("figure8", whose, drift=1e-3)  # 0.6 s in all, as 170 ppm make of an hour

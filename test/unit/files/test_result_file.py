@@ -254,6 +254,7 @@ def test_a_damaged_or_foreign_file_is_refused_with_its_name_and_the_reason(saved
     assert str(caught.value).startswith(f"{saved}: ") and expected in str(caught.value)
 
 
+@pytest.mark.spread(15)
 @pytest.mark.parametrize("line", range(60))
 def test_a_file_of_which_the_end_was_cut_off_anywhere_is_refused(saved, line):
     """Also in its parameters, of which those that are missing would be taken for not changed."""

@@ -76,6 +76,7 @@ def assert_same(paths, parameters):
     return found
 
 
+@pytest.mark.spread(18)
 @pytest.mark.parametrize("version", ["first", "covariance", "fixed sizes"])
 @pytest.mark.parametrize("kind", TYPES)
 @pytest.mark.parametrize("reference", [TWIST, TWIST_STAMPED, ODOMETRY])

@@ -82,6 +82,7 @@ def assert_same(live, whole, atol=1e-12) -> None:
                     np.testing.assert_allclose(getattr(got[sample.stamp_ns], name), getattr(sample, name), 0, atol)
 
 
+@pytest.mark.spread(8)
 @pytest.mark.parametrize("name", [*EFFECTS, "stale_samples", "noise_inflation", "coloured_reference_noise"])
 def test_following_a_motion_gives_what_simulating_all_of_it_gives(name):
     scenario = replace(SCENARIO, effects=(typical(name),))

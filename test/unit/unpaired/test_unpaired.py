@@ -78,6 +78,7 @@ def test_the_effect_that_the_simulator_lacks_is_named_with_its_size_on_both_side
     assert [each.code for each in compared.reasons][:2] == ["SIMULATOR_LACKS", "SIMULATOR_PUT_RIGHT"]
 
 
+@pytest.mark.slow
 def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_in(compared):
     assert [each.name for each in compared.effects if each.status.is_claim] == ["lever_arm"]
 
