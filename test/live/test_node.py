@@ -89,6 +89,7 @@ def diagnosed(messages, key):
 # ---------------------------------------------------------------- a process of its own
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_the_node_and_the_replay_of_one_bag_agree_in_every_model(scenario, world, tmp_path):
     bag, saved = tmp_path / "bag", tmp_path / "live.yaml"
@@ -110,6 +111,7 @@ def test_the_node_and_the_replay_of_one_bag_agree_in_every_model(scenario, world
         assert len(offline.segments) == 4
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_path):
     saved = tmp_path / "live.yaml"

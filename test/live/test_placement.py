@@ -40,6 +40,7 @@ def world():
     world.close()
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("given", [(), ("use_transforms:=false",), ("mounting_rpy:=[0.0, 0.0, 0.7]",)])
 def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, tmp_path, given):
     bag, saved = tmp_path / "bag", tmp_path / "live.yaml"
@@ -73,6 +74,7 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
         assert result["counts"]["dvl"]["accepted"] > 250
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("given", [(), ("heading_deviation_std:=0.01",)])
 def test_what_the_imu_claims_of_its_heading_is_taken_unless_given(world, tmp_path, given):
     sound, bag, saved = tmp_path / "sound", tmp_path / "bag", tmp_path / "live.yaml"

@@ -236,6 +236,7 @@ def test_another_type_of_the_dvls_messages_can_be_had(world):
     assert heard[3].twist.linear.x == pytest.approx(1.0, abs=0.6)
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("mode", "stop"),
     [
