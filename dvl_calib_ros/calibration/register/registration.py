@@ -71,7 +71,7 @@ IN_TIME_STD_S = 0.5
 # Farther off than so many times that no place of the data says what one in time leaves open.
 FAR_OPEN = 2.0
 # What it leaves open of a lever arm is none to speak of below this, m (σ).
-OPEN_FROM_M = 0.08
+OPEN_FROM_M = 0.03
 # ... and of the DVL's yaw, rad (σ).
 OPEN_FROM_RAD = math.radians(0.1)
 

@@ -253,8 +253,17 @@ def test_by_how_much_an_arm_is_another_for_each_second_is_no_matter_of_what_the_
     np.testing.assert_allclose(more.by(LATE), white[:, LATE] / white[LATE, LATE], rtol=1e-9)
 
 
-def test_where_speeds_differ_nothing_of_the_arm_is_open():
-    assert not registered("free", 5.0).left_open.any()
+@pytest.mark.parametrize("late", [0.0, 0.06, 0.1])
+def test_an_imu_too_little_late_to_be_shown_is_in_the_arm(late):
+    """An arm of 0.26 m ± 0.01 for 0.40 was accepted of one that is 0.1 s late."""
+    found = registered("free", 5.0, imu=late)
+    assert found.offsets == {}
+    std = np.hypot(found.lever_arm_std, np.sqrt(np.diag(found.left_open))[3:6])
+    assert (np.abs(found.lever_arm - [ARM, 0.0, 0.0]) < 2.5 * std).all() and std[0] < 0.06
+
+
+def test_where_the_clock_shows_nothing_of_the_arm_is_open():
+    assert not registered("figure8", 5.0).left_open.any()
     assert not registered("free", 5.0, in_earth=False).left_open.any()
 
 
