@@ -37,7 +37,7 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "present": (
         *_READ, "disk", "files", "effects", "discovery", "examination", "replay", "diagnosis", "unpaired", "evaluation",
     ),
-    "node": (*_CORE, "streams", "disk", "messages", "files", "discovery", "simulation"),
+    "node": (*_READ, "streams", "disk", "files", "discovery", "simulation"),
     "demo": (*_READ, "files", "node"),
     "api": (
         *_READ, "parallel", "disk", "files", "discovery", "examination", "replay", "diagnosis", "unpaired",

@@ -514,6 +514,11 @@ class Parameters:
         high=0.5,
         read_only=False,
     )
+    discover: bool = _parameter(
+        True,
+        "Look for DVL, reference and IMU among all topics, as replay does, while nobody publishes the DVL's topic and "
+        "that was not remapped.",
+    )
     target_drift: float = _parameter(
         2.0,
         "Drift of dead reckoning, predicted for a straight leg, from which on the live view says that the calibration "

@@ -33,15 +33,22 @@ Difference = Callable[[Look, Look], float | None]
 """DVL and reference -> what no rotation can explain of their difference, as a share of the speed; None: unknown."""
 
 
-def _words(look: Look) -> set[str]:
-    """Parts of a topic's name and frame."""
-    return set(re.split(r"[^a-z0-9]+", f"{look.topic} {look.frame_id}".lower()))
-
-
 def _has(look: Look, words: Iterable[str]) -> bool:
     """Whether its name or frame holds one of these words; short ones only as a part of their own."""
-    text, parts = f"{look.topic} {look.frame_id}".lower(), _words(look)
+    return _names(f"{look.topic} {look.frame_id}", words)
+
+
+def _names(text: str, words: Iterable[str]) -> bool:
+    text = text.lower()
+    parts = set(re.split(r"[^a-z0-9]+", text))
     return any(word in parts or (len(word) > 3 and word in text) for word in words)
+
+
+def may_be_dvl(topic: str, msgtype: str) -> bool:
+    """Whether a topic is of a type that only DVLs send, or named as a DVL's that nobody has computed."""
+    if _names(topic, (*DERIVED_WORDS, *COMMAND_WORDS)):
+        return False
+    return msgtype in DVL_TYPES and (msgtype not in REFERENCE_TYPES or _names(topic, DVL_WORDS))
 
 
 def is_derived(look: Look) -> bool:

@@ -56,6 +56,7 @@ from ..verdict.reasons import Reason, finding
 from .answering import AnsweringNode
 from .card import Card
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
+from .discovering import Discovering
 from .graph import input_problems, output_problems, twin_problems
 from .gravity_seen import GravitySeen
 from .inbox import Arrived, in_order_of_arrival, take
@@ -133,6 +134,9 @@ class CalibrationNode(AnsweringNode):
             "gnss/twist": lambda message, received_ns: self._feed.reference(message, received_ns),
             "imu/data": self._feed_imu,
         }
+        # by the node's own name of an input, that of the topic where it was found
+        self._found_names: dict[str, str] = {}
+        self._found: list[Reason] = []
         self._subscribe(dvl_class, "dvl/twist")
         self._subscribe(gnss_class, "gnss/twist")
         self._subscribe(Imu, "imu/data")
@@ -140,6 +144,7 @@ class CalibrationNode(AnsweringNode):
         _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
         now_s = self._pauses.running_s(steady_s())
         self._silence, self._recent, self._card = Silence(now_s, topics), RecentCounts(), Card(now_s)
+        self._discovering = self._to_discover(parameters, topics)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -147,6 +152,56 @@ class CalibrationNode(AnsweringNode):
         # steady: diagnostics go on while simulated time stands still or jumps
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._log_configuration()
+
+    def _to_discover(self, parameters: Parameters, topics: Mapping[str, str]) -> Discovering | None:
+        """What looks for topics that were not remapped; None where the DVL's was, or nothing is to be looked for."""
+        roles = {"dvl": "dvl/twist", "gnss": "gnss/twist", "imu": "imu/data"}
+        space = self.get_namespace().rstrip("/")
+        named = {role: None if topics[own] == f"{space}/{own}" else topics[own] for role, own in roles.items()}
+        if not parameters.discover or named["dvl"] is not None:
+            return None
+        given = self._given if self._initial is None else {*self._given, "mounting_rpy"}
+        return Discovering(self, named, parameters, given, self._worker)
+
+    def _discover(self) -> None:
+        """Look for topics while nobody publishes the DVL's, and keep to what is found."""
+        searching = self._discovering
+        if searching is None:
+            return
+        if self.count_publishers(self._inputs["dvl/twist"].topic_name) or self._calibrator.counts["dvl"]["received"]:
+            searching.close()
+            return
+        found = searching.step()
+        if found is None:
+            return
+        self._discovering = None
+        discovery, parameters = found
+        self._found = [finding("TOPICS_FOUND", own=self._inputs["dvl/twist"].topic_name, found=discovery.found[0])]
+        for sentence in discovery.found[1:]:
+            self.get_logger().info(sentence)
+        self._warn(str(self._found[0]))
+        for doubt in discovery.doubts:
+            self._warn(doubt)
+        topics = discovery.topics
+        names = {"dvl/twist": topics.dvl, "gnss/twist": topics.gnss, "imu/data": topics.imu}
+        there = {name for name, _ in self.get_topic_names_and_types()}
+        self._found_names = {own: name for own, name in names.items() if name in there}
+        classes = {
+            "dvl/twist": velocity_class("dvl_type", parameters.dvl_type),
+            "gnss/twist": velocity_class("gnss_type", parameters.gnss_type),
+            "imu/data": Imu,
+        }
+        for own in self._found_names:
+            old = self._inputs[own]
+            self._subscribe(classes[own], own)
+            self.destroy_subscription(old)
+        self._begin(parameters, self._initial)
+        self._adapted = self._feed.decoder.reference_type.adapted
+        self._heading_is_open = self._heading_is_open and "heading_deviation_std" not in discovery.values
+        now_s = self._pauses.running_s(steady_s())
+        heard = {own: subscription.topic_name for own, subscription in self._inputs.items()}
+        self._silence, self._recent, self._card = Silence(now_s, heard), RecentCounts(), Card(now_s)
+        self._correction, self._mounting_published = None, ("", 0)
 
     def _begin(
         self, parameters: Parameters, initial: Mapping[str, GaussianState] | None, feed: MessageFeed | None = None
@@ -232,7 +287,7 @@ class CalibrationNode(AnsweringNode):
         profile = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=reliability)
         self._inputs[topic] = self.create_subscription(
             message_type,
-            topic,
+            self._found_names.get(topic, topic),
             partial(self._on_message, topic),
             profile,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible, use_default_callbacks=False),
@@ -373,9 +428,10 @@ class CalibrationNode(AnsweringNode):
             self._feed.kept.forget()
 
     def _publish_diagnostics(self) -> None:
+        self._discover()
         self._publish_mounting()
         decoder = self._feed.decoder
-        problems = [*decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
+        problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
         if self._save_problem:
@@ -488,6 +544,8 @@ class CalibrationNode(AnsweringNode):
 
     def destroy_node(self) -> None:
         """Leave ROS, and end what solves G2's blocks."""
+        if self._discovering is not None:
+            self._discovering.close()
         self._worker.shutdown(cancel_futures=True)
         super().destroy_node()
 

@@ -18,6 +18,13 @@ FINDINGS = (
         Severity.ERROR,
     ),
     Kind(
+        "TOPICS_FOUND",
+        "nobody published {own}; found and used instead: {found}",
+        "Topics were chosen by type and content, as a replay chooses them (parameter discover). With several vehicles "
+        "on one ROS domain they may be another's.",
+        "remap the topics to these names if they are right, else to the right ones, or set discover to false",
+    ),
+    Kind(
         "DVL_SILENT",
         "no usable DVL message for {seconds:.0f} s",
         "Messages came and have stopped, or every one of them is refused (the other findings say why).",

@@ -143,3 +143,9 @@ def test_a_package_or_class_that_is_not_there_is_named_with_the_remedy():
         message_class("dvl_type", A50)
     with pytest.raises(InputError, match=r"dvl_type nav_msgs/msg/Dvl: .* install nav_msgs, and source"):
         message_class("dvl_type", "nav_msgs/msg/Dvl")
+
+
+def test_topics_are_looked_for_unless_the_dvls_was_named_or_nobody_wants_it(world):
+    for options in ({}, {"discover": False}, {"cli_args": ["--ros-args", "-r", "dvl/twist:=/a50/velocity"]}):
+        with node_here(world, **options) as node:
+            assert (node._discovering is not None) == (not options)

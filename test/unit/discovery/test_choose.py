@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.discovery.choose import choose_dvl, choose_imu, choose_reference
+from dvl_calib_ros.discovery.choose import choose_dvl, choose_imu, choose_reference, may_be_dvl
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.recordings.look import Look, Survey
 
@@ -34,3 +34,17 @@ def test_of_references_that_are_alike_the_first_by_name_is_taken_and_the_others_
 @pytest.mark.parametrize("order", [*permutations(["/b/imu", "/a/imu", "/c/imu"])], ids=" ".join)
 def test_of_imus_that_are_alike_the_first_by_name_is_taken(order):
     assert choose_imu(survey(*order, msgtype=IMU_TYPE), "imu/data") == "/a/imu"
+
+
+@pytest.mark.parametrize(
+    ("topic", "msgtype", "may_be"),
+    [
+        ("/a50/velocity", TWIST_TYPE, True),
+        ("/nav/velocity", TWIST_TYPE, False),
+        ("/dvl/filtered", TWIST_TYPE, False),
+        ("/anything", "dvl_msgs/msg/DVL", True),
+        ("/dvl/imu", IMU_TYPE, False),
+    ],
+)
+def test_a_topic_may_be_a_dvls_by_its_type_or_its_name(topic, msgtype, may_be):
+    assert may_be_dvl(topic, msgtype) == may_be

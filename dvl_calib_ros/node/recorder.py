@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -14,9 +16,9 @@ from ..bags.channels import Channel
 from ..bags.definitions import Definition
 from ..bags.writer import BagWriter
 from ..errors import InputError
-from ..node.message_types import message_class
 from ..recordings.columns import is_kept
 from ..recordings.recording import is_static
+from .message_types import message_class
 
 DEPTH = 1000
 
@@ -27,22 +29,35 @@ class TopicRecorder:
     def __init__(self, node: Node, writer: BagWriter) -> None:
         self._node, self._writer = node, writer
         self._seen: set[tuple[str, str]] = set()
+        self._subscriptions: list[Any] = []
+        self._static: set[str] = set()
         self.counts: Counter[str] = Counter()
         self.left_out: dict[str, str] = {}
 
-    def look(self) -> None:
-        """Subscribe to topics that have turned up."""
+    @property
+    def topics(self) -> list[str]:
+        """What is heard that moves."""
+        return [each.topic_name for each in self._subscriptions if each.topic_name not in self._static]
+
+    def look(self) -> bool:
+        """Subscribe to topics that have turned up; whether there are any."""
+        before = len(self._subscriptions)
+        own = f"{self._node.get_fully_qualified_name()}/"
         for topic, kinds in self._node.get_topic_names_and_types():
             for kind in kinds:
-                if (topic, kind) not in self._seen and (is_kept(kind) or is_static(topic, kind)):
+                is_new = (topic, kind) not in self._seen and not topic.startswith(own)
+                if is_new and (is_kept(kind) or is_static(topic, kind)):
                     self._seen.add((topic, kind))
                     try:
                         self._subscribe(topic, kind)
                     except InputError as error:
                         self.left_out[topic] = str(error)
+        return len(self._subscriptions) > before
 
     def _subscribe(self, topic: str, kind: str) -> None:
         publishers = self._node.get_publishers_info_by_topic(topic)
+        if is_static(topic, kind) or not publishers:
+            self._static.add(topic)
         is_reliable = all(each.qos_profile.reliability is ReliabilityPolicy.RELIABLE for each in publishers)
         is_latched = bool(publishers) and all(
             each.qos_profile.durability is DurabilityPolicy.TRANSIENT_LOCAL for each in publishers
@@ -59,8 +74,16 @@ class TopicRecorder:
             definition = Definition(MessageDefinitionFormat.MSG, text)
         channel = Channel(topic, kind, definition)
         taken = partial(self._take, channel)
-        self._node.create_subscription(message_class(topic, kind), topic, taken, profile, raw=True)
+        self._subscriptions.append(
+            self._node.create_subscription(message_class(topic, kind), topic, taken, profile, raw=True)
+        )
+
+    def close(self) -> None:
+        """Hear no more."""
+        for each in self._subscriptions:
+            self._node.destroy_subscription(each)
+        self._subscriptions = []
 
     def _take(self, channel: Channel, data: bytes) -> None:
-        self._writer.raw(channel, self._node.get_clock().now().nanoseconds, data)
+        self._writer.raw(channel, time.time_ns(), data)
         self.counts[channel.topic] += 1

@@ -1,0 +1,142 @@
+"""Topics that nobody named are found while the node runs, by the rules that recordings are looked through with.
+
+Where the DVL's topic has no publisher and another topic may be a DVL's, all that may be of use is recorded for a while,
+and looked through as a recording.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from rclpy.node import Node
+
+from ..bags.writer import BagWriter
+from ..calibration.parameters import Parameters
+from ..discovery.choose import may_be_dvl
+from ..discovery.discover import Discovery, Given, discover
+from ..errors import InputError
+from ..recordings.recording import open_recording
+from .recorder import TopicRecorder
+
+# So long is recorded, s; longer, where a topic that has a publisher brings nothing yet.
+LISTEN_S, MOST_S = 20.0, 60.0
+
+
+class _Running(NamedTuple):
+    """What records. ends: closes it. began: monotonic time, s."""
+
+    folder: TemporaryDirectory[str]
+    recorder: TopicRecorder
+    ends: ExitStack
+    began: float
+
+
+class FoundTopics(NamedTuple):
+    """What was found. parameters: as given, with the types of the messages and what the recording says."""
+
+    discovery: Discovery
+    parameters: Parameters
+
+
+class Discovering:
+    """One search after the other, a step at each call, until something is found.
+
+    named: by role (dvl, gnss, imu) the topic that the user named, None where it is the node's own. given: names of
+    parameters that the user gave. worker: looks through what was recorded.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        named: dict[str, str | None],
+        parameters: Parameters,
+        given: Collection[str],
+        worker: ThreadPoolExecutor,
+    ) -> None:
+        self._node, self._parameters, self._worker = node, parameters, worker
+        self._given = Given(named["dvl"], named["gnss"], named["imu"], frozenset(given))
+        self._recording: _Running | None = None
+        self._looked_through: Future[FoundTopics] | None = None
+        self._said = ""
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether something is recorded, or looked through."""
+        return self._recording is not None or self._looked_through is not None
+
+    def step(self) -> FoundTopics | None:
+        """Begin to record, look for new topics, or look through what came; what was found, once."""
+        if self._looked_through is not None:
+            return self._outcome(self._looked_through)
+        if self._recording is None:
+            if any(self._may_be_dvl()):
+                self._begin()
+            return None
+        folder, recorder, ends, began = self._recording
+        if recorder.look() and time.monotonic() < began + LISTEN_S:
+            began = time.monotonic()  # what has turned up late is listened to for as long
+            self._recording = self._recording._replace(began=began)
+        waits_for = LISTEN_S if all(recorder.counts[topic] for topic in recorder.topics) else MOST_S
+        if time.monotonic() < began + waits_for:
+            return None
+        self._recording = None
+        ends.close()
+        path = Path(folder.name) / "live"
+        self._looked_through = self._worker.submit(_look_through, folder, path, self._parameters, self._given)
+        return None
+
+    def _may_be_dvl(self) -> list[str]:
+        own = f"{self._node.get_fully_qualified_name()}/"
+        return [
+            topic
+            for topic, kinds in self._node.get_topic_names_and_types()
+            if not topic.startswith(own) and any(may_be_dvl(topic, kind) for kind in kinds)
+            and self._node.count_publishers(topic)
+        ]  # fmt: skip
+
+    def _begin(self) -> None:
+        topics = ", ".join(self._may_be_dvl())
+        self._node.get_logger().info(f"nobody publishes the DVL's topic; looking through the others ({topics}) ...")
+        folder = TemporaryDirectory(prefix="dvl_calib_")
+        ends = ExitStack()
+        recorder = TopicRecorder(self._node, ends.enter_context(BagWriter(Path(folder.name) / "live")))
+        ends.callback(recorder.close)
+        recorder.look()
+        self._recording = _Running(folder, recorder, ends, time.monotonic())
+
+    def _outcome(self, looked_through: Future[FoundTopics]) -> FoundTopics | None:
+        if not looked_through.done():
+            return None
+        self._looked_through = None
+        try:
+            return looked_through.result()
+        except InputError as error:
+            if str(error) != self._said:  # it is looked for again
+                self._said = str(error)
+                self._node.get_logger().warning(self._said)
+            return None
+
+    def close(self) -> None:
+        """Record no more."""
+        if self._recording is not None:
+            folder, _, ends, _ = self._recording
+            self._recording = None
+            ends.close()
+            folder.cleanup()
+
+
+def _look_through(folder: TemporaryDirectory[str], path: Path, parameters: Parameters, given: Given) -> FoundTopics:
+    with folder:
+        try:
+            recording = open_recording([path], parameters=parameters)
+            found = discover(recording, parameters, given)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), "the topics there are")) from error
+        # clocks are taken off by the node itself, once two looks agree
+        return FoundTopics(found, recording.of_types(found.topics, parameters.replace(**found.values)))
