@@ -5,11 +5,9 @@ from __future__ import annotations
 import io
 
 from ..present.document import Document
-from ..present.terminal import shown
 
 # Columns of what is printed, as of the commands into a pipe
 WIDTH = 160
-_PRE = '<pre style="font-family: monospace; line-height: 1.3; overflow-x: auto; white-space: pre">{code}</pre>'
 
 
 def printed(result: object, as_html: bool) -> str:
@@ -21,12 +19,16 @@ def printed(result: object, as_html: bool) -> str:
 
 def text_of(document: Document, as_html: bool) -> str:
     """A document as it would be on a terminal, as text or as HTML."""
+    if as_html:
+        from ..present.page import fragment
+
+        return fragment(document)
     from rich.console import Console
+
+    from ..present.terminal import shown
 
     # in a notebook rich would show it by itself, beside what is returned
     console = Console(file=io.StringIO(), record=True, width=WIDTH, force_jupyter=False, highlight=False, emoji=False)
     for each in shown(document):
         console.print(each)
-    if as_html:
-        return console.export_html(inline_styles=True, code_format=_PRE)
     return "\n".join(line.rstrip() for line in console.export_text().splitlines())

@@ -172,6 +172,15 @@ class Numbers:
     numbers: Sequence[Number]
     is_valid: bool = True
 
+    @property
+    def table(self) -> Table:
+        """They as rows."""
+        if any(each.std for each in self.numbers):
+            stds = (each.std if each.is_shown else f"{each.std} ?" for each in self.numbers)
+            rows = [(each.name, each.nominal, each.value, std) for each, std in zip(self.numbers, stds, strict=True)]
+            return Table(("", "nominal", "corrected", "±1σ"), rows)
+        return Table(("", "", ""), [(each.name, each.value, each.note) for each in self.numbers])
+
 
 @dataclass(frozen=True)
 class Worth:

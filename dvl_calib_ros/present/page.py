@@ -62,3 +62,10 @@ def write_document(path: Path, document: Document) -> None:
     context = {"title": document.title, "subtitle": document.subtitle, "document": document, "sections": sections}
     written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
     save_text(path, render_page("document.html", context | {"written": written}))
+
+
+def fragment(document: Document) -> str:
+    """HTML of the answer, its sentences and tables, for a notebook: what a terminal shows of a document."""
+    sections = [each for each in document.sections if each.where is not Where.PAGE and each.items]
+    context = {"document": document, "sections": sections}
+    return _environment().get_template("fragment.html").render(context).strip()

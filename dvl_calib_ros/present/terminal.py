@@ -64,7 +64,9 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
             elif isinstance(item, Facts):
                 yield from (Text(printable(f"{name}: {value}")) for name, value in item.facts)
             elif isinstance(item, Numbers):
-                yield _numbers(item)
+                made = _table(item.table)
+                made.style = "none" if item.is_valid else "dim"
+                yield made
             elif isinstance(item, Map) and width is not None:
                 yield terminal_map(item.navigation, width)
 
@@ -75,19 +77,6 @@ def _found(reason: Reason) -> Iterator[Padding]:
 
     yield Padding(Text(printable(reason.says), COLOURS[reason.severity]), (0, 0, 0, 2))
     yield Padding(Text.assemble(printable(reason.remedy), " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
-
-
-def _numbers(item: Numbers) -> RichTable:
-    if any(each.std for each in item.numbers):
-        rows = [
-            (each.name, each.nominal, each.value, each.std if each.is_shown else f"{each.std} ?")
-            for each in item.numbers
-        ]
-        made = _table(Table(("", "nominal", "corrected", "±1σ"), rows))
-    else:
-        made = _table(Table(("", "", ""), [(each.name, each.value, each.note) for each in item.numbers]))
-    made.style = "none" if item.is_valid else "dim"
-    return made
 
 
 def _table(table: Table) -> RichTable:

@@ -68,7 +68,7 @@ _KINDS = (
     ),
     Kind(
         "DOCTOR_GAPS",
-        "{topic}: silent for {seconds:.1f} s in all, {count} times, for longest at {at_s:.0f} s",
+        "{topic}: silent for {seconds:.1f} s in all (gaps: {count}), the longest at {at_s:.0f} s",
         "The sensor, its cable, its fix or its driver dropped out.",
         "check power, cable, bottom lock and fix at that time",
     ),

@@ -133,7 +133,8 @@ def test_results_print_as_their_answer_and_in_a_notebook_with_tables(bag, calibr
     compared = dc.compare(bag, later)
     assert str(compared).startswith(f"{compared.word}: ") and len(str(compared)) < 5000
     for each in (examined, compared, calibration):
-        assert each._repr_html_().startswith("<pre") and "yaw" in each._repr_html_()
+        html = each._repr_html_()
+        assert html.startswith("<div") and "<table" in html and "yaw" in html and "<script" not in html
 
 
 def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
