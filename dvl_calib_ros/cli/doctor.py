@@ -98,6 +98,8 @@ def _record(path: Path, seconds: float) -> None:
                     looked = now
                     on_progress((now - began) / seconds)
                 executor.spin_once(timeout_sec=LOOK_S)
+        if recorder.failed is not None:
+            raise recorder.failed
         for why in recorder.left_out.values():
             say(f"warning: {why}")
         if not recorder.counts:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
-from ..recordings.look import Look, Survey
 from ..recordings.topics import spelled
 from ..verdict.reasons import Reason, finding
+
+if TYPE_CHECKING:
+    from ..recordings.look import Look, Survey
 
 NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
@@ -29,7 +32,7 @@ MOVES_FROM = 0.02
 # Two velocities that differ by less than this share of the speed were made from each other.
 SAME_SHARE = 1e-4
 
-Difference = Callable[[Look, Look], float | None]
+Difference = Callable[["Look", "Look"], "float | None"]
 """DVL and reference -> what no rotation can explain of their difference, as a share of the speed; None: unknown."""
 
 

@@ -171,7 +171,13 @@ class CalibrationNode(AnsweringNode):
         if self.count_publishers(self._inputs["dvl/twist"].topic_name) or self._calibrator.counts["dvl"]["received"]:
             searching.close()
             return
-        found = searching.step()
+        try:
+            found = searching.step()
+        except InputError as error:
+            self._warn(f"{error}; topics are not looked for")
+            searching.close()
+            self._discovering = None
+            return
         if found is None:
             return
         self._discovering = None

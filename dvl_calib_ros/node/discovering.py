@@ -1,7 +1,7 @@
 """Topics that nobody named are found while the node runs, by the rules that recordings are looked through with.
 
 Where the DVL's topic has no publisher and another topic may be a DVL's, all that may be of use is recorded for a while,
-and looked through as a recording.
+and looked through as a recording. What reads recordings is imported then: a ROS machine need not have it.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rclpy.node import Node
 
-from ..bags.writer import BagWriter
 from ..calibration.parameters import Parameters
 from ..discovery.choose import may_be_dvl
-from ..discovery.discover import Discovery, Given, discover
 from ..errors import InputError
-from ..recordings.recording import open_recording
-from .recorder import TopicRecorder
+
+if TYPE_CHECKING:
+    from ..discovery.discover import Discovery
+    from .recorder import TopicRecorder
 
 # So long is recorded, s; longer, where a topic that has a publisher brings nothing yet.
 LISTEN_S, MOST_S = 20.0, 60.0
@@ -60,18 +60,16 @@ class Discovering:
         worker: ThreadPoolExecutor,
     ) -> None:
         self._node, self._parameters, self._worker = node, parameters, worker
-        self._given = Given(named["dvl"], named["gnss"], named["imu"], frozenset(given))
+        self._named, self._given = named, frozenset(given)
         self._recording: _Running | None = None
         self._looked_through: Future[FoundTopics] | None = None
         self._said = ""
 
-    @property
-    def is_searching(self) -> bool:
-        """Whether something is recorded, or looked through."""
-        return self._recording is not None or self._looked_through is not None
-
     def step(self) -> FoundTopics | None:
-        """Begin to record, look for new topics, or look through what came; what was found, once."""
+        """Begin to record, look for new topics, or look through what came; what was found, once.
+
+        Raises InputError where nothing can be recorded, or read.
+        """
         if self._looked_through is not None:
             return self._outcome(self._looked_through)
         if self._recording is None:
@@ -79,6 +77,8 @@ class Discovering:
                 self._begin()
             return None
         folder, recorder, ends, began = self._recording
+        if recorder.failed is not None:
+            raise recorder.failed
         if recorder.look() and time.monotonic() < began + LISTEN_S:
             began = time.monotonic()  # what has turned up late is listened to for as long
             self._recording = self._recording._replace(began=began)
@@ -88,7 +88,7 @@ class Discovering:
         self._recording = None
         ends.close()
         path = Path(folder.name) / "live"
-        self._looked_through = self._worker.submit(_look_through, folder, path, self._parameters, self._given)
+        self._looked_through = self._worker.submit(self._look_through, folder, path)
         return None
 
     def _may_be_dvl(self) -> list[str]:
@@ -103,8 +103,12 @@ class Discovering:
     def _begin(self) -> None:
         topics = ", ".join(self._may_be_dvl())
         self._node.get_logger().info(f"nobody publishes the DVL's topic; looking through the others ({topics}) ...")
-        folder = TemporaryDirectory(prefix="dvl_calib_")
-        ends = ExitStack()
+        try:
+            from ..bags.writer import BagWriter
+            from .recorder import TopicRecorder
+        except ImportError as error:
+            raise InputError(f"discover needs rosbags ({error}); pip install dvl_calib_ros, or remap topics") from error
+        folder, ends = TemporaryDirectory(prefix="dvl_calib_"), ExitStack()
         recorder = TopicRecorder(self._node, ends.enter_context(BagWriter(Path(folder.name) / "live")))
         ends.callback(recorder.close)
         recorder.look()
@@ -130,13 +134,16 @@ class Discovering:
             ends.close()
             folder.cleanup()
 
+    def _look_through(self, folder: TemporaryDirectory[str], path: Path) -> FoundTopics:
+        from ..discovery.discover import Given, discover
+        from ..recordings.recording import open_recording
 
-def _look_through(folder: TemporaryDirectory[str], path: Path, parameters: Parameters, given: Given) -> FoundTopics:
-    with folder:
-        try:
-            recording = open_recording([path], parameters=parameters)
-            found = discover(recording, parameters, given)
-        except InputError as error:
-            raise InputError(str(error).replace(str(path), "the topics there are")) from error
+        given = Given(self._named["dvl"], self._named["gnss"], self._named["imu"], self._given)
+        with folder:
+            try:
+                recording = open_recording([path], parameters=self._parameters)
+                found = discover(recording, self._parameters, given)
+            except InputError as error:
+                raise InputError(str(error).replace(str(path), "the topics there are")) from error
         # clocks are taken off by the node itself, once two looks agree
-        return FoundTopics(found, recording.of_types(found.topics, parameters.replace(**found.values)))
+        return FoundTopics(found, recording.of_types(found.topics, self._parameters.replace(**found.values)))

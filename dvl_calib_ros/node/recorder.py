@@ -33,6 +33,8 @@ class TopicRecorder:
         self._static: set[str] = set()
         self.counts: Counter[str] = Counter()
         self.left_out: dict[str, str] = {}
+        self.failed: InputError | None = None
+        """Why no more is written: a full disk."""
 
     @property
     def topics(self) -> list[str]:
@@ -85,5 +87,10 @@ class TopicRecorder:
         self._subscriptions = []
 
     def _take(self, channel: Channel, data: bytes) -> None:
-        self._writer.raw(channel, time.time_ns(), data)
+        if self.failed is not None:
+            return
+        try:
+            self._writer.raw(channel, time.time_ns(), data)
+        except InputError as error:
+            self.failed = error
         self.counts[channel.topic] += 1

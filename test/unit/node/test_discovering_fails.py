@@ -1,0 +1,58 @@
+"""Looking for topics never ends the node: where nothing can be recorded, it is said."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
+
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.messages.drivers import TWIST_TYPE
+from dvl_calib_ros.node.discovering import Discovering
+
+
+def searching(*topics):
+    node = SimpleNamespace(
+        get_fully_qualified_name=lambda: "/dvl_calibration",
+        get_topic_names_and_types=lambda: [(topic, [TWIST_TYPE]) for topic in topics],
+        count_publishers=lambda _: 1,
+        get_publishers_info_by_topic=lambda _: [],
+        create_subscription=lambda _, topic, taken, *__, **___: SimpleNamespace(topic_name=topic, taken=taken),
+        destroy_subscription=lambda _: None,
+        get_logger=lambda: SimpleNamespace(info=lambda _: None, warning=lambda _: None),
+    )
+    named = {"dvl": None, "gnss": None, "imu": None}
+    return Discovering(node, named, Parameters(), (), ThreadPoolExecutor(1))
+
+
+def test_nothing_is_recorded_while_no_topic_may_be_a_dvls_nor_of_what_the_node_says_itself():
+    search = searching("/odometry", "/cmd_vel", "/dvl_calibration/calibrated_twist")
+    assert search.step() is None and search._recording is None
+
+
+def test_without_what_reads_recordings_it_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dvl_calib_ros.bags.writer", None)
+    with pytest.raises(InputError, match="discover needs rosbags"):
+        searching("/dvl").step()
+
+
+def test_a_full_disk_ends_the_search(monkeypatch):
+    search = searching("/dvl")
+    assert search.step() is None
+    recorder = search._recording.recorder
+
+    def full(*_):
+        raise InputError("no space left")
+
+    monkeypatch.setattr(recorder._writer, "raw", full)
+    for each in recorder._subscriptions:
+        each.taken(b"")
+    with pytest.raises(InputError, match="no space left"):
+        search.step()
+    search.close()
+    assert search._recording is None
