@@ -20,6 +20,7 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
+from .clock_or_arm import ARM, combination
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
@@ -48,6 +49,8 @@ POWER = 0.8
 MATERIAL = 0.2
 # What is left beyond the noise is told in the sentence from this share of the noise on
 WORTH_TELLING = 0.3
+# A DVL whose z axis is as near to the vehicle's measures roll and pitch about the other two
+UPRIGHT = 0.98
 Triple = tuple[float, float, float]
 
 
@@ -82,7 +85,9 @@ def diagnose_recordings(
         check_clocks(recording, parameters.rotation_dvl_from_body)
     available = frozenset.intersection(*(recording.available for recording in recordings))
     untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
-    testable = {name: effect for name, effect in effects.items() if name not in untestable}
+    testable = {
+        name: _shown_part(each, recordings, parameters) for name, each in effects.items() if name not in untestable
+    }
     selection = select(recordings, parameters.rotation_dvl_from_body, np.array(parameters.lever_arm), testable)
     if len(selection.fitter.problem.time) < SETTINGS.min_bins:
         samples, seconds = len(selection.fitter.problem.bin_of), sum(each.seconds for each in recordings)
@@ -151,6 +156,14 @@ def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequen
     if effect.relative_to_first and len(recordings) < 2:
         lacking.append("a second recording")
     return ", ".join(sorted(lacking))
+
+
+def _shown_part(effect: Effect, recordings: Sequence[RecordedStreams], parameters: Parameters) -> Effect:
+    """An effect without what references that are horizontal do not show of it."""
+    is_upright = abs(parameters.rotation_dvl_from_body[2, 2]) > UPRIGHT
+    if not effect.vertical or any(recording.measured[2] for recording in recordings) or not is_upright:
+        return effect
+    return effect.without(effect.vertical)
 
 
 def _compared_axes(selection: EffectSelection) -> str:
@@ -280,6 +293,7 @@ def _found(selection: EffectSelection, selected: Selected, covariance: Array, n_
         closure_alone(selection, gap, effect.name),
         min(1.0, float(np.exp(selected.log_p)) * n_tested),
         {names[recording]: parameters for recording, parameters in ordered.items()} if is_of_each else {},
+        combination(fit, covariance, effect.name) if ARM in selected.equivalent else None,
     )
 
 

@@ -11,7 +11,7 @@ from ..calibration.extrinsics import turn_between
 from ..calibration.frames import Array
 from ..calibration.register.far import far_clocks
 from ..calibration.register.motion import MotionStreams, make_motion
-from ..calibration.register.registration import register
+from ..calibration.register.registration import Registration, register
 from ..calibration.samples import VelocityFrame
 from ..effects.base import EffectNeeds
 from ..errors import InputError
@@ -21,11 +21,15 @@ from .recordings import RecordedStreams
 
 @dataclass(frozen=True)
 class FirstGuess:
-    """Of one recording. offsets: of clocks. lever_arm: (3,) m, beyond what is known of it. phi: (3,) rad."""
+    """Of one recording. offsets: of clocks. lever_arm: (3,) m, beyond what is known of it. phi: (3,) rad.
+
+    registration: where these are from, None without one.
+    """
 
     offsets: Offsets
     lever_arm: Array
     phi: Array
+    registration: Registration | None = None
 
 
 def check_clocks(recording: RecordedStreams, rotation_dvl_from_body: Array) -> None:
@@ -53,7 +57,7 @@ def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever
     if found is None:
         return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
     phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)
-    return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi)
+    return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi, found)
 
 
 def _motion(recording: RecordedStreams) -> MotionStreams | None:

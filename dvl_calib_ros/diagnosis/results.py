@@ -9,6 +9,7 @@ from typing import Any
 
 from ..verdict.answering import Answering
 from ..verdict.reasons import Reason
+from .clock_or_arm import Combination
 from .closure import Gap
 from .dvl import DvlSeen
 from .noise_findings import NoiseFinding
@@ -32,7 +33,8 @@ class DiagnosisVerdict(str, Enum):
 class FoundEffect:
     """An effect that was found. equivalent_to: others that this data cannot tell from it. parameters: value, low, high
     (95 per cent) by name; of the day's, in several recordings, their weighted mean, and by_recording the values of
-    each. closure: of the gap by this effect alone. p: adjusted over the library.
+    each. closure: of the gap by this effect alone. p: adjusted over the library. combination: of a clock that a lever
+    arm could stand in for, what is known of both.
     """
 
     name: str
@@ -41,6 +43,7 @@ class FoundEffect:
     closure: float
     p: float
     by_recording: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
+    combination: Combination | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -109,6 +112,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
                 "closure": effect.closure,
                 "p_adjusted": effect.p,
                 **_by_recording(effect),
+                **_combination(effect),
             }
             for effect in diagnosis.effects
         ],
@@ -145,6 +149,18 @@ def _by_recording(effect: FoundEffect) -> dict[str, Any]:
     if not effect.by_recording:
         return {}
     return {"by_recording": {name: _parameters(values) for name, values in effect.by_recording.items()}}
+
+
+def _combination(effect: FoundEffect) -> dict[str, Any]:
+    found = effect.combination
+    if found is None:
+        return {}
+    known = {
+        "parameter": found.parameter,
+        "speed_mps": found.speed,
+        "arm_less_speed_times_delay_m": _value(found.value),
+    }
+    return {"combination": known}
 
 
 def _dvl(dvl: DvlSeen) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..effects.base import Effect
+from .clock_or_arm import ARM, is_open, with_arm
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
@@ -137,8 +138,13 @@ def select(
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
     fitter, fit = _about(fitter, fit, effects)
+    fit = with_arm(fitter, fit, guesses, effects)
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
+    if is_open(guesses):
+        selected = _clock_or_arm(fitter, fit, selected, len(effects))
+    if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
+        selected = [_either_clock(each) for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
     return EffectSelection(ordered, base, fit, fitter, guesses)
 
@@ -513,6 +519,36 @@ def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapp
             found.append((behind, name))
     del base
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
+
+
+def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int) -> list[Selected]:
+    """Lever arm and clock as one where each would do without the other."""
+    threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
+
+    def is_shown(each: Selected) -> bool:
+        return each.log_p <= threshold and _robust_p(fit, each.effect, block) < SETTINGS.robust_level
+
+    own = {each.effect.name: each for each in selected}
+    arm, clocks = own.get(ARM), [own[name] for name in CLOCKS[:2] if name in own]
+    if arm is None or not clocks:
+        return selected
+    clock = min(clocks, key=lambda each: each.log_p)
+    if is_shown(arm) and is_shown(clock):
+        return selected
+    one, other = (arm, clock) if is_shown(arm) else (clock, arm)
+    rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
+    without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
+    log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
+    equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
+    return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
+
+
+def _either_clock(selected: Selected) -> Selected:
+    """A clock that is off, where it does not show which of the two it is."""
+    if selected.effect.name not in CLOCKS[:2]:
+        return selected
+    (other,) = {*CLOCKS[:2]} - {selected.effect.name}
+    return replace(selected, equivalent=tuple(dict.fromkeys((other, *selected.equivalent))))
 
 
 __all__ = ["EffectSelection", "Offsets", "Selected", "blocks_of", "log_p_value", "select"]

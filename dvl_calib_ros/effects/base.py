@@ -7,7 +7,8 @@ diagnosis, through one function, `trace`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
+from copy import copy
 from dataclasses import dataclass
 from enum import Enum
 from typing import ClassVar
@@ -129,8 +130,8 @@ def along_axes(
 
 
 def vector(values: Mapping[str, float], suffix: str) -> Array:
-    """The three values (3,) of `along_axes`."""
-    return np.array([values[f"{axis}_{suffix}"] for axis in "xyz"])
+    """The three values (3,) of `along_axes`, 0 where not given."""
+    return np.array([values.get(f"{axis}_{suffix}", 0.0) for axis in "xyz"])
 
 
 class AnyEffect:
@@ -158,12 +159,20 @@ class Effect(AnyEffect, ABC):
 
     manoeuvre: what to fly to see it and to tell it from what it is confounded with. of_the_day: whether its size is
     another in every recording; else it belongs to the vehicle. relative_to_first: whether it is a change against the
-    first of several recordings.
+    first of several recordings. vertical: parameters of which a reference that is horizontal shows nothing, with the
+    DVL upright.
     """
 
     manoeuvre: ClassVar[str]
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
+    vertical: ClassVar[frozenset[str]] = frozenset()
+
+    def without(self, names: Collection[str]) -> Effect:
+        """The same, without some parameters, which stay at their defaults of 0."""
+        found = copy(self)
+        vars(found)["parameters"] = tuple(each for each in self.parameters if each.name not in names)
+        return found
 
     @property
     def linear(self) -> bool:

@@ -17,6 +17,7 @@ class LeverArm(Effect):
     summary = "the DVL sits at l from the reference point and moves when the vehicle turns: ω × l"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
+    vertical = frozenset({"z_m"})
     acts_on = ActsOn.MOTION
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     confounded_with = ("sideslip", "reference_time_offset", "reference_lag")

@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from ..diagnosis.clock_or_arm import Combination
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect
 from ..diagnosis.series import DiagnosisSeries
@@ -75,6 +76,16 @@ NOISE: Columns[NoiseFinding] = {
 }
 
 
+def _combined(known: Combination) -> str:
+    """What is known of a lever arm and a clock together."""
+    value, low, high = known.value
+    sign = "-" if known.speed > 0.0 else "+"
+    return (
+        f"Known of both is lever_arm {known.parameter} {sign} {abs(known.speed):.2f} m/s · {known.clock} = "
+        f"{value:.2f} m ({low:.2f} to {high:.2f})."
+    )
+
+
 def diagnosis(d: Diagnosis) -> Document:
     """Where the DVL differs from what calibration leads to expect, which effect makes it, and what cannot be told."""
     found = [
@@ -95,6 +106,7 @@ def diagnosis(d: Diagnosis) -> Document:
     ]
     cannot = "This data cannot tell {} from {}; each explains it as well."
     alike = [Sentence(cannot.format(e.name, " or ".join(e.equivalent_to))) for e in d.effects if e.equivalent_to]
+    alike += [Sentence(_combined(e.combination)) for e in d.effects if e.combination is not None]
     has_closure = bool(d.effects) and math.isfinite(d.gap.closure)
     return Document(
         title="Sim-to-real gap of the DVL",

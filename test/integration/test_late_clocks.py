@@ -78,16 +78,6 @@ def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_all_three(tmp_path, capsys):
-    """Legs that repeat after 80 s: 50 s apart by doctor, who said yes, and replay accepted."""
-    bag = bag_of(tmp_path, {"dvl_time_offset": 30.0}, "lawnmower")
-    told, examined = said("doctor", bag, tmp_path, capsys)
-    assert examined["verdict"] == "no" and "whose clock is off does not show" in told
-    calibration = dc.replay(bag, history=False)
-    assert calibration.verdict == "reject" and "whose clock is off does not show" in calibration.reasons[0]
-
-
-@pytest.mark.slow
 def test_the_function_names_the_clock_that_the_command_names(tmp_path):
     """It took the clock off, and said nothing of it."""
     effects = {
@@ -133,3 +123,28 @@ def test_a_clock_that_is_off_beside_the_log_is_taken_off_and_no_reason_against_t
     assert examined["verdict"] == "yes" and "stamps are 18.0" in doctor
     calibration = dc.replay(ahead, history=False)
     assert calibration.verdict == "accept", calibration.reasons
+
+
+@pytest.mark.slow
+def test_at_one_speed_a_diagnosis_says_that_the_clock_may_be_an_arm_and_what_is_known_of_both(tmp_path):
+    """It named the clock alone, 0.4 s off by ± 0.03."""
+    (effect,) = dc.diagnose(bag_of(tmp_path, {"reference_time_offset": 2.5}, "lawnmower", dvl_rate=1.0)).effects
+    assert effect.name == "reference_time_offset" and "lever_arm" in effect.equivalent_to
+    _, low, high = effect.parameters["seconds"]
+    assert low < 2.5 < high and high - low > 0.5
+    known = effect.combination
+    assert known is not None and known.parameter == "x_m" and known.speed == pytest.approx(-1.5, abs=0.1)
+    _, low, high = known.value  # the clock is the reference's: later, it turns the other way
+    assert low < ARM - known.speed * 2.5 < high and high - low < 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("late", "rate"), [(7.5, 1.0), (30.0, 5.0)])
+def test_on_legs_that_repeat_a_dvl_far_behind_is_found_and_calibrated_with(late, rate, tmp_path):
+    """It was a delay of 3 s, marginal; or 50 s early to diagnose."""
+    bag = bag_of(tmp_path, {"dvl_time_offset": late}, "lawnmower", dvl_rate=rate, gnss_rate=rate)
+    run = dc.replay(bag, history=False)
+    assert run.verdict == "accept"
+    assert run.replayed.result.parameters["dvl_time_offset"] == pytest.approx(late, abs=0.05 + 0.04 * late)
+    (clock,) = (each for each in dc.diagnose(bag).effects if each.name == "dvl_time_offset")
+    assert clock.parameters["seconds"][0] == pytest.approx(late, abs=0.05 + 0.04 * late)

@@ -61,7 +61,10 @@ def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: in
 
 
 def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[ClockPlace]:
-    misfit = misfit.copy()
+    around = np.pad(misfit, 1, constant_values=np.inf)  # of a broad one no flank takes the place of another
+    is_lowest = np.minimum(misfit, np.minimum(around[2:, 1:-1], around[:-2, 1:-1])) == misfit
+    is_lowest &= np.minimum(misfit, np.minimum(around[1:-1, 2:], around[1:-1, :-2])) == misfit
+    misfit = np.where(is_lowest, misfit, np.inf)
     found: list[ClockPlace] = []
     for _ in range(most):
         r, d = np.unravel_index(int(np.argmin(misfit)), misfit.shape)
@@ -69,8 +72,8 @@ def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> lis
             break
         place = ClockPlace(float(by_reference[r]), float(by_dvl[d]), float(misfit[r, d]))
         found.append(place)
-        around = np.abs(by_reference - place.reference)[:, None] < APART_S
-        misfit[around & (np.abs(by_dvl - place.dvl) < APART_S)] = np.inf
+        beside = np.abs(by_reference - place.reference)[:, None] < APART_S
+        misfit[beside & (np.abs(by_dvl - place.dvl) < APART_S)] = np.inf
     return found
 
 

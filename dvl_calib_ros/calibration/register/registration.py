@@ -57,8 +57,8 @@ AS_MANY = 0.95
 # What is left lasts by so much longer than noise where a clock moves, which is then looked for by so many references of
 # each stretch.
 STEADY, ROWS_OF_STRETCH = 1.05, 400
-# The place of the clocks is known where it is to this, s (σ).
-KNOWN_STD_S = 0.25
+# The place of the clocks is known where it is to this, s (σ), or to this share of it.
+KNOWN_STD_S, KNOWN_SHARE = 0.25, 0.06
 
 
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
@@ -273,7 +273,7 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
     late = 0.0 if likeliest in (_Off.NONE, _Off.DVL) else float(x[LATE])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
-        dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and _beyond(best.dvl_late, best.dvl_std)),
+        dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and is_beyond_doubt(best.dvl_late, best.dvl_std)),
         reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(best, LATE)),
         imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
         apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
@@ -330,11 +330,13 @@ def _held(
 
 
 def _is_off(fitted: Fitted, index: int) -> bool:
-    return _beyond(float(fitted.x[index]), float(fitted.std[index]))
+    return is_beyond_doubt(float(fitted.x[index]), float(fitted.std[index]))
 
 
-def _beyond(seconds: float, std: float) -> bool:
-    return std < KNOWN_STD_S and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
+def is_beyond_doubt(seconds: float, std: float) -> bool:
+    """Whether a clock is off that is late by so much: from here on it is said."""
+    is_known = std < max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds))
+    return is_known and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
 
 
 def _is_possible(fitted: Fitted) -> bool:

@@ -11,11 +11,11 @@ import pytest
 from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.register.coarse import LONGEST_S, places
+from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.register.curves import Curves
 from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, MotionFit
 from dvl_calib_ros.calibration.register.motion import MotionStreams, make_motion
-from dvl_calib_ros.calibration.register.registration import Registration, _is_possible, register
+from dvl_calib_ros.calibration.register.registration import Clock, Registration, _is_possible, is_beyond_doubt, register
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -296,3 +296,22 @@ def test_a_fit_that_settles_beyond_a_minute_or_nowhere_is_none(at, value, is_pos
     x = fitted.x.copy()
     x[at] = value
     assert _is_possible(fitted._replace(x=x)) is is_possible
+
+
+def test_flanks_of_a_broad_place_do_not_take_those_of_others():
+    """Legs that repeat: a DVL that was 30 s late was found 50 s early, four times."""
+    late = np.arange(-60.0, 60.5, 0.5)
+    misfit = np.minimum(1e-5 * (late + 50.0) ** 2, 0.002 + 1e-2 * np.abs(late - 30.0))[None]
+    assert [place.dvl for place in _minima(misfit, np.zeros(1), late, 4)][:2] == [-50.0, 30.0]
+
+
+def test_a_clock_that_is_far_off_is_known_to_a_share_of_it():
+    """At 1 Hz a DVL that was 7.5 s late was known to 0.28 s, so nobody said so, and replay found a delay of 3 s."""
+    assert is_beyond_doubt(7.76, 0.28) and not is_beyond_doubt(1.06, 0.28) and not is_beyond_doubt(0.08, 0.001)
+
+
+def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_a_calibration():
+    in_time = Clock(0.0, 0.1, False)
+    found = replace(registered("box", 5.0), dvl=in_time, reference=in_time, imu=in_time, apart=Clock(-50.0, 0.1, True))
+    assert found.not_told_apart is not None and found.not_told_apart.code == "CLOCKS_NOT_TOLD_APART"
+    assert found.contradiction(Parameters()) == found.not_told_apart

@@ -182,6 +182,10 @@ def test_a_horizontal_reference_gives_the_same_answer_and_its_vertical_is_not_co
     assert_within(level, "lever_arm", x_m=-1.9, y_m=0.4)
     assert_within(level, "dvl_time_offset", seconds=0.7)
     assert level.gap.after == pytest.approx(np.sqrt(2.0) * 0.02, rel=0.15)
+    # a height was claimed of a boat, and a mounting moved by 8° of roll
+    assert {*found(whole)["lever_arm"]} == {"x_m", "y_m", "z_m"}
+    assert {*found(level)["lever_arm"]} == {"x_m", "y_m"}
+    assert {*level.minimum_detectable["mount_flexure"]} == {"z_rad_per_mps"}
 
 
 def replace_velocity(sample, velocity):

@@ -1,0 +1,80 @@
+"""At one speed a clock looks like a lever arm: what a diagnosis says of both, by the one registration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..effects.base import Effect
+from .composed import Values
+from .fitting import Fit, Fitter
+from .registered import FirstGuess
+from .settings import SETTINGS
+
+ARM = "lever_arm"
+CLOCKS = ("dvl_time_offset", "reference_time_offset")
+
+
+@dataclass(frozen=True)
+class Combination:
+    """What is known of a lever arm and a clock that cannot be told apart: the arm less speed times delay.
+
+    parameter: of the arm. clock: name of the effect. speed: m/s. value: m, with its 95 per cent interval.
+    """
+
+    parameter: str
+    clock: str
+    speed: float
+    value: tuple[float, float, float]
+
+
+def is_open(guesses: Sequence[FirstGuess]) -> bool:
+    """Whether registration leaves open how much of a clock is a lever arm."""
+    return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
+
+
+def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> Fit:
+    """The fit with clocks as registration tells them, and the lever arm beside, where that is left open.
+
+    As it is where no clock is in it, or the other explains less.
+    """
+    present = [effect.name for effect in fit.effects]
+    own = [name for name in CLOCKS if name in present]
+    if not own or ARM not in effects or not is_open(guesses):
+        return fit
+    shown = {name for each in guesses if each.registration is not None for name in each.registration.offsets}
+    clocks = [name for name in CLOCKS if name in shown] or own
+    if not shown <= {*CLOCKS} or {*clocks, ARM} == {*own, *(name for name in present if name == ARM)}:
+        return fit
+    rest = [effect for effect in fit.effects if effect.name not in (*CLOCKS, ARM)]
+    start: dict[str, tuple[Values, ...]] = {
+        ARM: tuple(dict(zip(("x_m", "y_m", "z_m"), each.lever_arm.tolist(), strict=True)) for each in guesses)[:1]
+        * len(guesses),
+        CLOCKS[0]: tuple({"seconds": each.offsets.dvl} for each in guesses),
+        CLOCKS[1]: tuple({"seconds": each.offsets.reference} for each in guesses),
+    }
+    wanted = [*rest, effects[ARM], *(effects[name] for name in clocks if name in effects)]
+    if len(wanted) > SETTINGS.max_effects:
+        return fit
+    found = fitter.fit_kept(fit.hypothesis.with_effects(wanted, len(guesses), start), fit.noise)
+    return found if found.deviance < fit.deviance + SETTINGS.indistinguishable else fit
+
+
+def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
+    """What is known of arm and clock of one recording, by a fit that has both and its covariance (6 + p, 6 + p)."""
+    at = {(each.effect.name, each.spec.name): 6 + i for i, each in enumerate(fit.hypothesis.parameters())}
+    delay = at.get((clock, "seconds"))
+    if delay is None or len(fit.seen) > 1:
+        return None
+    vector = fit.hypothesis.vector()
+    speeds = {name: float(covariance[i, delay] / covariance[delay, delay]) for (e, name), i in at.items() if e == ARM}
+    if not speeds:
+        return None
+    name = max(speeds, key=lambda each: abs(speeds[each]))
+    arm, speed = at[ARM, name], speeds[name]
+    value = float(vector[arm] - speed * vector[delay])
+    std = float(np.sqrt(max(covariance[arm, arm] - speed**2 * covariance[delay, delay], 0.0)))
+    return Combination(name, clock, speed, (value, value - 1.96 * std, value + 1.96 * std))
