@@ -25,9 +25,9 @@ MOST = 64
 FEWEST = 8
 # By chance a scatter may exceed the filter's σ up to this quantile without being taken for more.
 CHANCE = 0.1
-# Neighbours of so many blocks are correlated if their coefficient is more than so many times its σ, 1/√m; no more than
-# this is believed of it.
-LASTING_FROM, LASTS, MOST_LASTING = 16, 2.5, 0.85
+# Neighbours of so many blocks are correlated if their coefficient is more than so many times its σ, 1/√m: of noise that
+# lasts as long as blocks do more would show in half of the runs of four minutes. No more than this is believed of it.
+LASTING_FROM, LASTS, MOST_LASTING = 16, 1.5, 0.85
 
 
 class TimeBlocks:
@@ -108,9 +108,9 @@ class TimeBlocks:
         information, vector = (each[:, index].copy() for each in self.kept)
         return BlocksOfOne(information, vector, self.total[0][index])
 
-    def inflation(self, index: int, x: Array, p: Array) -> Array:
+    def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTS) -> Array:
         """`inflations` of one of the K, x (n,), P (n, n)."""
-        return inflations([self.of(index)], x[None], p[None])[0]
+        return inflations([self.of(index)], x[None], p[None], lasts=lasts)[0]
 
 
 class BlocksOfOne(NamedTuple):
@@ -121,11 +121,13 @@ class BlocksOfOne(NamedTuple):
     total: Array
 
 
-def inflations(blocks: Sequence[BlocksOfOne], x: Array, p: Array, variance: Array | None = None) -> Array:
+def inflations(
+    blocks: Sequence[BlocksOfOne], x: Array, p: Array, variance: Array | None = None, lasts: float = LASTS
+) -> Array:
     """By how much σ of each state has to grow, at least 1, by S times blocks (S, n). x (S, n), P (S, n, n).
 
     The largest over blocks as they are, and over two and four of them together. variance: (S, r) of r quantities that
-    are judged instead, whose covariance with the states p (S, r, n) then is.
+    are judged instead, whose covariance with the states p (S, r, n) then is. lasts: as `LASTS`.
     """
     variance = np.diagonal(p, axis1=1, axis2=2) if variance is None else variance
     factor = np.ones(variance.shape)
@@ -134,18 +136,18 @@ def inflations(blocks: Sequence[BlocksOfOne], x: Array, p: Array, variance: Arra
         at = np.flatnonzero(counts == count)
         scores = np.stack([blocks[number].vector - blocks[number].information @ x[number] for number in at.tolist()])
         total = np.stack([blocks[number].total for number in at.tolist()])
-        factor[at] = _inflations(scores, total, p[at], variance[at])
+        factor[at] = _inflations(scores, total, p[at], variance[at], lasts)
     return factor
 
 
-def _inflations(scores: Array, total: Array, p: Array, variance: Array) -> Array:
+def _inflations(scores: Array, total: Array, p: Array, variance: Array, lasts: float) -> Array:
     """(S, r), by scores (S, m, n) and their information (S, n, n)."""
     factor = np.ones(variance.shape)
     claimed = ((p @ total) * p).sum(axis=2)
     while scores.shape[1] >= FEWEST:
         m = scores.shape[1]
         scatter = p @ scores.swapaxes(1, 2)
-        found = (scatter**2).sum(axis=2) * (m / (m - 1.0)) * _lasting(scatter)
+        found = (scatter**2).sum(axis=2) * (m / (m - 1.0)) * _lasting(scatter, lasts)
         ratio = found / np.maximum(claimed, 1e-300)
         beyond_chance = ratio > chi2_isf(CHANCE, m - 1) / (m - 1)
         # the prior's part of P is not the data's to judge
@@ -158,7 +160,7 @@ def _inflations(scores: Array, total: Array, p: Array, variance: Array) -> Array
     return factor
 
 
-def _lasting(scatter: Array) -> Array:
+def _lasting(scatter: Array, lasts: float) -> Array:
     """By how much the variance of the sum of each of series (S, n, m) is more than that of their terms.
 
     What lasts longer than a block is in neighbours alike, and where few blocks are left it is not seen otherwise.
@@ -171,4 +173,4 @@ def _lasting(scatter: Array) -> Array:
     beside = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
     rho = np.clip((beside + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
     more = (1.0 + rho) / (1.0 - rho)
-    return np.asarray(np.where(beside > LASTS / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))
+    return np.asarray(np.where(beside > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))

@@ -49,8 +49,9 @@ HALF_AT = 3.0
 SLOW_MPS, ENOUGH = 0.1, 20
 # No more of what is known of δ is taken for noise.
 MOST_OF_NOISE = 0.95
-# Blocks of time by whose scatter σ is found.
-BLOCKS = 48
+# Blocks of time by whose scatter σ is found. That noise lasts has to be beyond doubt (`time_blocks.LASTS`): where it is
+# taken for what a clock that moves leaves, none is found.
+BLOCKS, LASTS_BEYOND_DOUBT = 48, 2.5
 # Median of chi-square of 1, 2, 3 degrees of freedom.
 _MEDIAN_CHI2 = (0.455, 1.386, 2.366)
 _Compared = tuple[Index, tuple[Array, ...]]
@@ -282,7 +283,7 @@ class MotionFit:
             h = rows.jacobian[part].reshape(-1, N)
             w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
             blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
-        factor = blocks.inflation(0, np.zeros(N), p)
+        factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT)
         return p * np.outer(factor, factor), factor
 
 

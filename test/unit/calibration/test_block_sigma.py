@@ -187,13 +187,16 @@ def mean_of(noise):
     return float(x[0]), float(blocks.inflation(0, x, p)[0]) / np.sqrt(n)
 
 
-@pytest.mark.parametrize(("lasts", "least", "most"), [(0.0, 0.8, 1.1), (20.0, 0.7, 1.1), (60.0, 0.7, 1.2)])
-def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, least, most):
-    """640 samples: blocks of 80 are the longest that there are enough of, and noise may last 60."""
+@pytest.mark.parametrize(
+    ("lasts", "number", "least", "most"),
+    [(0.0, 640, 0.8, 1.1), (20.0, 640, 0.7, 1.1), (60.0, 640, 0.7, 1.2), (10.0, 250, 0.8, 1.3), (0.0, 250, 0.8, 1.1)],
+)
+def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, number, least, most):
+    """Of 640 samples blocks of 80 are the longest that there are enough of, of 250 those of 30."""
     normalised = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        noise = rng.normal(size=640)
+        noise = rng.normal(size=number)
         if lasts:
             keep = np.exp(-1.0 / lasts)
             noise[0] *= 1.0 / np.sqrt(1.0 - keep**2)

@@ -20,6 +20,7 @@ from dvl_calib_ros.calibration.delay import solver as delay_solver
 from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.delay.rows import BEYOND
 from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
+from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
@@ -333,7 +334,7 @@ class Lazy:
 
 @pytest.mark.parametrize("worker", [Lazy, ThreadPoolExecutor])
 def test_when_a_worker_is_done_changes_nothing_that_is_published(worker):
-    at_once = Calibrator(NOISE, block_size=64)
+    at_once = Calibrator(NOISE, block_size=64, worker=AtOnce())  # looks on the way, as live
     beside = Calibrator(NOISE, block_size=64, worker=worker(1))
     models = set()
     for number, sample in enumerate(late(-1.4, duration=80.0)):
