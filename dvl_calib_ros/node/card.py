@@ -80,6 +80,8 @@ class Card:
             noise = noise_of_a_second(estimate, parameters, seconds, self._squares / max(self._looks, 1))
             still = RecentMotion(0.0, None, False, noise)
             moving = still if motion is None else motion._replace(noise=noise)
+            if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
+                moving = moving._replace(speed=max(moving.speed, math.sqrt(self._squares / max(self._looks, 1))))
             self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
         drift = predicted_drift(model, estimate.recording_covariance, parameters)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
