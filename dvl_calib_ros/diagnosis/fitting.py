@@ -327,11 +327,6 @@ def _length(step: Array, before: Array, length: float) -> float:
     return float(np.clip(length / max(1.0 - along / before_square, 0.1), 0.3, 5.0))
 
 
-def names_of(effects: Sequence[Effect]) -> frozenset[str]:
-    """Their names."""
-    return frozenset(effect.name for effect in effects)
-
-
 def n_amplitudes(effect: Effect, n_recordings: int) -> int:
     """Number of parameters with a derivative, of all recordings."""
     return len(amplitudes(effect)) * len(whose_parameters(effect, n_recordings))

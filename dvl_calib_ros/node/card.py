@@ -18,6 +18,7 @@ from ..calibration.models import MODELS
 from ..calibration.mounting_pose import rpy_std, scale_and_delay
 from ..calibration.results import Estimate
 from ..calibration.worth import KM, Outlook, RecentMotion, noise_of_a_second, outlook, predicted_drift
+from ..verdict.reasons import finding
 
 # What to drive next is thought of anew so often, s: it takes a few milliseconds.
 THOUGHT_OF_EVERY_S = 5.0
@@ -40,14 +41,19 @@ class Card:
         self._thought_s = -math.inf
 
     def values(
-        self, calibrator: Calibrator, estimate: Estimate, counts: Mapping[str, Mapping[str, int]], now_s: float
+        self,
+        calibrator: Calibrator,
+        estimate: Estimate,
+        counts: Mapping[str, Mapping[str, int]],
+        now_s: float,
+        rejected: bool = False,
     ) -> dict[str, str]:
-        """By key of /diagnostics."""
+        """By key of /diagnostics. rejected: whether a replay would reject the calibration."""
         return {
             "elapsed [s]": f"{now_s - self._began_s:.0f}",
             **self._streams({name: counts[name]["received"] for name in _STREAMS}, now_s),
             **_mounting(calibrator, estimate),
-            **self._next(calibrator, estimate, now_s),
+            **self._next(calibrator, estimate, now_s, rejected),
             **{f"driven {name} [s]": f"{seconds:.0f}" for name, seconds in self._driven_s.items()},
         }
 
@@ -65,7 +71,7 @@ class Card:
         self._received.append((now_s, received))
         return values
 
-    def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float) -> dict[str, str]:
+    def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
         parameters, model = calibrator.parameters, MODELS[estimate.model]
         motion = calibrator.latest_motion()
         if motion is not None and motion.speed > 0.0:
@@ -83,6 +89,7 @@ class Card:
             if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
                 moving = moving._replace(speed=max(moving.speed, math.sqrt(self._squares / max(self._looks, 1))))
             self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
+        found = Outlook(finding("NEXT_REJECTED"), None) if rejected else self._outlook
         drift = predicted_drift(model, estimate.recording_covariance, parameters)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
@@ -96,9 +103,9 @@ class Card:
             "worth ahead": "-" if math.isnan(drift.ahead) else f"{drift.ahead:.2f}",
             "target": f"{parameters.target_drift:g}",
             **{f"goal {name} [%]": f"{share:.0f}" for name, share in goals.items() if not math.isnan(share)},
-            "next": self._outlook.next.sentence,
-            "next code": self._outlook.next.code,
-            "seconds": "-" if self._outlook.seconds is None else f"{self._outlook.seconds:.0f}",
+            "next": found.next.sentence,
+            "next code": found.next.code,
+            "seconds": "-" if found.seconds is None else f"{found.seconds:.0f}",
         }
 
 

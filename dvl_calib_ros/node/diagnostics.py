@@ -166,7 +166,7 @@ def diagnose(
         **_beside_the_pose(estimate, calibrator.parameters),
         **_count_values(estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
-        **({} if card is None else card.values(calibrator, estimate, counts, now_s)),
+        **({} if card is None else card.values(calibrator, estimate, counts, now_s, rejected)),
     }
     for number, each in enumerate(found, start=1):
         values[f"finding {number}"] = str(each)

@@ -16,6 +16,11 @@ MANOEUVRES = (
     _Said("NEXT_EIGHT", "drive a figure eight", "Turns to both sides tell a lever arm from a yaw."),
     _Said("NEXT_DIVE", "dive and rise by 10° of pitch", "Pitching shows what the vertical axis brings."),
     _Said("NEXT_WAIT", "keep on: nothing is learnt yet", "The models have not used a sample, or the vehicle stands."),
+    _Said(
+        "NEXT_REJECTED",
+        "nothing: the findings say why this calibration is not to be used",
+        "A replay would reject it: more data of the same kind do not help.",
+    ),
     _Said("NEXT_IS_GOOD", "good enough: save", "The predicted drift is within target_drift."),
     _Said(
         "NEXT_IS_GOOD_BUT_SCALE",

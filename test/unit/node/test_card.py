@@ -77,3 +77,10 @@ def test_a_standing_vehicle_drives_no_heading():
     for second in range(5):
         said = values(card, calibrator, counts(7), float(second))
     assert sum(float(said[f"driven {name} [s]"]) for name in SECTORS) == 0.0
+
+
+def test_of_a_calibration_that_would_be_rejected_nothing_is_good_enough():
+    calibrator = calibrate(make_samples(RUN), Parameters(model="G1", target_drift=1000.0))
+    card, estimate = Card(0.0), calibrator.estimate()
+    assert card.values(calibrator, estimate, counts(1), 1.0)["next code"] == "NEXT_IS_GOOD"
+    assert card.values(calibrator, estimate, counts(1), 2.0, rejected=True)["next code"] == "NEXT_REJECTED"
