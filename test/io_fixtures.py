@@ -16,12 +16,17 @@ from rosbags.typesys import Stores, get_typestore
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.files.result_file import result_document, result_text
+from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.encode import SampleWriter
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -140,3 +145,13 @@ def steady_run(count: int, seed: int = 7) -> list[Sample]:
         samples.append(ReferenceSample(stamp, tuple((truth + rng.normal(0, 0.05, 3)).tolist())))
         samples.append(DvlSample(stamp, tuple(measured.tolist())))
     return samples
+
+
+def live(bag: Path, parameters: Parameters) -> Calibrator:
+    """A calibrator as the node has one, after all of a bag."""
+    recording, topics = open_recording([bag]), Topics()
+    calibrator = Calibrator(parameters, worker=AtOnce())
+    named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
+    for stretch in recording.stretches(named, MessageDecoder(parameters)):
+        calibrator.feed(stretch.streams)
+    return calibrator

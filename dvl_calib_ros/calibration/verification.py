@@ -172,9 +172,10 @@ def verify(
     """
     reasons = by_severity(
         [
+            # the cause before what it makes of the samples
+            *([finding("CONFIGURATION_WRONG", says=suggestion).weighed(Severity.REJECT)] if suggestion else []),
             *use_findings(used_and_gated),
             *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
-            *([finding("CONFIGURATION_WRONG", says=suggestion).weighed(Severity.REJECT)] if suggestion else []),
             *_size_findings(model, state, parameters),
             *_convergence_findings(convergence),
             _error_finding(held_out, parameters, reference_claims, typical_error, own_error),

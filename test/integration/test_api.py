@@ -98,7 +98,7 @@ def test_without_history_what_needs_it_says_so(bag):
 
 def test_the_other_functions_give_dataclasses(tmp_path, bag):
     made = dc.simulate(tmp_path / "made", seconds=60.0, trajectory="figure8")
-    assert dc.doctor(made).verdict == "yes"
+    assert dc.doctor(made).verdict == "partly"  # of a minute no yaw to speak of: a replay of it claims ± 2.4°
     checked = dc.evaluate([bag, made], models=["G1"])
     assert checked.models == ("G1",)
     assert dc.replay([made], gnss_topic="none").model == "F1"

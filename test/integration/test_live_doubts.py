@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from io_fixtures import live
 
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import Stream
 from dvl_calib_ros.files.mounting import load_calibrated_mounting
 from dvl_calib_ros.files.result_file import result_document, save_result
-from dvl_calib_ros.messages.decode import MessageDecoder
-from dvl_calib_ros.recordings.recording import open_recording
-from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
@@ -26,16 +21,6 @@ LOOKED_FOR = {
     "TILT_NOT_FOLLOWED", "TILT_NOT_SHOWN", "DVL_BIAS", "VELOCITY_SMOOTHED", "CIRCULAR_REFERENCE", "HEADING_DEVIATION",
     "LEVER_ARM_CONTRADICTED", "ONE_HEADING", "IMU_LEVEL",
 }  # fmt: skip
-
-
-def live(bag, parameters) -> Calibrator:
-    """A calibrator as the node has one, after all of a bag."""
-    recording, topics = open_recording([bag]), Topics()
-    calibrator = Calibrator(parameters, worker=AtOnce())
-    named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
-    for stretch in recording.stretches(named, MessageDecoder(parameters)):
-        calibrator.feed(stretch.streams)
-    return calibrator
 
 
 @pytest.mark.parametrize(

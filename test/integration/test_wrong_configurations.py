@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from conftest import few
-from io_fixtures import write_bag
+from io_fixtures import live, write_bag
 from scipy.spatial.transform import Rotation
 from yaml_text import written
 
@@ -180,10 +180,8 @@ def test_a_right_configuration_is_not_rejected_and_nothing_else_is_said_to_fit(s
     assert result.suggestion is None
 
 
-def test_what_the_node_saves_of_a_wrong_configuration_is_refused_too_though_it_cannot_verify(tmp_path, capsys):
-    result = replay([write_bag(tmp_path / "bag", run(YAW[45]))], Parameters()).result
-    document = result_document(result)
-    del document["verification"]
+def test_what_the_node_saves_of_a_wrong_configuration_is_refused_too(tmp_path, capsys):
+    document = result_document(live(write_bag(tmp_path / "bag", run(YAW[45])), Parameters()).result())
     saved, launch = tmp_path / "result.yaml", tmp_path / "tf.launch.xml"
     saved.write_text(written(document))
     assert main(["apply", str(saved), "--launch", str(launch)]) == 2
