@@ -9,11 +9,14 @@ import numpy as np
 
 from ..frames import Array, skew, turned_skew
 from ..observations import Observations
+from ..samples import Mask
 from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance
 
 # A DVL axis shows its scale from this speed along it, m/s: a DVL noise of 0.01 m/s then pulls by 0.1 per cent at most,
 # while a scale error of 0.5 per cent that is left out costs 1.5 mm/s.
-SCALE_SHOWN_FROM = 0.3
+# ... and slower ones along which it travels, by this share of the speed: of a DVL mounted at 30° one would show it at
+# times and at times not, and a scale that is left out of half of the samples is a yaw.
+SCALE_SHOWN_FROM, ALONG_FROM = 0.3, 0.4
 
 
 def linearise_g1(seen: Observations) -> Linearised:
@@ -49,7 +52,7 @@ def g1_errors(body_from_dvl: Array, v: Array) -> Array:
     """[Tᵀ[v×], -Tᵀdiag(v)] (3, 5, N) of velocities v (3, N) m/s in the DVL's frame, as in `linearise_g1`."""
     h = np.empty((3, 5, v.shape[1]))
     h[:, :3] = turned_skew(body_from_dvl, v)
-    h[:, 3:] = -body_from_dvl[:, :2, None] * _shown(v)[:2]
+    h[:, 3:] = -body_from_dvl[:, :2, None] * np.where(_show_scale(v), v, 0.0)[:2]
     return h
 
 
@@ -70,13 +73,16 @@ def g1_heave_errors(body_from_dvl: Array, v: Array) -> Array:
     level = body_from_dvl.T[:2, :2] @ (body_from_dvl[:2] @ v)
     row = np.empty((5, v.shape[1]))
     row[:3] = turned_skew(body_from_dvl[2:], v)[0]
-    row[3:] = -body_from_dvl[2, :2, None] * np.where(np.abs(v[:2]) > SCALE_SHOWN_FROM, level, 0.0)
+    row[3:] = -body_from_dvl[2, :2, None] * np.where(_show_scale(v)[:2], level, 0.0)
     return row
 
 
-def _shown(v: Array) -> Array:
-    """Velocities (3, N) m/s in the DVL's frame, zero along axes that are too slow to show their scale."""
-    return np.where(np.abs(v) > SCALE_SHOWN_FROM, v, 0.0)
+def _show_scale(v: Array) -> Mask:
+    """Whether axes show their scale by velocities (3, N) m/s in the DVL's frame."""
+    square = v * v
+    speed = square.sum(axis=0)
+    along = (square > ALONG_FROM**2 * speed) & (speed > SCALE_SHOWN_FROM**2)
+    return np.asarray(along | (square > SCALE_SHOWN_FROM**2))
 
 
 def noise_in_body(seen: Observations) -> Array:

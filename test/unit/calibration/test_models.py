@@ -176,6 +176,14 @@ def test_noiseless_errors_are_recovered(name, mounting, frame, rng):
         np.testing.assert_allclose(state, truth, atol=2e-8)  # second order: 4e-5 squared
 
 
+def test_a_scale_is_no_yaw_of_a_dvl_whose_axis_is_fast_at_times(rng):
+    """Survey 34169: at 30° and 0.7 m/s one axis is now above 0.3 m/s and now below; 0.6° of yaw were made of 0.8 %."""
+    model, t = MODELS["G1"], rotation_from_rpy((0.0, 0.0, np.pi / 6.0)).T
+    velocity = np.column_stack([rng.uniform(0.45, 0.75, 400), rng.normal(0.0, 0.03, 400), np.zeros(400)])
+    state = run_filter(model, distort(velocity, np.zeros(3), np.full(3, -0.008) * [1, 1, 0], t), velocity, t)
+    assert abs(np.degrees(state[2])) < 0.15  # what the prior of the scale leaves
+
+
 @pytest.mark.parametrize("name", ["M5", "M6"])
 @each_frame
 def test_the_models_without_gnss_find_pitch_and_yaw_of_a_straight_level_run(name, frame, rng):
