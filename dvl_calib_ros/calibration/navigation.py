@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .delay.hold_out import NO_TERMS, Terms, ThinnedRecording
 from .frames import Array
@@ -33,6 +34,8 @@ SHORTEST_M = 20.0
 GAP_INTERVALS, GAP_S = 5.0, 2.0
 # By chance the drift over few stretches is not so many times larger with a calibration than without.
 WORSE = 1.5
+# Velocities fit clearly better where squares of their errors are so many times smaller, in the median.
+FITS_BETTER = 0.5
 # Samples that are compared in one go.
 COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
@@ -109,6 +112,15 @@ class Navigation:
     def speed(self) -> float:
         """m/s, mean over the track."""
         return self.distance_m / max(self.seconds, 1e-9)
+
+    @property
+    def fits_better(self) -> bool:
+        """Whether velocities do, clearly and not by outliers: then the way went back on itself, which a wrong mounting
+        cancels over, and noise that lasts does not."""
+        if not len(self.error_before):
+            return False
+        before, after = (median((each**2).sum(axis=1)) for each in (self.error_before, self.error_after))
+        return bool(after < FITS_BETTER * before)
 
 
 def dead_reckoned(
@@ -265,7 +277,8 @@ def objections(navigation: Navigation | None) -> list[Reason]:
         if float(metres(after)) <= float(metres(before)):
             return []
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
-    return [finding("DRIFT_WORSE", after=after, before=before)]
+    worse = finding("DRIFT_WORSE", after=after, before=before)
+    return [worse.weighed(Severity.MARGINAL) if navigation.fits_better else worse]
 
 
 def in_words(navigation: Navigation) -> list[str]:
