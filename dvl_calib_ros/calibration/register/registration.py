@@ -57,8 +57,9 @@ AS_MANY = 0.95
 # What is left lasts by so much longer than noise where a clock moves, which is then looked for by so many references of
 # each stretch.
 STEADY, ROWS_OF_STRETCH = 1.05, 400
-# The place of the clocks is known where it is to this, s (σ), or to this share of it.
-KNOWN_STD_S, KNOWN_SHARE = 0.25, 0.06
+# The place of the clocks is known where it is to this, s (σ); of one that is far off to a share of it, and to no more
+# than this: a short run finds some place for any clock, to half a second.
+KNOWN_STD_S, KNOWN_SHARE, KNOWN_AT_MOST_S = 0.25, 0.12, 0.35
 
 
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
@@ -335,7 +336,7 @@ def _is_off(fitted: Fitted, index: int) -> bool:
 
 def is_beyond_doubt(seconds: float, std: float) -> bool:
     """Whether a clock is off that is late by so much: from here on it is said."""
-    is_known = std < max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds))
+    is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_AT_MOST_S)
     return is_known and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
 
 

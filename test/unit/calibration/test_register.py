@@ -308,6 +308,7 @@ def test_flanks_of_a_broad_place_do_not_take_those_of_others():
 def test_a_clock_that_is_far_off_is_known_to_a_share_of_it():
     """At 1 Hz a DVL that was 7.5 s late was known to 0.28 s, so nobody said so, and replay found a delay of 3 s."""
     assert is_beyond_doubt(7.76, 0.28) and not is_beyond_doubt(1.06, 0.28) and not is_beyond_doubt(0.08, 0.001)
+    assert not is_beyond_doubt(36.7, 0.43)  # of a short run
 
 
 def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_a_calibration():
