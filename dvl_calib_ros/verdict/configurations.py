@@ -40,6 +40,12 @@ CONFIGURATIONS = (
         "set dvl_axes to frd",
     ),
     _Said(
+        "DVL_LEFT_HANDED",
+        "the DVL's axes look left-handed",
+        "The data fit much better with y negated alone, which no rotation does.",
+        "correct the DVL's driver",
+    ),
+    _Said(
         "MOUNTING_FITS",
         "the data fit mounting_rpy {roll:.3g} {pitch:.3g} {yaw:.3g}",
         "The DVL is turned by far more than a misalignment.",

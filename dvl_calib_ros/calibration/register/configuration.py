@@ -19,7 +19,7 @@ from ..directions import Directions
 from ..extrinsics import turn_between
 from ..frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..samples import VelocityFrame
-from .curves import GAP_S, Curves
+from .curves import GAP_S, MIRRORED, Curves
 from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion import MotionStreams
 from .registration import Registration
@@ -78,7 +78,8 @@ def fitting_configuration(
         as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
-        return _flipped(motion, curves, nominal, lever_arm, given)
+        asked = motion, curves, nominal, lever_arm, given
+        return _flipped(*asked) or _mirrored(*asked)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -166,6 +167,26 @@ def _flipped(
     # read at other times, the DVL's noise is another one: what is left differs by that alone
     by_chance = math.sqrt(6.0 * turned.rows) if abs(given.dvl_late - turned.dvl_late) > ALIKE_S else 0.0
     return finding("DVL_AXES_FRD") if gain > CLEARLY + by_chance else None
+
+
+def _mirrored(
+    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
+) -> Reason | None:
+    """Whether a DVL whose y points the other way explains more, each with any lever arm.
+
+    Then the sway of turns is the other way round, which at one speed is a lever arm of the other sign.
+    """
+    other = replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * MIRRORED))
+    near = nearest(MotionFit(other, lever_arm, curves.mirrored(), FEW_ROWS), nominal, (REFERENCE,))
+    if near is None or near.level > registered.spread:
+        return None
+    held = (REFERENCE,)
+    turned = MotionFit(other, lever_arm, curves.mirrored(), MOST_ROWS)(0.0, near.dvl_late, nominal, held)
+    given = MotionFit(motion, lever_arm, curves, MOST_ROWS)(0.0, registered.dvl.late, nominal, held)
+    if turned is None or given is None:
+        return None
+    gain = 3.0 * turned.rows * 2.0 * math.log(max(given.level, 1e-6) / max(turned.level, 1e-6))
+    return finding("DVL_LEFT_HANDED") if gain > CLEARLY + math.sqrt(6.0 * turned.rows) else None
 
 
 def _named(

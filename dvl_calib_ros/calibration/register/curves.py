@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from ..delay.local_motion import REACH_INTERVALS, local_fit, reach_at, spacing_at
@@ -15,6 +17,10 @@ from .motion import MotionStreams
 GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
 # Attitudes and rates further apart than this tell nothing between, s.
 GAP_S = 2.0
+
+
+# A left-handed driver's axes.
+MIRRORED: Array = np.array([1.0, -1.0, 1.0])
 
 
 class Curves:
@@ -39,6 +45,12 @@ class Curves:
             self._turns_start = float(grid[0])
             rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
             self._turns = np.nan_to_num(np.concatenate(rates))
+
+    def mirrored(self) -> Curves:
+        """The same of a DVL whose y points the other way."""
+        made = copy(self)
+        made._velocity = self._velocity * MIRRORED[[0, 1, 2, 0, 1, 2, 0]]
+        return made
 
     def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
         """At times (J,) s: velocity (J, 3), slope (J, 3), noise gain of the slope (J,), and whether there is one."""
