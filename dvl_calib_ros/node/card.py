@@ -110,9 +110,9 @@ class Card:
 
 
 def _done(drift: float, unknown: float, target: float) -> float:
-    """Per cent of the way from what is not known at all to the target, by the logarithm."""
-    if drift <= target:
-        return 100.0
+    """Per cent of the way from what is not known at all to the target, by the logarithm; nan for what never will."""
+    if drift <= target or math.isnan(drift):
+        return 100.0 if drift <= target else math.nan
     return max(0.0, min(99.0, 100.0 * math.log(unknown / drift) / max(math.log(unknown / target), 1e-9)))
 
 

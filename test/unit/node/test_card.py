@@ -27,6 +27,7 @@ def values(card, calibrator, received, now_s):
 def test_before_the_first_sample_nothing_is_known_and_all_is_said_so():
     said = values(Card(100.0), Calibrator(Parameters()), counts(0), 101.0)
     assert said["elapsed [s]"] == "1" and said["dvl rate [Hz]"] == said["dvl age [s]"] == said["seconds"] == "-"
+    assert said["worth ahead"] == "-" and "goal ahead [%]" not in said  # no model without a reference knows the scale
     assert said["next code"] == "NEXT_WAIT" and float(said["goal worth [%]"]) == pytest.approx(0.0, abs=1.0)
 
 
