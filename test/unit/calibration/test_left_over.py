@@ -101,6 +101,14 @@ def test_a_bias_shows_at_several_speeds(rng):
     assert said.severity is Severity.REJECT and said.code == "DVL_BIAS"
 
 
+def test_a_bias_that_is_not_beyond_doubt_is_marginal(rng):
+    """27 ± 7 mm/s, which were 1.4 degrees of yaw at 0.2, were accepted."""
+    found = Vehicle(rng).found()
+    for bias, words in ((0.027, [Severity.MARGINAL]), (0.02, []), (0.05, [Severity.REJECT])):
+        biased = found._replace(bias=np.array([0.0, bias, 0.0]), bias_std=np.full(3, 0.0067))
+        assert [each.severity for each in left_over_advice(biased) if each.code == "DVL_BIAS"] == words
+
+
 def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
     vehicle = Vehicle(rng)
     slow = smoothed(vehicle.earth, 1.5)
