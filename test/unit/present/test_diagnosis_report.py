@@ -89,7 +89,8 @@ def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page
     found = diagnosis()
     rest = replace(found.series.rest, log_p=-50.0)
     unknown = replace(found, verdict=DiagnosisVerdict.UNKNOWN, series=replace(found.series, rest=rest))
-    assert "still follows turn rate (p = 1.9e-22)" in page_of(tmp_path, unknown).text
+    said = finding("REST_FOLLOWS", about="turn rate").full_sentence.removesuffix(".")
+    assert f"{said} (p = 1.9e-22)" in page_of(tmp_path, unknown).text
 
 
 def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_path):

@@ -130,7 +130,11 @@ def test_the_type_of_the_dvls_data_is_shown(made):
 def test_warnings_are_shown(tmp_path):
     samples = [sample for sample in run() if isinstance(sample, DvlSample)]
     path, replayed = replay_page(tmp_path, samples)
-    assert replayed.notes and all(note in Page(path).text for note in replayed.notes)
+    text = Page(path).text
+    (lead,) = [found for found in replayed.findings if found.code == "BAG_NO_IMU"]
+    assert text.count(lead.says) == 1 and lead.remedy in text and lead.code in text  # before all else, and once
+    others = [note for note in replayed.notes if note != str(lead)]
+    assert others and all(note in text for note in others)
 
 
 @pytest.mark.slow
