@@ -28,7 +28,7 @@ SCRIPT = Path("cases") / "stacks.py"
 # An answer is wrong if it is off by more than three of its σ and by this: degrees of roll, pitch, yaw; per cent; m; s.
 ANGLES_DEG, SCALE, POSITION_M, DELAY_S = (0.7, 0.7, 0.5), 0.5, 0.1, 0.06
 # A bag that holds no answer: the right one is to say why, first.
-NONE_TO_GIVE = {"d_no_imu": "No IMU"}
+NONE_TO_GIVE = {"d_no_imu": "no IMU"}
 # A DVL beside the one that is taken: truth's names for both, and the topic of the other.
 SECOND = {"f_two_dvls_camera": ("port", "stbd", "/starboard/dvl")}
 
@@ -111,7 +111,7 @@ def judge(bag: Path, truth: Mapping[str, Any], work: Path) -> Judged:
         judged.wrong.append(f"doctor says {doctor}, replay {verdict}")
     if name in NONE_TO_GIVE:
         first = NONE_TO_GIVE[name]
-        if verdict != "reject" or not said.startswith(first) or first not in answer.partition("reject")[0]:
+        if verdict != "reject" or not said.lstrip().startswith(first) or first not in answer.partition("reject")[0]:
             judged.wrong.append(f"{first!r} is not the first thing said, or it is not rejected ({verdict})")
         return judged
     if verdict == "reject":
