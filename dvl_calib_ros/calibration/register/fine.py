@@ -124,7 +124,7 @@ class _Rows(NamedTuple):
 class MotionFit:
     """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
 
-    times: (J,) s of the references that are looked at.
+    times: (J,) s of the references that are looked at. dvl_noise: variance of the DVL's white noise, (m/s)².
     """
 
     def __init__(self, motion: MotionStreams, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
@@ -136,8 +136,8 @@ class MotionFit:
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self.times, self._velocity = m.reference_times[moving], m.reference[moving]
-        # of the DVL, (m/s)²: where hardly anything changes, what seems to is its noise
-        self._noise = float(white_noise(m.dvl.velocity))
+        # where hardly anything changes, what seems to is its noise
+        self.dvl_noise = float(white_noise(m.dvl.velocity))
 
     def __call__(
         self,
@@ -250,7 +250,7 @@ class MotionFit:
                 jacobian = attitude @ jacobian
             residual, jacobian = residual[:, measured], jacobian[:, measured]
         speed = float(np.sqrt((body**2).sum(axis=1).mean()))
-        return _Rows(residual, jacobian, at, gain * self._noise * residual.shape[1], speed)
+        return _Rows(residual, jacobian, at, gain * self.dvl_noise * residual.shape[1], speed)
 
     def _solved(
         self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]

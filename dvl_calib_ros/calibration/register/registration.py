@@ -354,8 +354,11 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
     """Whether a place explains the data about as well as the one that leaves least, and the same data.
 
     A delay that pushes a bad stretch of the DVL out of the overlap leaves less of the rest, as any other place does.
+    Read at other times, the DVL's noise is another one: in waves that repeat, that alone tells two places apart.
     """
-    if _gain(motion, one, closest) < GAIN:
+    is_read_elsewhere = abs(float(one.x[APART]) - float(closest.x[APART])) > ALIKE_S
+    enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
+    if _gain(motion, one, closest) < enough:
         return True
     if closest.rows > AS_MANY * one.rows:
         return False
@@ -363,7 +366,16 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
     if again is None:
         return False
     grown = again.cost(closest.level, again.at) - closest.cost(closest.level, again.at)
-    return 0.5 * grown * min(1.0, _independent(motion, again) / again.rows) < GAIN
+    return 0.5 * grown * min(1.0, _independent(motion, again) / again.rows) < enough
+
+
+def _by_chance(motion: MotionStreams, fitted: Fitted, dvl_noise: float) -> float:
+    """σ of the difference in log evidence of two places at which the DVL's noise is not the same."""
+    share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of what is left
+    # variance of (g + a)² - (g + b)², in squares of what is left: g the reference's noise, a and b the DVL's
+    each = 8.0 * share * (1.0 - share) + 4.0 * share**2
+    samples = fitted.rows * fitted.axes
+    return 0.5 * math.sqrt(each * samples) * min(1.0, _independent(motion, fitted) / fitted.rows)
 
 
 def _gain(motion: MotionStreams, one: Fitted, other: Fitted) -> float:

@@ -129,6 +129,37 @@ def test_a_straight_leg_at_one_speed_shows_no_clock():
         assert found.offsets == {} and found.contradiction(Parameters()) is None
 
 
+def leg_in_waves(seed: int) -> MotionStreams:
+    """A leg in time, in waves of two periods that repeat each other after 41 s, with a DVL as noisy as a reference."""
+    rng, times = np.random.default_rng(seed), np.arange(0.0, 380.0, 0.02)
+    first, second = 2.0 * np.pi / 6.0 * times, 2.0 * np.pi / 8.22 * times
+    phase = rng.uniform(0.0, 6.0, 6)
+    tilt = 0.007 * (np.sin(first[:, None] + phase[:2]) + 0.7 * np.sin(second[:, None] + phase[2:4]))
+    angles = np.column_stack([tilt, 0.4 * np.sin(times / 60.0) + 0.1 * np.sin(times / 17.0)])
+    heave = 0.05 * (np.sin(first + phase[4]) + 0.5 * np.sin(second + phase[5]))
+    body = np.column_stack([1.8 + 0.02 * np.cos(first + phase[4]), 0.015 * np.sin(second + phase[5]), heave])
+    attitudes = rotation_from_rpy(angles)
+    dvl, reference, imu = slice(10, None, 25), slice(3, None, 10), slice(0, None, 5)
+    v, g = body[dvl], np.einsum("nij,nj->ni", attitudes, body)[reference]
+    orientations = np.array([quaternion_from_rotation(each) for each in attitudes[imu]])
+    made = make_motion(
+        (times[dvl], v + rng.normal(0.0, 0.03, v.shape)),
+        (times[reference], g + rng.normal(0.0, 0.06, g.shape) * [1.0, 1.0, 1.5]),
+        True,
+        (True,) * 3,
+        ImuColumns(times[imu], orientations, np.gradient(angles, times, axis=0)[imu]),
+    )
+    assert made is not None
+    return made
+
+
+@pytest.mark.spread(2)
+@pytest.mark.parametrize("seed", [1, 11, 0, 5, 8])
+def test_waves_that_repeat_with_other_noise_are_no_clock(seed):
+    found = register(leg_in_waves(seed), np.eye(3), np.zeros(3))
+    assert found is not None and found.offsets == {} and found.not_told_apart is None
+
+
 def leg_in_moving_water(share: float, seed: int) -> MotionStreams:
     """A leg at about one speed, in time, whose DVL is on moving water over the last share of it."""
     times = np.arange(0.0, 400.0, 0.2)
