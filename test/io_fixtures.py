@@ -147,9 +147,9 @@ def steady_run(count: int, seed: int = 7) -> list[Sample]:
     return samples
 
 
-def live(bag: Path, parameters: Parameters) -> Calibrator:
+def live(bag: Path, parameters: Parameters, topics: Topics | None = None) -> Calibrator:
     """A calibrator as the node has one, after all of a bag."""
-    recording, topics = open_recording([bag]), Topics()
+    recording, topics = open_recording([bag]), topics or Topics()
     calibrator = Calibrator(parameters, worker=AtOnce())
     named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     for stretch in recording.stretches(named, MessageDecoder(parameters)):

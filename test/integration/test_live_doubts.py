@@ -8,13 +8,16 @@ from io_fixtures import live
 
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.files.mounting import load_calibrated_mounting
 from dvl_calib_ros.files.result_file import result_document, save_result
+from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.verdict.kinds import Severity
+from validation.surveys.physics import draw, write_survey
 
 # What both look for.
 LOOKED_FOR = {
@@ -57,3 +60,16 @@ def test_live_says_what_a_replay_says_and_what_it_saves_is_refused_as_well(effec
     assert bool(loaded.objections) == bool(rejects)
     assert all(each.says in " ".join((*loaded.objections, *loaded.doubts)) for each in result.doubts)
     np.testing.assert_allclose(result.estimate.state, replayed.result.estimate.state, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [36001, 36008, 36367, 34246])
+def test_of_random_surveys_what_a_replay_rejects_live_does_not_call_usable(seed, tmp_path):
+    write_survey(draw(seed), tmp_path / "bag")
+    recording = open_recording([tmp_path / "bag"])
+    found = discover(recording, Parameters())
+    named = recording.of_types(found.topics, found.parameters)
+    replayed = replay(recording, found.parameters, found.topics).result
+    lived = live(tmp_path / "bag", named, found.topics).result()
+    of_replay, of_live = (each.verifications[each.selected].verdict for each in (replayed, lived))
+    assert of_live is of_replay
