@@ -186,6 +186,7 @@ def _mirrored(
     if turned is None or given is None:
         return None
     gain = 3.0 * turned.rows * 2.0 * math.log(max(given.level, 1e-6) / max(turned.level, 1e-6))
+    gain /= max(given.inflation, turned.inflation) ** 2  # noise that lasts is that of fewer samples (survey 34211)
     return finding("DVL_LEFT_HANDED") if gain > CLEARLY + math.sqrt(6.0 * turned.rows) else None
 
 
