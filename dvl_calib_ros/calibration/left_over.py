@@ -10,7 +10,7 @@ And where it follows what the DVL's noise was before, the reference is a filter'
 of the DVL and r = s + m of an instrument of its own, r - d = m - n, and noise n that is new with each sample is not
 foretold by any d before it. A filter that keeps h of the noise makes r - d = m - n + h ∗ n, which is. The noise that
 was is what past d did not foretell of d (an autoregression). A smoothed reference lags the motion, and gives the other
-sign.
+sign. (Long, because all of it is asked of one fit.)
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from .parameters import Parameters
 from .results import Estimate
 from .robust import median, robust_std
 from .samples import Index
+from .told_arm import ARM
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
 TILT_S = 1.0, 15.0
@@ -49,6 +50,8 @@ QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
 # Known to no better than this (σ), it may as well be all of it.
 TILT_SHOWN = 0.2
+# A bias of the DVL (m/s) that has been seen, which the motion shows to no better than this (σ, of ahead or across).
+SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
 # A share from here on is no levelled velocity, but a sign.
 WRONG_SIGN_FROM = 1.6
 # An error of a mounting (rad) that is worth a word, and one that no answer is given beside.
@@ -69,8 +72,8 @@ FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
 FOLLOWED_BY_FILTER, FILTER_SHOWN = 2.4, 2.4
 # A filter lags by what it smooths over, within this factor; by less than this (s) so does anything.
 LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
-# A calibration with less than this to correct, rad for an angle and a share for a scale, or so many σ, finds nothing.
-NO_ANGLE, NO_SCALE, BY_CHANCE = math.radians(0.35), 0.005, 3.0
+# With less to correct than this (an angle in rad, a share of scale, an arm in m), or than so many σ, nothing is found.
+NO_ANGLE, NO_SCALE, NO_ARM_M, BY_CHANCE = math.radians(0.35), 0.005, 0.2, 3.0
 # ... and of it where a reference is positions: their window holds the motion on both sides of its middle, which looks a
 # little like it.
 FOLLOWED_BY_POSITIONS = 0.1
@@ -176,14 +179,19 @@ def left_over(
 
 
 def nil_lag(estimate: Estimate, parameters: Parameters) -> float:
-    """By what (s) the reference lags behind the DVL where a calibration finds nothing else to correct; else 0."""
+    """By what (s) the reference lags behind the DVL where a calibration finds nothing else to correct; else 0.
+
+    One that knows no two angles has found nothing either way, and a filter of the DVL shows no lever arm of its own.
+    """
     terms = MODELS[estimate.model].error_terms_from_state
     found = np.abs(terms @ estimate.state)
     std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
-    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, BY_CHANCE * std)).any():
+    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, BY_CHANCE * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
         return 0.0
-    own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True)).get("time_offset", 0.0)
-    return parameters.reference_time_offset - parameters.dvl_time_offset - own
+    arm, own = estimate.std_of(*ARM), dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
+    if arm is not None and (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, BY_CHANCE * arm)).any():
+        return 0.0
+    return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
 
 
 def left_over_advice(found: LeftOver | None, of_positions: bool = False, nil_lag_s: float = 0.0) -> list[Reason]:
@@ -229,6 +237,9 @@ def left_over_advice(found: LeftOver | None, of_positions: bool = False, nil_lag
         is_sure = bool((size > SURELY * found.bias_std)[shown].any())
         word = Severity.REJECT if turned > WRONG_FROM and is_sure else Severity.MARGINAL
         said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
+    elif float(found.bias_std[:2].max()) > BIAS_OPEN:
+        share = SEEN_BIAS / found.speed
+        said.append(finding("ONE_SPEED", off=SEEN_BIAS, degrees=math.degrees(share), percent=100.0 * share))
     return said
 
 

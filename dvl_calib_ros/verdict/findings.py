@@ -338,6 +338,13 @@ FINDINGS = (
         "look into the driver's settings, or record in waves or with dives",
     ),
     Kind(
+        "ONE_SPEED",
+        "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
+        "{degrees:.1f}° or {percent:.1f} %, which σ leaves out",
+        "A bias turns with the vehicle as a mounting does, and only another speed tells one from the other.",
+        "drive at two speeds, one twice the other",
+    ),
+    Kind(
         "DVL_BIAS",
         "the DVL is off by the same velocity at every speed, {axes} mm/s in the body: {degrees:.1f}° at the usual one",
         "A bias of the DVL's electronics, a rounding, or water that moves in its shell. At one speed nothing tells it "

@@ -113,6 +113,15 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
     assert selected.count("A1") >= 9
 
 
+@pytest.mark.parametrize("name", ["T05", "T13"])
+def test_an_ins_that_lags_half_a_second_is_no_filter_of_the_dvl(snapir_ins, tmp_path, name):
+    """T05 shows an arm of 1.6 m, and T13 no angle that could be off: neither has been found to have nothing wrong."""
+    files = (snapir_ins / f"{name}_{kind}.csv" for kind in ("dvl", "gnss", "attitude"))
+    import_recording(*files, tmp_path / name, ImportOptions(gnss_frame="ned", dvl_std=0.01, gnss_std=0.01))
+    result = checked_replay([tmp_path / name], Parameters()).result
+    assert result.verifications[result.selected].verdict.value == "accept"
+
+
 @pytest.mark.slow
 def test_three_recordings_together_are_accepted_with_one_lever_arm_and_a_delay_for_each(snapir_ins, tmp_path):
     """Their clocks are 0.9 s apart from day to day; one delay for all was rejected."""
