@@ -243,6 +243,7 @@ def test_a_command_that_is_ended_half_way_leaves_no_half_of_a_bag(tmp_path, numb
     assert process.returncode in (130, -signal.SIGINT) and os.listdir(tmp_path) == []
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
 def test_a_port_that_is_open_and_is_no_scheduler_is_said_within_ten_seconds(bag, tmp_path, capsys, answer):
     pytest.importorskip("distributed", reason="Dask is optional: pip install distributed")

@@ -55,6 +55,7 @@ def test_a_reference_whose_clock_moves_is_named_by_all_and_not_accepted(moves, w
     assert words in replayed and "reject" in replayed.lower()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("moves", "words"),
     [

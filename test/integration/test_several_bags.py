@@ -74,6 +74,7 @@ def test_who_asks_to_merge_gets_it_with_a_note(place):
     assert any(note.startswith("merged as asked: the mounting differs by") for note in run.replayed.notes)
 
 
+@pytest.mark.slow
 def test_a_reference_in_a_bag_of_its_own_belongs_to_the_recording_of_its_time(tmp_path):
     bags = [
         recorded(tmp_path / "dvl0", 0, 2.0, "di"), recorded(tmp_path / "gnss0", 0, 2.0, "g"),

@@ -25,6 +25,7 @@ def world(monkeypatch):
     world.close()
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
 def test_what_is_on_the_topics_is_found_and_looked_at(world, tmp_path, capsys, reliability):
     bag = write_bag(tmp_path / "bag", run(60.0))

@@ -100,6 +100,7 @@ def test_parameter_files_are_found_where_rcl_looks_for_them():
 # ---------------------------------------------------------------- the node
 
 
+@pytest.mark.slow
 def test_an_interrupt_under_data_cuts_no_sample_short_so_the_saved_result_is_a_replay_of_what_was_received(
     world, tmp_path
 ):

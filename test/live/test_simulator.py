@@ -226,6 +226,7 @@ def test_two_sensors_on_one_topic_are_refused_at_the_start_of_the_node(world, mo
     assert "name another" in refused_at_start(capfd, "-r", "dvl/twist:=/x", "-r", "imu/data:=/x")
 
 
+@pytest.mark.slow
 def test_another_type_of_the_dvls_messages_can_be_had(world):
     options = ["--trajectory", "box", "--duration", "5", "--speed", "5", "--wait"]
     with simulator(world, *options, "--dvl-type", "geometry_msgs/msg/TwistStamped", ends_by_itself=True) as process:

@@ -267,6 +267,7 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
         assert node.poll() is None
 
 
+@pytest.mark.slow
 def test_of_two_nodes_the_one_is_shown_that_was_named(world):
     """The other, in a namespace, is heard on the same /diagnostics and has another model."""
     with world.calibration_node("model:=A1"):

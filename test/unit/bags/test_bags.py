@@ -57,6 +57,7 @@ def expected(plain) -> dict:
     return estimates(plain)
 
 
+@pytest.mark.spread(3)
 @pytest.mark.parametrize(("storage", "compression"), KINDS)
 def test_every_storage_and_compression_gives_the_same_estimates(tmp_path, expected, storage, compression):
     assert estimates(write_bag(tmp_path / "bag", run(), storage, compression)) == expected

@@ -83,6 +83,7 @@ def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_i
     assert [each.name for each in compared.effects if each.status.is_claim] == ["lever_arm"]
 
 
+@pytest.mark.slow
 def test_adding_the_missing_effect_shrinks_error_and_distance_on_held_out_stretches(compared):
     rungs = {rung.name: rung for rung in compared.rungs}
     assert list(rungs) == [AS_IT_IS, "with lever_arm", NOISE]
