@@ -179,10 +179,12 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
         what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
         found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
+    told_by_log = any(each.code == "DOCTOR_CLOCKS" for each in found)  # whose clock it is, and by how much
     without = None if discovery.clocks is None else discovery.clocks.doubt  # no calibration can be done with that
     found += [
         finding("DOCTOR_FRAMES", says=doubt).weighed(Severity.ERROR if doubt == without else Severity.WARNING)
         for doubt in discovery.contradictions
+        if not (told_by_log and doubt.code == "CLOCKS_NOT_TOLD_APART")
     ]
     parameters = discovery.parameters
     speed = np.linalg.norm(velocity, axis=1)
