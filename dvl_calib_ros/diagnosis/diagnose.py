@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -51,6 +52,9 @@ MATERIAL = 0.2
 WORTH_TELLING = 0.3
 # A DVL whose z axis is as near to the vehicle's measures roll and pitch about the other two
 UPRIGHT = 0.98
+# ... and one that tilts at this (rad/s, rms) moves a DVL half a metre below by a centimetre a second: a boat at 0.2°/s
+# shows nothing of that, an AUV at sea at 1.8°/s does.
+TILTING_RADPS = math.radians(1.0)
 Triple = tuple[float, float, float]
 
 
@@ -163,7 +167,17 @@ def _shown_part(effect: Effect, recordings: Sequence[RecordedStreams], parameter
     is_upright = abs(parameters.rotation_dvl_from_body[2, 2]) > UPRIGHT
     if not effect.vertical or any(recording.measured[2] for recording in recordings) or not is_upright:
         return effect
+    if effect.name == ARM and any(_tilts(recording) for recording in recordings):
+        return effect
     return effect.without(effect.vertical)
+
+
+def _tilts(recording: RecordedStreams) -> bool:
+    """Whether a vehicle rolls and pitches so fast that a height of the DVL moves it to and fro."""
+    if EffectNeeds.ANGULAR_VELOCITY not in recording.available:
+        return False
+    rates = recording.angular_velocity(recording.dvl.time)[:, :2]
+    return float(np.sqrt(np.nanmean((rates**2).sum(axis=1)))) > TILTING_RADPS
 
 
 def _compared_axes(selection: EffectSelection) -> str:

@@ -38,7 +38,7 @@ class Card:
         self._driven_s = dict.fromkeys(SECTORS, 0.0)
         self._squares, self._looks = 0.0, 0
         self._outlook: Outlook | None = None
-        self._thought_s = -math.inf
+        self._was_good, self._thought_s = False, -math.inf
 
     def values(
         self,
@@ -79,7 +79,10 @@ class Card:
             if motion.heading is not None and self._received[-1][0] == self._came_s.get("dvl"):
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
                 self._driven_s[SECTORS[sector]] += now_s - (self._received[-2][0] if len(self._received) > 1 else now_s)
-        if now_s - self._thought_s >= THOUGHT_OF_EVERY_S or self._outlook is None:
+        drift = predicted_drift(model, estimate.recording_covariance, parameters)
+        is_good = drift.both <= parameters.target_drift
+        if now_s - self._thought_s >= THOUGHT_OF_EVERY_S or self._outlook is None or is_good is not self._was_good:
+            self._was_good = is_good  # the bars and what is next say the same
             self._thought_s = now_s
             first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
             seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
@@ -90,7 +93,6 @@ class Card:
                 moving = moving._replace(speed=max(moving.speed, math.sqrt(self._squares / max(self._looks, 1))))
             self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
         found = Outlook(finding("NEXT_REJECTED"), None) if rejected else self._outlook
-        drift = predicted_drift(model, estimate.recording_covariance, parameters)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
             "side": _done(drift.side, unknown[0], parameters.target_drift / math.sqrt(2.0)),

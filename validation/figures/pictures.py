@@ -116,20 +116,24 @@ def watch(folder: Path) -> None:
     from dvl_calib_ros.calibration.parameters import Parameters
     from dvl_calib_ros.cli.live_view import rendered
     from dvl_calib_ros.messages.feed import MessageFeed
+    from dvl_calib_ros.node.card import Card
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
     from dvl_calib_ros.node.status import Status
 
     calibrator = Calibrator(Parameters())
     feed = MessageFeed(calibrator, print)
     handlers = {"dvl/twist": feed.dvl, "gnss/twist": feed.reference, "imu/data": feed.imu}
+    silence, recent, card, now_s = Silence(0.0, {}), RecentCounts(), Card(0.0), 0.0
     with BagReader([ROOT / HARBOUR_BOX]) as bag:
         first_ns = None
         for topic, log_ns, message, _ in bag.messages(handlers):
             first_ns = first_ns or log_ns
-            if log_ns - first_ns > 250e9:
-                break
             handlers[topic](message, log_ns)
-    found = diagnose(calibrator, feed.decoder.dvl_type, [], Silence(0.0, {}), RecentCounts(), 0.0)
+            if log_ns - first_ns > 1e9 * (now_s + 1.0):
+                now_s += 1.0
+                found = diagnose(calibrator, feed.decoder.dvl_type, [], silence, recent, now_s, card=card)
+            if now_s == 250.0:
+                break
     values = {item.key: item.value for item in found.values}
     shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
     terminal(shown, folder, "watch", "dvl-calib run --watch", 100)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from runs import MatchedRun, calibrate, make_samples
@@ -71,6 +72,16 @@ def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
     for second in range(11):
         values(card, calibrator, counts(second), float(second))
     assert len(calls) == 1 + 10 // THOUGHT_OF_EVERY_S
+
+
+def test_bars_that_are_full_and_what_to_drive_next_say_the_same_at_once():
+    card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="G1"))
+    estimate = calibrator.estimate()
+    coarse = replace(estimate, recording_covariance=1e4 * estimate.recording_covariance)
+    assert "GOOD" not in card.values(calibrator, coarse, counts(9), 1.0)["next code"]
+    fine = replace(estimate, recording_covariance=1e-4 * estimate.recording_covariance)
+    said = card.values(calibrator, fine, counts(9), 2.0)
+    assert said["goal worth [%]"] == "100" and said["next code"] == "NEXT_IS_GOOD"
 
 
 def test_a_standing_vehicle_drives_no_heading():
