@@ -182,10 +182,19 @@ def test_a_horizontal_reference_gives_the_same_answer_and_its_vertical_is_not_co
     assert_within(level, "lever_arm", x_m=-1.9, y_m=0.4)
     assert_within(level, "dvl_time_offset", seconds=0.7)
     assert level.gap.after == pytest.approx(np.sqrt(2.0) * 0.02, rel=0.15)
-    # a height was claimed of a boat, and a mounting moved by 8° of roll
-    assert {*found(whole)["lever_arm"]} == {"x_m", "y_m", "z_m"}
-    assert {*found(level)["lever_arm"]} == {"x_m", "y_m"}
+    # a height was claimed of a boat that does not tilt, as this vehicle does, and a mounting moved by 8° of roll
+    assert {*found(whole)["lever_arm"]} == {*found(level)["lever_arm"]} == {"x_m", "y_m", "z_m"}
+    still = [each._replace(orientation=turned(each), angular_velocity=(0.0, 0.0, 0.1)) for each in run.imu]
+    boat = diagnose_recordings([recording_of(Run(run.dvl, flat, still))], Parameters())
+    assert all({*values} <= {"x_m", "y_m"} for name, values in found(boat).items() if name == "lever_arm")
+    assert {*boat.minimum_detectable["lever_arm"]} == {"x_m", "y_m"}
     assert {*level.minimum_detectable["mount_flexure"]} == {"z_rad_per_mps"}
+
+
+def turned(sample):
+    """The orientation of a vehicle that only turns."""
+    _, _, z, w = sample.orientation
+    return (0.0, 0.0, z / np.hypot(z, w), w / np.hypot(z, w))
 
 
 def replace_velocity(sample, velocity):
