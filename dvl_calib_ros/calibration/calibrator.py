@@ -21,9 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..verdict.kinds import Severity
-from ..verdict.reasons import Reason, finding
+from ..verdict.reasons import Reason
 from . import told_arm
-from .advice import one_heading_advice
 from .alignment import Aligner
 from .assembly import nis_bounds
 from .bank import Group, groups_of
@@ -31,22 +30,20 @@ from .days import day_covariance, offset_covariance
 from .delay.clocks import Rest
 from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 from .delay.workers import Worker
+from .doubts import doubts
 from .error_model import correction_matrix
 from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
 from .folds import folds_of
 from .frames import Array, Vector, rotation_from_quaternion
-from .heading_deviation import comes_first, heading_advice
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
-from .left_over import left_over_advice, nil_lag
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
 from .navigation import Navigation, dead_reckoned, objections
 from .observability import MEASURES_VERTICAL, convergence, observability
 from .observations import Observations
 from .observe import Observer
 from .parameters import IAC, ParameterError, Parameters
-from .positions import are_positions
 from .register.registration import Registration
 from .results import Day, Estimate, Result
 from .samples import (
@@ -745,25 +742,20 @@ class Calibrator:
 
         fresh: by a look at all there is, for which a result waits; else by one that the worker took a little ago.
         """
-        suggested = self.suggestion if fresh else self.suggestion_so_far
-        found = [finding("IMU_LEVEL")] if fresh and self.is_level else []
-        if not suggested:  # which would be why the arm is another
-            finding_it = {name: self.estimate(name) for name in self._models if told_arm.finds_arm(MODELS[name])}
-            told = told_arm.told_arm_advice(finding_it, self.parameters)
-            found += [each.weighed(Severity.MARGINAL) for each in told]
-        rest = self._rest(fresh=fresh)
+        of = self._without_tilt if fresh else _as_it_is
+        suggested, rest = self.suggestion if fresh else self.suggestion_so_far, self._rest(fresh=fresh)
         navigation = None if rest is None else rest.navigation
-        if rest is None or navigation is None:
+        found = doubts(
+            of(self.estimate()),
+            (of(self.estimate(name)) for name in self._models if told_arm.finds_arm(MODELS[name])),
+            navigation,
+            self.parameters,
+            suggested=suggested is not None,
+            in_earth=rest is not None and rest.in_earth,
+            is_level=fresh and self.is_level,
+        )
+        if navigation is None:
             return found
-        estimate = self.estimate()
-        if navigation.deviation is not None:
-            is_first = comes_first(navigation.deviation, estimate)
-            advice = heading_advice(navigation.deviation)
-            found += [each.weighed(Severity.REJECT) if is_first else each for each in advice]
-        if rest.in_earth:
-            found += one_heading_advice(estimate, self.parameters, navigation.speed)
-        lag_s = nil_lag(estimate, self.parameters)
-        found += left_over_advice(navigation.followed, are_positions(self.parameters), lag_s)
         held_out = self._verified_so_far(fresh=fresh).reasons
         return [*found, *objections(navigation), *(each for each in held_out if each.code in JUDGED_LIVE)]
 
@@ -843,6 +835,10 @@ class Calibrator:
     def suggestion_so_far(self) -> Reason | None:
         """`suggestion`, live: what a look that is not made anew for every message says."""
         return next((each.suggestion_so_far for each in self._further if each.suggestion_so_far), None)
+
+
+def _as_it_is(estimate: Estimate) -> Estimate:
+    return estimate
 
 
 def _own(block: AlignedBlock) -> AlignedBlock:

@@ -7,7 +7,7 @@ a DVL in the earth's frame, turn rates of the wrong sign or unit, a late IMU, an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,9 +50,9 @@ def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> 
     return np.asarray(away > np.maximum(SIGMAS * std, MEASURED_TO))
 
 
-def told_arm_advice(estimates: Mapping[str, Estimate], parameters: Parameters) -> list[Reason]:
-    """Whether the lever arm that was told is another than the one that the data show."""
-    estimate = next((each for each in estimates.values() if each.used and finds_arm(MODELS[each.model])), None)
+def told_arm_advice(estimates: Iterable[Estimate], parameters: Parameters) -> list[Reason]:
+    """Whether the lever arm that was told is another than the one that the first estimate shows that finds it."""
+    estimate = next((each for each in estimates if each.used and finds_arm(MODELS[each.model])), None)
     if estimate is None:
         return []
     # a late clock, which at one speed explains as much, is one of the causes

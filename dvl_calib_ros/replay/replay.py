@@ -12,23 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.advice import data_advice, gate_advice, message_advice, one_heading_advice, reference_advice
+from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
+from ..calibration.doubts import doubts
 from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
-from ..calibration.heading_deviation import comes_first, heading_advice
 from ..calibration.kalman import GaussianState
-from ..calibration.left_over import left_over_advice, nil_lag
 from ..calibration.models import MODELS
 from ..calibration.navigation import Navigation, objections
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
-from ..calibration.positions import are_positions
 from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
-from ..calibration.told_arm import told_arm_advice
 from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
@@ -128,37 +125,29 @@ def replay(
     result = calibrator.result()
     result = replace(result, days=_named(result.days, recording))
     found += _warnings(result, topics, decoder)
-    found += [finding("IMU_LEVEL")] if calibrator.is_level else []
-    # a configuration that is wrong, such as a late reference, is why the arm is another
-    told = [] if result.suggestion else told_arm_advice(result.estimates, calibrator.parameters)
-    found += told
     history = recorder.history(calibrator, result.estimates) if recorder else None
     navigation = calibrator.navigation(result.selected) if judged else None
-    if navigation is not None:
-        deviates = heading_advice(navigation.deviation)
-        found += deviates
-        if decoder.frame_of_reference is not VelocityFrame.BODY:
-            found += one_heading_advice(result.estimate, calibrator.parameters, navigation.speed)
-    left = []
-    if navigation is not None:
-        lag_s = nil_lag(result.estimate, calibrator.parameters)
-        left = left_over_advice(navigation.followed, are_positions(of_types), lag_s)
-    found += [each.weighed(Severity.WARNING) for each in left]
+    against = doubts(
+        result.estimate,
+        result.estimates.values(),
+        navigation,
+        calibrator.parameters,
+        suggested=result.suggestion is not None,
+        in_earth=decoder.frame_of_reference is not VelocityFrame.BODY,
+        is_level=calibrator.is_level,
+    )
+    found += [each.weighed(Severity.WARNING) for each in against]
     of_drift = objections(navigation)
     # where the data show how the clocks stand, it does not matter when messages arrived
     of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
-    of_clocks += [each.weighed(Severity.MARGINAL) for each in told]
-    of_clocks += [each for each in left if each.severity is not Severity.WARNING]
-    deviation = navigation.deviation if navigation is not None else None
-    if deviation is not None and comes_first(deviation, result.estimate):
-        of_clocks += [each.weighed(Severity.REJECT) for each in deviates]
+    of_all = of_clocks + [each for each in against if each.severity is not Severity.WARNING]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
-        of_clocks += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
+        of_all += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
     return Replayed(
         replace(
             result,
             verifications={
-                name: verification.with_objections([*of_clocks, *(of_drift if name == result.selected else [])])
+                name: verification.with_objections([*of_all, *(of_drift if name == result.selected else [])])
                 for name, verification in result.verifications.items()
             },
         ),
