@@ -15,6 +15,7 @@ from dvl_calib_ros.errors import InputError
 PROGRAM = "python -m validation"
 # name: what it does. Each is a module of this package with `main(argv) -> int`, imported when it is asked for
 COMMANDS = {
+    "combinations": "one thing at a time that recordings have, drawn at random on physics not ours: as surveys",
     "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
     "late_clocks": "late references and late DVLs: that doctor, replay and diagnose name one cause, by its size",
     "mutants": "faults put into ten rules, each of which the tests must see",
@@ -31,7 +32,7 @@ def main(argv: Sequence[str]) -> int:
     if not argv or argv[0] in ("-h", "--help"):
         print(f"usage: {PROGRAM} COMMAND ...\n\n{(__doc__ or '').strip()}\n")
         for name, what in COMMANDS.items():
-            print(f"  {name:<8}  {what}")
+            print(f"  {name:<12}  {what}")
         return 0 if argv else 2
     name, *rest = argv
     try:

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from validation import mutants, repeat, surveys
+import dvl_calib_ros as dc
+from validation import combinations, mutants, repeat, surveys
 from validation.__main__ import COMMANDS, main
+from validation.combinations.recordings import physics_path, write_combination
+from validation.drawn import share
 from validation.stacks import mounting_errors
 
 
@@ -18,7 +21,7 @@ def test_every_command_is_listed_and_there(capsys):
     assert main(["--help"]) == 0
     listed = capsys.readouterr().out
     for name, what in COMMANDS.items():
-        assert f"  {name:<8}  {what}\n" in listed
+        assert f"  {name:<12}  {what}\n" in listed
         assert callable(importlib.import_module(f"validation.{name}").main)
 
 
@@ -84,9 +87,10 @@ def test_a_mutant_that_survives_is_said_by_the_exit_code_and_the_copy_alone_is_c
     assert (ROOT / path).read_text() == before
 
 
-def test_stacks_without_the_shared_folder_are_skipped_with_a_reason(monkeypatch, tmp_path, capsys):
+@pytest.mark.parametrize("command", ["stacks", "combinations"])
+def test_without_the_shared_folder_it_is_skipped_with_a_reason(monkeypatch, tmp_path, capsys, command):
     monkeypatch.setenv("DVL_CALIB_SHARED", str(tmp_path))
-    assert main(["stacks"]) == 0
+    assert main([command]) == 0
     assert "skipped" in capsys.readouterr().out
 
 
@@ -105,7 +109,7 @@ def test_the_judge_of_stacks_sees_an_angle_a_position_and_a_delay_that_are_wrong
 
 
 def test_a_survey_is_the_same_for_a_seed_and_its_judge_sees_what_is_wrong(tmp_path):
-    drawn = surveys.draw(7)
+    drawn, judge = surveys.draw(7), surveys.SURVEYS
     assert drawn == surveys.draw(7) != surveys.draw(8)
     truth = surveys.write_survey(drawn, tmp_path / "bag")
     assert (tmp_path / "bag" / "metadata.yaml").exists()
@@ -117,11 +121,34 @@ def test_a_survey_is_the_same_for_a_seed_and_its_judge_sees_what_is_wrong(tmp_pa
         "model": "G1",
         "off_deg": [9.0, 0.6, 0.4],
         "std_deg": [0.1] * 3,
+        "asked": False,
     }
     yaw = {**right, "verdict": "accept", "off_deg": [0.0, 0.0, 0.6]}
     pitch = {**right, "verdict": "marginal", "off_deg": [0.0, 0.8, 0.0]}
     unsure = {**yaw, "std_deg": [0.1, 0.1, 0.3]}
-    assert [surveys.is_wrong(each) for each in (right, yaw, pitch, unsure)] == [False, True, True, False]
-    said = surveys.summary([right, yaw, pitch, unsure])
-    assert said[0].startswith("usable and wrong: 2 of 3") and said[1].startswith("rejected though right: 1 of 4")
-    assert surveys.share(0, 0) == "0 of 0" and "bounds 0.0 to 3.6" in surveys.share(0, 100)
+    assert [judge.is_wrong(each) for each in (right, yaw, pitch, unsure)] == [False, True, True, False]
+    said = judge.summary([right, {**right, "asked": True}, yaw, pitch, unsure])
+    assert said[0].startswith("usable and wrong: 2 of 3") and said[1].startswith("rejected though right: 1 of 5")
+    assert "; 1 more as asked: they are mounted 5° or more beside what was told" in said[1]
+    assert any(line.startswith("  wrong 7: ") and "yaw +0.60 ± 0.10" in line and "roll" not in line for line in said)
+    assert share(0, 0) == "0 of 0" and "bounds 0.0 to 3.6" in share(0, 100)
+
+
+def test_the_judge_of_combinations_sees_a_scale_and_a_roll_that_are_wrong():
+    judge, right = combinations.COMBINATIONS, {"off_deg": [0.4, 0.0, 0.6, 0.4], "std_deg": [0.1, 0.1, 0.3, 0.1]}
+    assert not judge.is_wrong(right) and not judge.is_wrong({**right, "off_deg": [0.0] * 3})
+    assert judge.is_wrong({**right, "off_deg": [0.0, 0.0, 0.0, 0.6]}) and judge.is_wrong(
+        {**right, "off_deg": [0.6, 0, 0]}
+    )
+
+
+@pytest.mark.skipif(not physics_path().exists(), reason="cases/traps is not in the shared folder")
+@pytest.mark.slow
+def test_a_combination_is_the_same_for_a_seed_and_its_truth_is_what_replay_finds(tmp_path):
+    """Nothing is wrong with it."""
+    truth = write_combination(14, tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    assert run.verdict == "accept" and truth["drawn"]["defect"] == "none"
+    found = np.append(np.subtract(run.mounting.rpy_deg, truth["rpy_deg"]), run.mounting.scale_percent - truth["scale"])
+    assert np.abs(found / [*run.mounting.std_deg, run.mounting.scale_std_percent]).max() < 3.0
+    assert truth == write_combination(14, tmp_path / "again")

@@ -233,11 +233,12 @@ class Bag:
 
 
 def write_survey(drawn: Drawn, path: Path) -> dict[str, Any]:
-    """Write the bag of a survey; returns its truth (rpy in degrees, what was drawn)."""
+    """Write the bag of a survey; returns its truth: rpy, its angle from what was meant, what was drawn."""
     rng = np.random.default_rng([drawn.seed, 1])
     motion, bag = motion_of(drawn, rng), Bag()
     nominal = Rotation.from_euler("z", drawn.mounting_yaw, degrees=True)
-    mounted = nominal * Rotation.from_euler("xyz", drawn.off_rpy, degrees=True)
+    off = Rotation.from_euler("xyz", drawn.off_rpy, degrees=True)
+    mounted = nominal * off
     _write_dvl(drawn, motion, mounted, bag, rng)
     _write_reference(drawn, motion, bag, rng)
     _write_imu(drawn, motion, bag, rng)
@@ -250,7 +251,8 @@ def write_survey(drawn: Drawn, path: Path) -> dict[str, Any]:
         ]  # fmt: skip
         bag.add(0.0, "/tf_static", TF, bag.new(TF, transforms))
     bag.write(path)
-    return {"rpy_deg": mounted.as_euler("xyz", degrees=True).tolist(), "drawn": asdict(drawn)}
+    rpy_deg = mounted.as_euler("xyz", degrees=True).tolist()
+    return {"rpy_deg": rpy_deg, "misalignment_deg": float(np.degrees(off.magnitude())), "drawn": asdict(drawn)}
 
 
 def _write_dvl(drawn: Drawn, motion: Motion, mounted: Rotation, bag: Bag, rng: np.random.Generator) -> None:
