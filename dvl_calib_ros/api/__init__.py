@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ..evaluation.results import Evaluation
     from ..export.simulator import Export
     from ..files.applying import Applied
+    from ..files.instruments import InstrumentSettings
     from ..files.trajectories import Imported
     from ..unpaired.results import UnpairedComparison
 
@@ -55,6 +56,7 @@ __all__ = [
     "evaluate",
     "export",
     "import_files",
+    "instrument_settings",
     "replay",
     "report",
     "salvage",
@@ -457,6 +459,7 @@ def apply(
     launch: StrPath | None = None,
     fusion: StrPath | None = None,
     force: bool = False,
+    dry_run: bool = False,
 ) -> Applied:
     """Write a saved calibration into the files that a vehicle is configured by, as ``dvl-calib apply``.
 
@@ -478,6 +481,8 @@ def apply(
         Parameter file of the node, launch file with a static transform, parameters of robot_localization.
     force
         Also what is rejected, not converged, or of another mounting.
+    dry_run
+        Write nothing; ``changes`` is what would change.
 
     Returns
     -------
@@ -493,7 +498,40 @@ def apply(
     from ..files.mounting import load_calibrated_mounting
 
     targets = Targets(_path(urdf), _path(output), joint, keep_position, _path(params), _path(launch), _path(fusion))
-    return write_calibration(load_calibrated_mounting(Path(result)), targets, force)
+    return write_calibration(load_calibrated_mounting(Path(result)), targets, force, dry_run)
+
+
+def instrument_settings(
+    result: StrPath, instrument: str, now: Mapping[str, float] | None = None, *, force: bool = False
+) -> InstrumentSettings:
+    """What to set in the instrument itself for its data to come out corrected, as ``dvl-calib apply --instrument``.
+
+    Parameters
+    ----------
+    result
+        Result file, as `Calibration.save` writes it.
+    instrument
+        ``"waterlinked"``, ``"cerulean"`` or ``"ardupilot"``.
+    now
+        What it was set to when the data were recorded, by the setting's name; else as it is delivered.
+    force
+        Also of a calibration that is rejected or not converged.
+
+    Returns
+    -------
+    InstrumentSettings
+        Each setting with old and new value, the ``text`` to type or load, the ``document`` that it follows, and in
+        ``notes`` what the instrument cannot be told.
+
+    Raises
+    ------
+    InputError
+        For another instrument or setting, what it cannot be set to, or what must not be applied.
+    """
+    from ..files.instruments import instrument_settings as settings_of
+    from ..files.mounting import load_calibrated_mounting
+
+    return settings_of(load_calibrated_mounting(Path(result)), instrument, now, force)
 
 
 def export(simulator: str, source: StrPath, output: StrPath) -> Export:

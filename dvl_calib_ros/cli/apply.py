@@ -1,6 +1,7 @@
-"""Write a saved calibration into URDF, parameters, static transform or robot_localization. Without options, show it.
+"""Write a saved calibration into URDF, parameters, static transform, robot_localization or the instrument itself.
 
-Every file is replaced whole and the one before kept as .bak; the same line with --rollback brings that back.
+Without options, show it. Every file is replaced whole and the one before kept as .bak; the same line with --rollback
+brings that back. Nothing is sent to an instrument without --send.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
+    from ..files.instruments import InstrumentSettings
     from ..files.mounting import CalibratedMounting
 
 
@@ -31,6 +33,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--launch", type=Path, metavar="FILE", help="write a launch file (XML) with a static transform")
     parser.add_argument("--fusion", type=Path, metavar="FILE", help="write parameters for robot_localization (YAML)")
     parser.add_argument(
+        "--instrument",
+        metavar="NAME",
+        help="show the settings of the instrument itself instead: waterlinked, cerulean or ardupilot",
+    )
+    parser.add_argument(
+        "--now",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="what the instrument was set to when the data were recorded; repeatable",
+    )
+    parser.add_argument("--settings", type=Path, metavar="FILE", help="write the instrument's settings to this file")
+    parser.add_argument("--send", metavar="HOST", help="send them to the instrument (waterlinked), and read them back")
+    parser.add_argument("--dry-run", action="store_true", help="show old and new, write and send nothing")
+    parser.add_argument(
         "--force", action="store_true", help="apply a result that is rejected, not converged, or of another mounting"
     )
     parser.add_argument(
@@ -45,7 +62,15 @@ def run(arguments: argparse.Namespace) -> None:
 
     names = ("urdf", "output", "joint", "keep_position", "params", "launch", "fusion")
     targets = Targets(**{name: getattr(arguments, name) for name in names})
-    common.check_outputs(arguments, "urdf" if arguments.output is None else "output", "params", "launch", "fusion")
+    written = "urdf" if arguments.output is None else "output"
+    common.check_outputs(arguments, written, "params", "launch", "fusion", "settings")
+    if arguments.instrument is None and (arguments.now or arguments.settings or arguments.send):
+        raise InputError("--now, --settings and --send go with --instrument; name that, too")
+    if arguments.instrument is not None and (targets.paths or arguments.rollback):
+        raise InputError(
+            "--instrument takes the error out where it is made; with --urdf, --params, --launch or --fusion the DVL "
+            "would be turned twice: give one of them"
+        )
     if arguments.rollback:
         for path, kept in roll_back(targets).items():
             print(f"{path}: as before; what it was is now {kept.name}")
@@ -55,13 +80,58 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.mounting import load_calibrated_mounting
 
     calibrated = load_calibrated_mounting(arguments.result)
-    applied = write_calibration(calibrated, targets, arguments.force)
+    if arguments.instrument is not None:
+        _set(calibrated, arguments)
+        return
+    applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
     for note in applied.notes:
         print(f"note: {note}")
     _print(calibrated, arguments)
+    if arguments.dry_run:
+        print(applied.changes or "nothing would change", end="" if applied.changes else "\n")
+        return
     for path in targets.paths:
         before = f"; the one before is {applied.kept[path].name}" if path in applied.kept else ""
         print(f"{path}: written{before}" if path in applied.written else f"{path}: is so already")
+
+
+def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
+    """Show an instrument's settings; write, and send them, where that is wanted."""
+    from ..disk.atomic import save_bytes
+    from ..errors import InputError
+    from ..files.instruments import instrument_settings, told_settings
+    from ..files.water_linked import configure
+
+    now = told_settings(arguments.now)
+    chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
+    untold = [each.name for each in chosen.settings if each.name not in now]
+    if arguments.send and (arguments.instrument != "waterlinked" or untold):
+        raise InputError(
+            "--send is for waterlinked, and needs to know what it was set to when the data were recorded: "
+            + " ".join(f"--now {name}=..." for name in untold or ("mounting_rotation_offset",))
+        )
+    _print_settings(chosen, calibrated, arguments)
+    if arguments.settings and not arguments.dry_run:
+        save_bytes(arguments.settings, chosen.text.encode())
+        print(f"{arguments.settings}: written")
+    if arguments.send:
+        is_so = configure(arguments.send, chosen.settings, arguments.dry_run)
+        done = "would be set" if arguments.dry_run else "set, and read back"
+        print(f"{arguments.send}: {'is so already' if is_so else done}")
+
+
+def _print_settings(chosen: InstrumentSettings, calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
+    from rich.markup import escape
+
+    errors, out = common.console(stderr=True), common.console()
+    for sentence in (*calibrated.objections, *calibrated.doubts):
+        errors.print(f"[yellow]warning:[/] {arguments.result}: {escape(sentence)}", soft_wrap=True)
+    out.print(escape(f"{chosen.instrument}, by: {chosen.document}"), soft_wrap=True)
+    for setting in chosen.settings:
+        out.print(escape(f"  {setting}"), soft_wrap=True)
+    out.print(escape(chosen.text.rstrip("\n")), soft_wrap=True)
+    for note in chosen.notes:
+        out.print(escape(f"note: {note}"), soft_wrap=True)
 
 
 def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:

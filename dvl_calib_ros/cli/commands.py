@@ -51,7 +51,7 @@ COMMANDS = (
     Command("salvage", "recover damaged recordings into a new bag", "dvl-calib salvage cut_off_bag -o whole_bag"),
     Command(
         "apply",
-        "write a saved calibration into URDF, parameters, TF or robot_localization, or take it back",
+        "write a saved calibration into URDF, parameters, TF, robot_localization or the instrument, or take it back",
         "dvl-calib apply calibration.yaml --urdf robot.urdf --launch dvl_tf.launch.xml --fusion dvl_ekf.yaml",
     ),
     Command(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..disk.atomic import backup_of, own_stream, save_all
-from ..errors import InputError
+from ..errors import InputError, printable
 from .mounting import CalibratedMounting, calibrated_parameters, calibrated_urdf, fusion_file, launch_file
 from .urdf import read_urdf
 
@@ -45,29 +46,45 @@ class Targets:
 class Applied:
     """What became of the files.
 
-    written: those that are new or changed. unchanged: those that were so already. kept: of each that was there, where
-    the one before is. notes: in sentences, what whoever uses them should know.
+    written: those that are new or changed, or would be. unchanged: those that were so already. kept: of each that was
+    there, where the one before is. notes: in sentences, what whoever uses them should know. changes: of a dry run what
+    would change, as a unified diff.
     """
 
     written: tuple[Path, ...]
     unchanged: tuple[Path, ...]
     kept: dict[Path, Path]
     notes: tuple[str, ...]
+    changes: str = ""
 
 
-def write_calibration(calibrated: CalibratedMounting, targets: Targets, force: bool = False) -> Applied:
+def write_calibration(
+    calibrated: CalibratedMounting, targets: Targets, force: bool = False, dry_run: bool = False
+) -> Applied:
     """Write a calibration into all files, or into none. Each one before is kept beside it.
 
-    force: also what is rejected, not converged, or of another mounting. Raises InputError.
+    force: also what is rejected, not converged, or of another mounting. dry_run: write nothing, say what would change.
+    Raises InputError.
     """
     if targets.paths and calibrated.objections and not force:
         raise InputError(f"{calibrated.path}: {'; '.join(calibrated.objections)}; to apply it all the same: --force")
     contents, notes = _contents(calibrated, targets, force)
     there = [path for path in contents if own_stream(path) is None and path.exists()]
     new = {path: content for path, content in contents.items() if path not in there or path.read_bytes() != content}
+    unchanged = tuple(path for path in contents if path not in new)
+    if dry_run:
+        before = {path: path.read_bytes() if path in there else b"" for path in new}
+        changes = "".join(_difference(path, before[path], content) for path, content in new.items())
+        return Applied(tuple(new), unchanged, {}, tuple(notes), changes)
     save_all(new)  # a URDF that is turned beside parameters that are not would turn the DVL twice, or not at all
     kept = {path: backup_of(path) for path in new if path in there}
-    return Applied(tuple(new), tuple(path for path in contents if path not in new), kept, tuple(notes))
+    return Applied(tuple(new), unchanged, kept, tuple(notes))
+
+
+def _difference(path: Path, before: bytes, after: bytes) -> str:
+    old, new = (text.decode(errors="replace").splitlines() for text in (before, after))
+    lines = difflib.unified_diff(old, new, printable(str(path)), "would be", n=1, lineterm="")
+    return "".join(f"{printable(line)}\n" for line in lines)
 
 
 def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:

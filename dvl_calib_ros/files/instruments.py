@@ -1,0 +1,232 @@
+"""A saved calibration as the settings of the instrument itself, or of the autopilot that reads it.
+
+What is set takes the error out at its source, so the mounting that URDF and parameters tell stays what it was, but for
+what the instrument cannot be told. Settings are what the documents say that each entry names.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..errors import InputError
+from .mounting import POSITION_UNKNOWN, CalibratedMounting
+from .urdf import numbers
+
+# An angle that stays is worth a word from here on, rad.
+SAID_FROM = math.radians(0.05)
+# An autopilot's orientation is a quarter turn; so far from one (rad) it is none.
+QUARTER, NEAR_QUARTER = 0.5 * math.pi, math.radians(20.0)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One value of an instrument. now: None where nobody said it; assumed: nor said that it is what it is delivered
+    with, as which it is taken."""
+
+    name: str
+    now: float | None
+    new: float
+    unit: str = ""
+    assumed: bool = False
+
+    def __str__(self) -> str:
+        before = "not told" if self.now is None else f"{self.now:g}" + (" (taken for it)" if self.assumed else "")
+        return f"{self.name}: {before} -> {self.new:g} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class InstrumentSettings:
+    """What to set. text: as it is typed, sent, or loaded from a file. notes: what it leaves, in sentences."""
+
+    instrument: str
+    document: str
+    settings: tuple[Setting, ...]
+    text: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """A kind of instrument. document: the one that it follows. delivered: what it has of settings, and what it is
+    delivered with, None where that differs; settings: by a calibration and what it is set to now."""
+
+    document: str
+    delivered: Mapping[str, float | None]
+    settings: Callable[[CalibratedMounting, Mapping[str, float | None]], tuple[list[Setting], str, list[str]]]
+
+
+def instrument_settings(
+    calibrated: CalibratedMounting, name: str, now: Mapping[str, float] | None = None, force: bool = False
+) -> InstrumentSettings:
+    """What to set, so that the data come out corrected; `now`: what it was set to when the data were recorded.
+
+    Raises InputError for another instrument or setting, what it cannot be set to, or a calibration that is rejected,
+    unless force is set.
+    """
+    if name not in INSTRUMENTS:
+        raise InputError(f"instrument {name!r} is not known; one of {', '.join(INSTRUMENTS)}")
+    if calibrated.objections and not force:
+        raise InputError(f"{calibrated.path}: {'; '.join(calibrated.objections)}; to apply it all the same: --force")
+    instrument = INSTRUMENTS[name]
+    for key, value in (now or {}).items():
+        if key not in instrument.delivered:
+            raise InputError(f"{name} has no setting {key!r}; one of {', '.join(instrument.delivered)}")
+        if not math.isfinite(value):
+            raise InputError(f"{name}: {key} is {value}, which is no setting; give a number")
+    settings, text, notes = instrument.settings(calibrated, {**instrument.delivered, **(now or {})})
+    marked = [replace(each, assumed=each.now is not None and each.name not in (now or {})) for each in settings]
+    return InstrumentSettings(name, instrument.document, tuple(marked), text, tuple(notes))
+
+
+def _water_linked(
+    calibrated: CalibratedMounting, now: Mapping[str, float | None]
+) -> tuple[list[Setting], str, list[str]]:
+    offset, swing = _heading(calibrated, now["mounting_rotation_offset"] or 0.0)
+    turned = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
+    settings, notes = [turned], [*_left(calibrated, swing), *_delay(calibrated)]
+    factor, speed = 1.0 / (1.0 + calibrated.scale_ahead), now["speed_of_sound"]
+    if calibrated.model.scale_axes and speed is None:
+        notes.append(
+            f"speed_of_sound: times {factor:.5f}; say what it was set to (--now speed_of_sound=1500), for m/s. "
+            "That is what a wrong speed of sound looks like: set the water's temperature and salinity right first"
+        )
+    elif calibrated.model.scale_axes and speed is not None:
+        new = _between(factor * speed, 1000.0, 2000.0, "speed_of_sound")
+        settings.append(Setting("speed_of_sound", speed, new, "m/s"))
+        scale = f"{100.0 * calibrated.scale_ahead:+.2f} %"
+        notes.append(
+            f"scale {scale}: as a speed of sound that is {speed - new:+.1f} m/s off. Other water, another speed"
+        )
+    command = {"command": "set_config", "parameters": {each.name: each.new for each in settings}}
+    return settings, json.dumps(command) + "\n", notes
+
+
+def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float | None]) -> tuple[list[Setting], str, list[str]]:
+    heading, swing = _heading(calibrated, now["heading"] or 0.0)
+    settings = [Setting("heading", now["heading"], round(math.remainder(heading, 360.0), 2), "°")]
+    roll, pitch = now["roll"] or 0.0, now["pitch"] or 0.0
+    lines = [f"SET-SENSOR-ORIENTATION {roll:g}, {pitch:g}, {settings[0].new:g}"]
+    if calibrated.model.scale_axes:
+        adjustment = (now["velocity_adjustment"] or 1.0) / (1.0 + calibrated.scale_ahead)
+        new = _between(adjustment, 0.8, 1.25, "velocity_adjustment", digits=5)
+        settings.append(Setting("velocity_adjustment", now["velocity_adjustment"], new))
+        lines.append(f"SET-VELOCITY-ADJUSTMENT {new:g}")
+    return settings, "\n".join(lines) + "\n", [*_left(calibrated, swing), *_delay(calibrated)]
+
+
+def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float | None]) -> tuple[list[Setting], str, list[str]]:
+    settings, notes = [], []
+    if calibrated.position is None:
+        notes.append(f"VISO_POS_X, _Y, _Z are not set: {POSITION_UNKNOWN}")
+    else:
+        for axis, value in zip("XYZ", FLU_FROM_FRD @ np.array(calibrated.position), strict=True):
+            name = f"VISO_POS_{axis}"
+            settings.append(Setting(name, now[name], _between(float(value) + 0.0, -5.0, 5.0, name, digits=3), "m"))
+        notes.append(f"VISO_POS is from {calibrated.base_frame}: move it, if the autopilot's origin is elsewhere")
+    rotation = calibrated.rotation_body_from_dvl
+    clockwise = -math.atan2(rotation[1, 0], rotation[0, 0])
+    quarters = round(clockwise / QUARTER)
+    off = math.remainder(clockwise - quarters * QUARTER, 2.0 * math.pi)
+    if abs(off) > NEAR_QUARTER:
+        raise InputError(
+            f"ardupilot: the DVL is turned by {math.degrees(clockwise):+.1f}° (clockwise), and VISO_ORIENT holds "
+            "quarter turns; set the rest in the DVL itself (--instrument waterlinked or cerulean)"
+        )
+    settings.append(Setting("VISO_ORIENT", now["VISO_ORIENT"], float(quarters % 4 * 2)))
+    if abs(off) > SAID_FROM:
+        notes.append(
+            f"{math.degrees(off):+.2f}° of yaw (clockwise) stay: VISO_ORIENT holds quarter turns. Set them in the DVL "
+            "itself (--instrument waterlinked or cerulean)"
+        )
+    delay = round(1000.0 * calibrated.dvl_time_offset)
+    if 0 <= delay <= 250:
+        settings.append(Setting("VISO_DELAY_MS", now["VISO_DELAY_MS"], float(delay), "ms"))
+    else:
+        notes.append(f"VISO_DELAY_MS holds 0 to 250 ms, and the DVL's stamps are {delay} ms late: set its clock right")
+    if calibrated.model.scale_axes:
+        notes.append(f"the DVL's scale, {100.0 * calibrated.scale_ahead:+.2f} %, is its own to set")
+    return settings, "".join(f"{each.name},{each.new:g}\n" for each in settings), notes
+
+
+def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Array]:
+    """Clockwise angle, degrees, from the vehicle's forward axis to the DVL's that takes out what was found beside the
+    mounting that was told, and the rotation (3, 3) that stays behind it, in forward-right-down axes."""
+    told = calibrated.parameters.rotation_dvl_from_body
+    found = told @ calibrated.rotation_body_from_dvl
+    if not _is_down(calibrated):
+        found = FLU_FROM_FRD @ found @ FLU_FROM_FRD
+    whole = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
+    *_, z, w = quaternion_from_rotation(whole)
+    angle = 2.0 * math.atan2(z, w)  # of turns, the one about the DVL's z axis: what is left is about a level one
+    return math.degrees(angle), whole @ rotation_from_rpy(np.array([0.0, 0.0, -angle]))
+
+
+def _is_down(calibrated: CalibratedMounting) -> bool:
+    """Whether the axes that are calibrated are the DVL's own, forward-right-down, as it looks down."""
+    return bool(calibrated.parameters.rotation_dvl_from_body[2, 2] < 0.0)
+
+
+def _left(calibrated: CalibratedMounting, swing: Array) -> list[str]:
+    roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
+    said = ["URDF and parameters stay as they are: do not write this result into them as well"]
+    if roll_pitch.max() <= SAID_FROM:
+        return said
+    axes = swing if _is_down(calibrated) else FLU_FROM_FRD @ swing @ FLU_FROM_FRD
+    mounting = calibrated.parameters.rotation_dvl_from_body.T @ axes
+    of_frame = mounting @ FLU_FROM_FRD if calibrated.turned else mounting
+    degrees = ", ".join(f"{math.degrees(each):.2f}°" for each in roll_pitch)
+    return [
+        *said,
+        f"roll and pitch ({degrees}) are no setting of the instrument: with it set, give the URDF rpy="
+        f'"{numbers(rpy_from_rotation(of_frame))}" (mounting_rpy {numbers(rpy_from_rotation(mounting))})',
+    ]
+
+
+def _delay(calibrated: CalibratedMounting) -> list[str]:
+    late = calibrated.dvl_time_offset
+    return [f"the DVL's stamps are {late:+.3f} s late, which is no setting of the instrument"] if late else []
+
+
+def _between(value: float, least: float, most: float, name: str, digits: int = 2) -> float:
+    if not least <= value <= most:
+        raise InputError(
+            f"{name} would be {value:g}, and may be {least:g} to {most:g}; is what it is set to now right?"
+        )
+    return round(value, digits)
+
+
+def told_settings(words: Sequence[str]) -> dict[str, float]:
+    """Settings as an option gives them, NAME=VALUE. Raises InputError."""
+    told = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            told[name.strip()] = float(value)
+        except ValueError as error:
+            raise InputError(f"--now {word}: is not NAME=VALUE with a number") from error
+    return told
+
+
+INSTRUMENTS: Mapping[str, Instrument] = {
+    "waterlinked": Instrument(
+        "Water Linked DVL protocol, JSON over TCP, set_config; axes: vehicle frame (docs.waterlinked.com/dvl)",
+        {"mounting_rotation_offset": 0.0, "speed_of_sound": None},
+        _water_linked,
+    ),
+    "cerulean": Instrument(
+        "Cerulean Sonar, commands accepted by the DVL-75 and the Tracker 650 (docs.ceruleansonar.com)",
+        {"heading": 0.0, "roll": 0.0, "pitch": 0.0, "velocity_adjustment": 1.0},
+        _cerulean,
+    ),
+    "ardupilot": Instrument(
+        "ArduPilot's complete parameter list, VISO_ (ardupilot.org/sub)",
+        dict.fromkeys(("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z", "VISO_ORIENT", "VISO_DELAY_MS")),
+        _ardupilot,
+    ),
+}

@@ -1,0 +1,106 @@
+"""The configuration of a Water Linked DVL over TCP, asked for and set as its protocol says (get_config, set_config)."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from ..errors import InputError, printable
+from .instruments import Setting
+
+PORT = 16171
+# A DVL that has not answered for so long, s, is none; a line of its reports is no longer than this, bytes.
+PATIENCE_S, LONGEST_LINE = 10.0, 1 << 20
+# It is set with two digits; firmware before 2.2.1, with whole degrees and m/s, is told to be set by hand.
+AS_SET = 0.0051
+
+
+def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) -> bool:
+    """Set what is new, and read it back; nothing if dry_run. Whether it was set so already.
+
+    address: HOST or HOST:PORT. Raises InputError where nothing answers, it refuses, keeps something else, or is not set
+    to what it was when the data were recorded: what was found is relative to that.
+    """
+    host, _, port = address.partition(":")
+    try:
+        number = int(port or PORT)
+        if not host or not 0 < number < 65536:
+            raise ValueError
+    except ValueError as error:
+        raise InputError(f"--send {printable(address)}: is not HOST or HOST:PORT") from error
+    try:
+        with socket.create_connection((host, number), timeout=PATIENCE_S) as connection:
+            dvl = _Dvl(connection, address)
+            before = dvl.ask({"command": "get_config"})
+            if all(_is(before, each.name, each.new) for each in settings):
+                return True
+            for each in settings:
+                if each.now is None or not _is(before, each.name, each.now):
+                    raise InputError(
+                        f"{printable(address)}: {each.name} is {_held(before, each.name)}, and was {each.now} when the "
+                        "data were recorded (--now), which is what the calibration is relative to; record anew, or set "
+                        "it yourself"
+                    )
+            if dry_run:
+                return False
+            dvl.ask({"command": "set_config", "parameters": {each.name: each.new for each in settings}})
+            after = dvl.ask({"command": "get_config"})
+    except OSError as error:
+        why = error.strerror or "no answer"
+        raise InputError(f"{printable(address)}: {why}; is the DVL on, and the address right?") from error
+    for each in settings:
+        if not _is(after, each.name, each.new):
+            raise InputError(
+                f"{printable(address)}: {each.name} was set to {each.new:g} and is {_held(after, each.name)}; look at "
+                "the DVL's own page"
+            )
+    return False
+
+
+def _held(config: Any, name: str) -> Any:
+    return config.get(name) if isinstance(config, dict) else None
+
+
+def _is(config: Any, name: str, value: float) -> bool:
+    held = _held(config, name)
+    return isinstance(held, (int, float)) and abs(held - value) <= AS_SET
+
+
+class _Dvl:
+    """A connection, over which reports come between the answers."""
+
+    def __init__(self, connection: socket.socket, address: str) -> None:
+        self._connection, self._address, self._pending = connection, printable(address), b""
+
+    def ask(self, command: dict[str, Any]) -> Any:
+        """The result of a command. Raises InputError where it is refused, OSError where no answer comes."""
+        self._connection.sendall(json.dumps(command).encode() + b"\n")
+        until = time.monotonic() + PATIENCE_S
+        while True:
+            line = self._line(until)
+            try:
+                answer = json.loads(line)
+            except ValueError:
+                continue
+            if not isinstance(answer, dict) or answer.get("response_to") != command["command"]:
+                continue
+            if answer.get("success") is not True:
+                why = printable(str(answer.get("error_message") or "no reason given"))
+                raise InputError(f"{self._address}: refuses {command['command']} ({why})")
+            return answer.get("result")
+
+    def _line(self, until: float) -> bytes:
+        while b"\n" not in self._pending:
+            left = until - time.monotonic()
+            if left <= 0.0 or len(self._pending) > LONGEST_LINE:
+                raise TimeoutError("no answer")
+            self._connection.settimeout(left)
+            got = self._connection.recv(1 << 16)
+            if not got:
+                raise ConnectionResetError(0, "it closed the connection")
+            self._pending += got
+        line, _, self._pending = self._pending.partition(b"\n")
+        return line
