@@ -188,6 +188,7 @@ class Calibrator:
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
         self._seen: dict[Needs, _RowsSeen] = {}
+        self._doubted: tuple[tuple[object, ...], Sequence[Reason]] | None = None
         if self._trace is not None:
             self._trace.start(self._groups)
 
@@ -508,6 +509,7 @@ class Calibrator:
         """Change parameters that can change at run time (`ParameterSpec.read_only` False)."""
         selection = self.selection  # by what was so far
         self.parameters = self._aligner.parameters = parameters
+        self._doubted = None
         if self._n_selected:
             selection.record(self._aligner.partners.decided_ns, parameters)
 
@@ -758,6 +760,14 @@ class Calibrator:
             return found
         held_out = self._verified_so_far(fresh=fresh).reasons
         return [*found, *objections(navigation), *(each for each in held_out if each.code in JUDGED_LIVE)]
+
+    @property
+    def doubts_so_far(self) -> Sequence[Reason]:
+        """`doubts` that are not fresh, thought of anew only where there may be others: it takes a few milliseconds."""
+        of = (self.selected, *(each.n_told for each in self._further))
+        if self._doubted is None or self._doubted[0] != of:
+            self._doubted = of, self.doubts(fresh=False)
+        return self._doubted[1]
 
     @property
     def is_level(self) -> bool:

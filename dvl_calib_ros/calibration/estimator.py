@@ -127,6 +127,11 @@ class Estimator(ABC):
         return None
 
     @property
+    def n_told(self) -> int:
+        """What grows when it may have more to say, beside a state that changes with each sample."""
+        return self.counts.used
+
+    @property
     def suggestion_so_far(self) -> Reason | None:
         """`suggestion` as it was seen a little ago, which nobody has to wait for."""
         return self.suggestion

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import combinations
@@ -307,13 +307,14 @@ class CalibrationNode(AnsweringNode):
         """Subscriptions that the sensors' messages come by."""
         return list(self._inputs.values())
 
-    def deliver(self) -> None:
-        """Feed all messages that wait."""
-        self._deliver({})
+    def deliver(self, ready: Collection[Subscription] | None = None) -> None:
+        """Feed all messages that wait. ready: in which alone some do, if that is known."""
+        inputs = self._inputs.items()
+        self._deliver({}, None if ready is None else [topic for topic, each in inputs if each in ready])
 
-    def _deliver(self, taken: Mapping[str, Arrived]) -> None:
+    def _deliver(self, taken: Mapping[str, Arrived], ready: Collection[str] | None = None) -> None:
         """Feed messages that were taken, by topic, and all that wait."""
-        for topic, message in in_order_of_arrival(self._inputs, take, taken):
+        for topic, message in in_order_of_arrival(self._inputs, take, taken, ready=ready):
             if self._adapted is not None and topic == "gnss/twist":
                 message = self._adapted(message)
             self._feed_from[topic](message, self._received_ns(message))
@@ -413,9 +414,7 @@ class CalibrationNode(AnsweringNode):
         if state_of == self._mounting_published or calibrator.last_ns is None:
             return
         # of a wrong configuration none, for somebody would take it; messages wait meanwhile, so no look at all there is
-        if calibrator.suggestion_so_far or any(
-            each.severity is Severity.REJECT for each in calibrator.doubts(fresh=False)
-        ):
+        if calibrator.suggestion_so_far or any(each.severity is Severity.REJECT for each in calibrator.doubts_so_far):
             return
         self._mounting_published = state_of
         stamp = Time()

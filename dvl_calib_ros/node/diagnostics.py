@@ -148,7 +148,7 @@ def diagnose(
     found += reference_advice(estimate)
     if says := calibrator.suggestion_so_far:
         found.append(finding("CONFIGURATION_WRONG", says=says))
-    doubts = calibrator.doubts(fresh=False)
+    doubts = calibrator.doubts_so_far
     rejected = bool(says) or any(each.severity is Severity.REJECT for each in doubts)
     # what a replay rejects is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.subscription import Subscription
 
 if TYPE_CHECKING:
     from .calibration_node import CalibrationNode
@@ -41,8 +42,8 @@ class _Waiting:
         self._wait_set = rclpy_implementation.WaitSet(*sizes, node.context.handle)
         self._add = [(getattr(self._wait_set, f"add_{kind}"), each.handle) for kind, all_ in kinds for each in all_]
 
-    def wait(self, timeout_ns: int) -> tuple[bool, bool]:
-        """Wait (-1: for ever); whether sensors' messages have come, and whether anything else has."""
+    def wait(self, timeout_ns: int) -> tuple[list[Subscription], bool]:
+        """Wait (-1: for ever); by which subscriptions sensors' messages have come, and whether anything else has."""
         wait_set = self._wait_set
         wait_set.clear_entities()  # what was not ready has left it with the last waiting
         for add, handle in self._add:
@@ -50,15 +51,15 @@ class _Waiting:
         for waitable in self.waitables:
             waitable.add_to_wait_set(wait_set)
         wait_set.wait(timeout_ns)
-        inputs = sum(wait_set.is_ready("subscription", number) for number in range(len(self.inputs)))
-        others = len(wait_set.get_ready_entities("subscription")) > inputs
+        inputs = [each for number, each in enumerate(self.inputs) if wait_set.is_ready("subscription", number)]
+        others = len(wait_set.get_ready_entities("subscription")) > len(inputs)
         others = others or any(wait_set.get_ready_entities(kind) for kind in ("timer", "client", "service"))
         if ready := wait_set.get_ready_entities("guard_condition"):
             others = True
             for guard in self.guards:  # waiting has taken what rclpy is to be told as well
                 if guard.handle.pointer in ready:
                     guard.trigger()
-        return inputs > 0, others or any(each.is_ready(wait_set) for each in self.waitables)
+        return inputs, others or any(each.is_ready(wait_set) for each in self.waitables)
 
 
 class ReceivingExecutor(SingleThreadedExecutor):
@@ -94,11 +95,11 @@ class ReceivingExecutor(SingleThreadedExecutor):
         waiting = self._waiting
         if waiting is None:
             waiting = self._waiting = _Waiting(self._node, self._woken)
-        inputs_ready, others_ready = waiting.wait(-1 if timeout_sec is None else round(timeout_sec * 1e9))
+        inputs, others_ready = waiting.wait(-1 if timeout_sec is None else round(timeout_sec * 1e9))
         if others_ready or self._once_more:  # what is said of the vehicle may come before what it measures
             super().spin_once(timeout_sec=0.0)
-        elif inputs_ready:
-            self._node.deliver()
+        elif inputs:
+            self._node.deliver(inputs)
         while self._unfinished and self._unfinished[0].done():
             self._unfinished.popleft()
         # one call does one thing, and a callback may have given it more to do

@@ -6,7 +6,7 @@ by nearly the length of the stall, and go on without it where that is longer tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from rclpy.exceptions import InvalidHandle
@@ -44,20 +44,31 @@ def in_order_of_arrival(
     take_from: Callable[[Input], Arrived | None],
     taken: Mapping[str, Arrived],
     at_most: int = ROUND,
+    ready: Collection[str] | None = None,
 ) -> Iterator[tuple[str, Any]]:
     """Topic and message of all that waits, oldest first; those of one topic in the order in which they are taken.
 
     inputs: by topic, what messages are taken from. taken: what was taken before of some of them. at_most: how many
-    more are taken.
+    more are taken. ready: on which alone something waited a moment ago, if that is known: while these bring no second
+    message, the others are not asked, for to find that nothing waits costs a third of what a message does.
     """
-    heads = dict(taken)
-    left = at_most
-    while True:
-        for name, each in inputs.items():
-            if left and name not in heads and (arrived := take_from(each)) is not None:
+    heads, left = dict(taken), at_most
+
+    def take_more(names: Iterable[str]) -> bool:
+        nonlocal left
+        before = left
+        for name in names:
+            if left and name not in heads and (arrived := take_from(inputs[name])) is not None:
                 heads[name] = arrived
                 left -= 1
-        if not heads:
-            return
+        return left < before
+
+    take_more(inputs if ready is None else ready)
+    while heads:
         oldest = min(heads, key=lambda name: heads[name].at_ns)
         yield oldest, heads.pop(oldest).message
+        if ready is None:
+            take_more(inputs)
+        elif take_more(ready):  # what came by the others meanwhile may be older
+            ready = None
+            take_more(inputs)

@@ -49,8 +49,8 @@ class Hearing(Node):
         self.asked += 1
         return response
 
-    def deliver(self) -> None:
-        for each in self.inputs:
+    def deliver(self, ready) -> None:
+        for each in ready:
             while taken := each.handle.take_message(each.msg_type, each.raw):
                 self.said.append(taken[0].data)
 

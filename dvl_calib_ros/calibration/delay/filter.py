@@ -95,6 +95,7 @@ class DelayFilter(Estimator):
         self._block_ns: int | None = None  # start of the next block
         self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
         self._last_told = self._solver.outcome()
+        self._n_told = 0
         self._together = given.together
         self._gathered: list[Block] = []
         # by the stamp from which on they are told: those that are being solved, and the number of each among them
@@ -105,7 +106,6 @@ class DelayFilter(Estimator):
         # asked for with each message
         self._of_recording: tuple[Posterior, Registration | None, GaussianState] | None = None
         self._suggested: tuple[Outcome, Reason | None] | None = None
-        self._suggested_so_far: tuple[Outcome, Reason | None] | None = None
         self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
         for track in (aligner.reference, aligner.imu):
             track.needed_from[self] = LONG_AGO_NS  # until the first block is known
@@ -242,11 +242,13 @@ class DelayFilter(Estimator):
 
     @property
     def suggestion_so_far(self) -> Reason | None:
-        """The same, where a clock is late as it was seen a little ago: nobody waits for a look at all there is."""
-        newest = self._newest()
-        if self._suggested_so_far is None or self._suggested_so_far[0] is not newest:
-            self._suggested_so_far = newest, self._solver.suggestion(fresh=False)
-        return self._suggested_so_far[1]
+        """The same, as of the newest block that has taken effect: messages do not wait for one that is being solved."""
+        return self._told.suggestion
+
+    @property
+    def n_told(self) -> int:
+        """As `Estimator`: blocks."""
+        return self._n_told
 
     @property
     def evidence(self) -> Evidence:
@@ -382,6 +384,7 @@ class DelayFilter(Estimator):
             while self._coming and self._coming[0][0] <= reached_ns:
                 from_ns, solved, number = self._coming.popleft()
                 self._last_told = solved.result()[number]
+                self._n_told += 1
                 if self._last_told.has_rows:
                     self._on_block(from_ns)
         finally:

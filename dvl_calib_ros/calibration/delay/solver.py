@@ -55,7 +55,7 @@ class Outcome(NamedTuple):
     prior: of G2's states on the day that it is. posterior: None where nothing was ever found. counts: samples used,
     spikes and those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones. claims: references whose
     messages say how noisy they are, less the others. has_rows: whether the block had any. looked: how the instruments
-    stand, as of the newest look on the way.
+    stand, as of the newest look on the way. suggestion: live, what configuration fits, by that look.
     """
 
     prior: GaussianState
@@ -64,6 +64,7 @@ class Outcome(NamedTuple):
     claims: int
     has_rows: bool
     looked: Looked = Looked()
+    suggestion: Reason | None = None
 
 
 class _Comparison(NamedTuple):
@@ -182,7 +183,8 @@ class BlockSolver:
         if self._is_live:
             self._clocks.look_again(self._so_far)
         looked = self._clocks.looked(fresh=False)
-        return [outcome._replace(looked=looked) for outcome in outcomes]
+        suggestion = self.suggestion(fresh=False) if self._is_live else None
+        return [outcome._replace(looked=looked, suggestion=suggestion) for outcome in outcomes]
 
     def _of_day(self, blocks: Sequence[Block]) -> int:
         """How many blocks the day of some has, with these."""

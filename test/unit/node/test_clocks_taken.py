@@ -57,10 +57,13 @@ class Later:
 
 
 class _Waits:
+    asked = 0
+
     def __init__(self, work):
         self._work, self._found = work, None
 
     def result(self):
+        _Waits.asked += 1
         self._found = self._work() if self._found is None else self._found
         return self._found
 
@@ -78,6 +81,22 @@ def first_known(worker) -> int:
 
 def test_when_a_clock_is_known_is_decided_by_stamps_however_busy_the_machine_is():
     assert 0 < first_known(AtOnce()) == first_known(Later())
+
+
+def test_what_is_said_on_the_way_waits_for_no_block_and_is_thought_of_when_blocks_have_told_more(monkeypatch):
+    """It waited for the block that was being solved, and messages with it; and was thought of with every status."""
+    thought, real = [], Calibrator.doubts
+    monkeypatch.setattr(Calibrator, "doubts", lambda *of, **how: thought.append(1) or real(*of, **how))
+    calibrator = Calibrator(Parameters(), worker=Later())
+    feed = {DvlSample: calibrator.feed_dvl, ReferenceSample: calibrator.feed_reference, ImuSample: calibrator.feed_imu}
+    for sample in make_samples(MatchedRun("box", 65.0, frame=VelocityFrame.ENU, gnss_std=0.01, **ONE_HERTZ)):
+        feed[type(sample)](sample)
+        before = _Waits.asked
+        assert calibrator.suggestion_so_far is None
+        said = calibrator.doubts_so_far
+        assert _Waits.asked == before
+    assert 5 <= len(thought) <= 10  # a block is 10 s, and one model gives way to the other
+    assert said == real(calibrator, fresh=False)
 
 
 @pytest.fixture(scope="module")
