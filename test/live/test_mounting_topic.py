@@ -20,7 +20,6 @@ from std_srvs.srv import Trigger
 from test_node import Publisher, node_here, received, twist
 
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.delay.clocks import KeptClocks, Looked
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.node.transforms import Transforms
@@ -103,20 +102,6 @@ def test_a_model_without_lever_arm_gives_the_one_that_is_set_and_says_that_it_is
         assert (at.x, at.y, at.z) == (0.3, 0.0, -0.1)
         np.testing.assert_array_equal(np.diag(poses[-1].pose.covariance.reshape(6, 6))[:3], -1.0)
         assert said(diagnostics)["sigma dvl_time_offset [s]"] == "not estimated"
-
-
-def test_no_message_waits_for_a_look_at_all_that_the_clocks_have_shown(world, monkeypatch):
-    """Each block of ten seconds registered everything anew between two messages: a third of a second of CPU by then."""
-    asked: list[bool] = []
-    monkeypatch.setattr(
-        KeptClocks, "looked", lambda self, posterior=None, *, fresh=True: asked.append(fresh) or Looked()
-    )
-    with node_here(world, dvl_position="told"):
-        poses = world.received(PoseWithCovarianceStamped, f"{NODE}/mounting", LATCHED)
-        diagnostics = world.received(DiagnosticArray, "/diagnostics")
-        Publisher(world).send(*(twist(1000 + 0.2 * i) for i in range(30)))
-        until(lambda: poses and len(diagnostics) > 1, "the mounting, and diagnostics")
-        assert asked and not any(asked)
 
 
 class Broadcaster:
