@@ -12,9 +12,9 @@ WIDTH = 160
 
 def printed(result: object, as_html: bool) -> str:
     """The answer of a result, with its tables."""
-    from ..present.documents import document_of
+    from ..present.documents import DOCUMENTS
 
-    return text_of(document_of(result), as_html)
+    return text_of(DOCUMENTS[type(result)](result), as_html)
 
 
 def text_of(document: Document, as_html: bool) -> str:

@@ -141,9 +141,8 @@ def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> Non
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
-    errors, out = common.console(stderr=True), common.console()
-    for sentence in (*calibrated.objections, *calibrated.doubts):
-        errors.print(f"[yellow]warning:[/] {arguments.result}: {escape(sentence)}", soft_wrap=True)
+    common.print_warnings([f"{arguments.result}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
+    out = common.console()
     degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(calibrated.rpy))
     known = calibrated.position is not None
     transform = (

@@ -162,24 +162,12 @@ def check_outputs(
 
 
 def console(stderr: bool = False) -> Console:
-    """A rich console; plain text where the output is no terminal. Tables that are too wide for it are folded."""
+    """A rich console; plain text where the output is no terminal."""
     from rich.console import Console as RichConsole
-    from rich.table import Table as RichTable
-
-    from .folding import Folding
 
     class Console(RichConsole):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # main knows what to do; rich would exit with 1
-
-        def print(self, *objects: Any, **options: Any) -> None:
-            shown = (Folding(each) if isinstance(each, RichTable) else each for each in objects)
-            try:
-                super().print(*shown, **options)
-            except OSError:
-                if not self.stderr:
-                    raise
-                give_up(sys.stderr)  # who does not read warnings gets the result all the same
 
     return Console(stderr=stderr, width=_width(sys.stderr if stderr else sys.stdout), highlight=False, emoji=False)
 
@@ -196,8 +184,11 @@ def print_warnings(notes: Sequence[str]) -> None:
     from ..errors import printable
 
     errors = console(stderr=True)
-    for note in notes:
-        errors.print(f"[yellow]warning:[/] {escape(printable(note))}", soft_wrap=True)
+    try:
+        for note in notes:
+            errors.print(f"[yellow]warning:[/] {escape(printable(note))}", soft_wrap=True)
+    except OSError:
+        give_up(sys.stderr)  # who does not read warnings gets the result all the same
 
 
 def print_document(document: Document) -> None:

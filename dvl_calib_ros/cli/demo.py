@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from . import common
 from .reporting import add_report_option, report_writer
-from .tables import titled
 from .watch import node_command
 
 if TYPE_CHECKING:
@@ -124,22 +123,20 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
     from ..disk.yaml_files import load_yaml
     from ..files.result_file import load_result
-    from ..present.terms import ESTIMATE_COLUMNS, estimate_cells
+    from ..present.terminal import rich_table
+    from ..present.terms import estimate_table
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     _, live = load_result(saved)
-    numbers = ("model", *ESTIMATE_COLUMNS, "max |live - replay|")
-    table = titled("Live node against replay and truth", (), numbers)
-    table.add_row("[bold]truth[/]", *(f"{value:+.2f}" for value in _truth().values()), "")
-    worst = 0.0
-    for name, estimate in offline.estimates.items():
-        difference = max(
-            float(np.abs(live[name].x - estimate.state).max()), float(np.abs(live[name].p - estimate.covariance).max())
-        )
-        worst = max(worst, difference)
-        selected = f"[bold]{name} ◄[/]" if name == offline.selected else name
-        table.add_row(selected, *estimate_cells(estimate), f"{difference:.1e}")
-    out.print(table)
+    table = estimate_table(offline, list(offline.estimates))
+    out.print(rich_table(table))
+    truth = zip(table.head[1:], _truth().values(), strict=False)
+    out.print("True are " + "; ".join(f"{name} {value:+.2f}" for name, value in truth))
+    worst = max(
+        float(np.abs(here - there).max())
+        for name, estimate in offline.estimates.items()
+        for here, there in ((live[name].x, estimate.state), (live[name].p, estimate.covariance))
+    )
     model = load_yaml(saved, "result file")["model"]
     start_ns = offline.first_ns or 0
     switches = ", ".join(f"{(at - start_ns) * 1e-9:.1f} s {name}" for at, name in offline.segments)

@@ -18,10 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-COLOURS = {"no_gap": "green", "known": "green", "ambiguous": "yellow", "unknown": "red"}
 # At rest a bias shows that looks like scale at speed
 DEFAULTS = {"min_speed": 0.0}
-MAX_PLACES = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

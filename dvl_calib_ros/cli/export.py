@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
-from .tables import titled
 
 if TYPE_CHECKING:
     from ..export.simulator import Export
@@ -42,7 +41,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(exported: Export, arguments: argparse.Namespace) -> None:
-    from rich.markup import escape
+    from ..present.document import Table
+    from ..present.terminal import rich_table
 
     out = common.console()
     out.print(f"wrote {arguments.output}: {', '.join(exported.settings.found)}", soft_wrap=True, markup=False)
@@ -54,8 +54,6 @@ def _print(exported: Export, arguments: argparse.Namespace) -> None:
     if not exported.missing:
         out.print(f"{arguments.simulator} can represent everything that was found")
         return
-    table = titled(f"{arguments.simulator} cannot represent", ("what", "error that stays, mm/s", "why"))
-    for each in exported.missing:
-        error = "-" if each.error is None else f"{1e3 * each.error:.1f}"
-        table.add_row(each.name, error, escape(each.says))
-    out.print(table)
+    rows = [(e.name, "-" if e.error is None else f"{1e3 * e.error:.1f}", e.says) for e in exported.missing]
+    head = ("what", "error that stays, mm/s", "why")
+    out.print(rich_table(Table(head, rows, f"{arguments.simulator} cannot represent", words=3)))

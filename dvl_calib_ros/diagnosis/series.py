@@ -16,6 +16,8 @@ from .selection import EffectSelection
 from .unexplained import Unexplained
 from .where import regimes
 
+BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
+
 
 @dataclass(frozen=True)
 class HeldOutTwin:
@@ -49,6 +51,10 @@ class HeldOutTwin:
     noise: Array
     regimes: Mapping[str, NDArray[np.bool_]]
 
+    def errors(self, has_effects: bool) -> dict[str, Array]:
+        """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
+        return {"without": self.without, "with": self.with_effects} if has_effects else {"twin": self.without}
+
 
 @dataclass(frozen=True)
 class DiagnosisSeries:
@@ -74,6 +80,11 @@ class DiagnosisSeries:
     rest: Unexplained
     measured: tuple[bool, bool, bool] = (True, True, True)
     followed: Followed | None = None
+
+    @property
+    def axes(self) -> dict[str, str]:
+        """Axes that the reference measures, with what they are called."""
+        return {axis: BODY_AXES[axis] for axis, measured in zip("xyz", self.measured, strict=True) if measured}
 
     @property
     def twins(self) -> tuple[HeldOutTwin, ...]:

@@ -28,8 +28,6 @@ from ..verdict.reasons import Reason
 # A registration that leaves less than this share of the speed is one (17 degrees of misalignment); another reading of
 # the frames is taken for it if it leaves less than this share of what the first one leaves.
 REGISTERED, CLEARLY = 0.3, 0.5
-# What a clock leaves open of the lever arm is said from here on, m: the calibration's own σ does not hold it.
-SAID_FROM_M = 0.08
 # Of a stream one sample in so long is registered, ns.
 EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
 # What a clock of the DVL's that drifts or leaps is told by.

@@ -55,6 +55,11 @@ class CrossCheck(Answering):
     selected: tuple[str, ...] = ()
     navigation: Mapping[tuple[str, str], Navigation] = field(default_factory=dict)
 
+    @property
+    def names(self) -> list[str]:
+        """(L,) of the bags, without their folders."""
+        return [Path(bag).name or bag for bag in self.bags]
+
 
 @dataclass(frozen=True)
 class _Replayed:

@@ -134,6 +134,11 @@ class EachStudy:
         return np.asarray(np.median(self.seed_mean[rows], axis=0))
 
     @property
+    def run_names(self) -> list[str]:
+        """(L,) as people name them."""
+        return [f"{run.trajectory} {run.from_s:.0f}–{run.to_s:.0f} s" for run in self.runs]
+
+    @property
     def seed_mean(self) -> Array:
         """(L, C) Avg.VRMSE, mean over the seeds."""
         return mean_of_known(self.avg_vrmse, -1)
@@ -154,6 +159,11 @@ class Trace:
     truth: Array
     uncorrected: Array
     corrected: Mapping[str, Array]
+
+    @property
+    def best(self) -> str:
+        """The model that does best on it."""
+        return min(self.corrected, key=lambda name: float(((self.corrected[name] - self.truth) ** 2).sum()))
 
 
 @dataclass(frozen=True)
@@ -263,6 +273,11 @@ class Evaluation(Answering):
         """(S, C) published Avg.VRMSE, nan where there is none."""
         rows = [[self.published.get(each.name, {}).get(c, np.nan) for c in self.columns] for each in self.sets]
         return np.array(rows, dtype=float)
+
+    @property
+    def published_of_these(self) -> Array:
+        """(S, C) `published_table`; nan everywhere if the trajectories are others."""
+        return np.full_like(self.published_table, np.nan) if self.own_generator else self.published_table
 
     @property
     def ratio(self) -> Array:

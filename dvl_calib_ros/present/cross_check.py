@@ -2,84 +2,68 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from ..calibration.navigation import Navigation
 from ..evaluation.bags import CrossCheck
-from .document import Document, Item, Section, Sentence, Table, Where, figures, number, parameter_texts
+from .document import Document, Item, Sentence, Table, Where, figures, number, section
+
+ERRORS_NOTE = (
+    "rms of the vector, m/s, with the noise of GNSS, which no calibration removes; – nothing to calibrate with, or to "
+    "check against."
+)
+DRIFT_NOTE = (
+    "Drift in m per km, and per cent of the distance, rms over stretches of up to 1 km. With the lever arm of the bag "
+    "calibrated on; the delay, which is the day's, is that of the bag itself."
+)
 
 
 def cross_check(check: CrossCheck) -> Document:
     """What the calibration of each bag is worth on every other one."""
+    pictures: list[Item] = []
+    for bag, name in zip(check.bags, check.names, strict=True):
+        by = {f"by {one}": check.navigation.get((each, bag)) for each, one in zip(check.bags, check.names, strict=True)}
+        found = {name: each for name, each in by.items() if each is not None}
+        if found:
+            first = next(iter(found.values()))
+            pictures.append(figures("navigation_figures.navigation_pictures", first, found, f", {name}"))
+    head, nothing = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
+    errors = [(*nothing, *(number(value, 4) for value in check.uncorrected.tolist()))]
+    for name, of_models in zip(check.names, check.corrected, strict=True):
+        for model, row in zip(check.models, of_models, strict=True):
+            errors.append((name, model, *(number(value, 4) for value in row.tolist())))
     return Document(
         title="Bags checked against each other",
-        subtitle=", ".join(map(_name, check.bags)),
+        subtitle=", ".join(check.names),
         answer=None,
         warnings=check.notes,
         sections=[
-            Section(
+            section(
                 "",
-                [Sentence("Each bag calibrates, and every other one that has a reference is corrected with that.")],
-                Where.PAGE,
+                Sentence("Each bag calibrates, and every other one that has a reference is corrected with that."),
+                where=Where.PAGE,
             ),
-            Section("Dead reckoning on bags that were not calibrated on", [_drift(check)] if check.navigation else []),
-            Section("", [each for bag in check.bags for each in _pictures(check, bag)], Where.PAGE),
-            Section("Difference of DVL and GNSS on bags that were not calibrated on", [_errors(check)]),
+            section(
+                "Dead reckoning on bags that were not calibrated on",
+                Table(head, _drifts(check) if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
+                *pictures,
+            ),
+            section(
+                "Difference of DVL and GNSS on bags that were not calibrated on",
+                Table(head, errors, dense=True, notes=(ERRORS_NOTE,), words=2),
+            ),
         ],
-        parameters=parameter_texts(check.parameters),
+        parameters=check.parameters,
     )
 
 
-def _name(bag: str) -> str:
-    return Path(bag).name or bag
-
-
-def _errors(check: CrossCheck) -> Table:
-    rows = [("nothing", "uncalibrated", *(number(value, 4) for value in check.uncorrected.tolist()))]
-    for bag, of_models in zip(check.bags, check.corrected, strict=True):
-        for model, row in zip(check.models, of_models, strict=True):
-            rows.append((_name(bag), model, *(number(value, 4) for value in row.tolist())))
-    return Table(
-        ("calibrated on", "model", *map(_name, check.bags)),
-        rows,
-        dense=True,
-        notes=(
-            "rms of the vector, m/s, with the noise of GNSS, which no calibration removes; – nothing to calibrate "
-            "with, or to check against.",
-        ),
-        words=2,
-    )
-
-
-def _drift(check: CrossCheck) -> Table:
-    first = [next(iter(_of(check, bag).values()), None) for bag in check.bags]
-    drifts = [("nothing", "as mounted", [None if each is None else each.before for each in first])]
-    for calibrated, model in zip(check.bags, check.selected, strict=True):
-        found = [check.navigation.get((calibrated, bag)) for bag in check.bags]
-        drifts.append((_name(calibrated), model, [None if each is None else each.after for each in found]))
-    rows = [
-        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in of_bags))
-        for name, model, of_bags in drifts
+def _drifts(check: CrossCheck) -> list[tuple[str, ...]]:
+    """Of each bag as it is, then with the calibration of each other."""
+    found = [[check.navigation.get((calibrated, bag)) for bag in check.bags] for calibrated in check.bags]
+    first = [next((each for each in of_bag if each is not None), None) for of_bag in zip(*found, strict=True)]
+    rows = [("nothing", "as mounted", [each and each.before for each in first])]
+    rows += [
+        (name, model, [each and each.after for each in of_bags])
+        for name, model, of_bags in zip(check.names, check.selected, found, strict=True)
     ]
-    return Table(
-        ("calibrated on", "model", *map(_name, check.bags)),
-        rows,
-        notes=(
-            "Drift in m per km, and per cent of the distance, rms over stretches of up to 1 km. With the lever arm of "
-            "the bag calibrated on; the delay, which is the day's, is that of the bag itself.",
-        ),
-        words=2,
-    )
-
-
-def _of(check: CrossCheck, bag: str) -> dict[str, Navigation]:
-    """Dead reckoning of a bag by what corrected it."""
-    return {calibrated: each for (calibrated, verified), each in check.navigation.items() if verified == bag}
-
-
-def _pictures(check: CrossCheck, bag: str) -> list[Item]:
-    found = _of(check, bag)
-    if not found:
-        return []
-    named = {f"by {_name(calibrated)}": each for calibrated, each in found.items()}
-    return [figures("navigation_figures.navigation_pictures", next(iter(found.values())), named, f", {_name(bag)}")]
+    return [
+        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in drifts))
+        for name, model, drifts in rows
+    ]

@@ -6,13 +6,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from ..diagnosis.clock_or_arm import Combination
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect
-from ..diagnosis.series import DiagnosisSeries
+from ..diagnosis.series import BODY_AXES, DiagnosisSeries
 from ..diagnosis.where import GapPlace
 from ..effects.registry import EFFECTS
 from .document import (
@@ -20,8 +20,6 @@ from .document import (
     Cell,
     Columns,
     Document,
-    Facts,
-    Item,
     Number,
     Numbers,
     Section,
@@ -29,9 +27,11 @@ from .document import (
     Table,
     Warned,
     Where,
+    facts_by,
     figures,
     intervals,
     p_value,
+    section,
     share,
     table_by,
     three,
@@ -39,7 +39,6 @@ from .document import (
 )
 from .twin_table import twin_table
 
-BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
 NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",
     "stale_samples": "samples that repeat the one before, as a share",
@@ -53,6 +52,38 @@ EFFECTS_NOTE = (
     "The calibration is refitted with every effect. p is adjusted for all effects that were tried. Of names joined by "
     "“or”, the parameters are those of the first."
 )
+TRACES_NOTE = (
+    "Measured: the residual without the other effects. From both, what misalignment and scale take in has been left "
+    "out, so only that is shown which speaks for the effect."
+)
+TWINS_NOTE = (
+    "The twin is a simulated DVL on the recorded motion, without and with what was found. What is shown is what was "
+    "recorded less what the twin measured, on stretches that its parameters had not seen."
+)
+
+
+def _calibration(series: DiagnosisSeries) -> str:
+    angle_std, scale_std = np.split(series.calibration_std, 2)
+    angles, scales = (
+        ", ".join(
+            f"{axis} {with_std(*each, signed=True)}{unit}" for axis, *each in zip("xyz", values, std, strict=True)
+        )
+        for values, std, unit in (
+            (np.degrees(series.phi), np.degrees(angle_std), "°"),
+            (100.0 * series.scale, 100.0 * scale_std, " %"),
+        )
+    )
+    return f"misalignment {angles}; scale error {scales} (1σ)"
+
+
+FACTS: Mapping[str, Callable[[DiagnosisSeries], str]] = {
+    "Recordings": lambda s: ", ".join(
+        f"{name} ({np.ptp(s.time[s.recording_of == i]):.0f} s)" for i, name in enumerate(s.recordings)
+    ),
+    "Samples compared": lambda s: f"{len(s.time)}, on the axes {''.join(s.axes)}",
+    "Held out": lambda s: "whole recordings in turn" if len(s.recordings) > 1 else "a fifth of the run in turn",
+    "Calibration beside": _calibration,
+}
 WHERE: Columns[GapPlace] = {
     "axis": lambda place: f"{place.axis} ({BODY_AXES[place.axis]})",
     "regime": lambda place: place.regime,
@@ -76,100 +107,92 @@ NOISE: Columns[NoiseFinding] = {
 }
 
 
-def _combined(known: Combination) -> str:
-    """What is known of a lever arm and a clock together."""
-    value, low, high = known.value
-    sign = "-" if known.speed > 0.0 else "+"
-    return (
-        f"Known of both is lever_arm {known.parameter} {sign} {abs(known.speed):.2f} m/s · {known.clock} = "
-        f"{value:.2f} m ({low:.2f} to {high:.2f})."
-    )
-
-
 def diagnosis(d: Diagnosis) -> Document:
     """Where the DVL differs from what calibration leads to expect, which effect makes it, and what cannot be told."""
+    series, has_effects = d.series, bool(d.effects)
     found = [
         f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, _units(e.name))}." for e in d.effects
     ]
-    untestable = [table_by(NEEDS, d.untestable.items())] if d.untestable else []
-    detectable = [_detectable_table(d)] if d.minimum_detectable else []
-    following = Sentence(f"Next: {d.next_manoeuvre}.")
-    series = d.series
-    followed = (
-        [figures("twin_section.followed_picture", series.followed, _axes(series))] if series and series.followed else []
-    )
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
     of_each = [
         (effect.name, recording, intervals(parameters, _units(effect.name)))
         for effect in d.effects
         for recording, parameters in effect.by_recording.items()
     ]
-    cannot = "This data cannot tell {} from {}; each explains it as well."
-    alike = [Sentence(cannot.format(e.name, " or ".join(e.equivalent_to))) for e in d.effects if e.equivalent_to]
-    alike += [Sentence(_combined(e.combination)) for e in d.effects if e.combination is not None]
-    has_closure = bool(d.effects) and math.isfinite(d.gap.closure)
+    followed = (
+        figures("twin_pictures.followed_picture", series.followed, series.axes) if series and series.followed else None
+    )
+    regimes = None if series is None else figures("diagnosis_pictures.regime_picture", series, has_effects)
     return Document(
         title="Sim-to-real gap of the DVL",
-        subtitle="" if d.series is None else ", ".join(d.series.recordings),
+        subtitle="" if series is None else ", ".join(series.recordings),
         answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found]),
         warnings=d.notes,
         sections=[
-            Section("", [Numbers(_numbers(d))] if math.isfinite(d.gap.before) else []),
-            Section("", [Facts(_facts(series))] if series else [], Where.PAGE),
-            Section("", [Warned()], Where.PAGE),
-            Section("Where the gap lies", [table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))] if d.where else []),
-            Section(
-                "" if d.where else "Regimes of motion",
-                [figures("diagnosis_pictures.regime_picture", series, bool(d.effects))] if series else [],
-                Where.PAGE,
+            section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
+            section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
+            section("", Warned(), where=Where.PAGE),
+            section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
+            section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),
+            section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
+            section("", Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)),
+            section(
+                "",
+                figures("diagnosis_pictures.closure_picture", d)
+                if has_effects and math.isfinite(d.gap.closure)
+                else None,
+                where=Where.PAGE,
             ),
-            Section("Which effects make it", [table_by(FOUND, d.effects, (EFFECTS_NOTE,))] if d.effects else []),
-            Section("", [Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)] if of_each else []),
-            Section("", [figures("diagnosis_pictures.closure_picture", d)] if has_closure else [], Where.PAGE),
-            *(_traces(d, series) + _twins(d, series) if series else []),
-            Section("What is left", [Sentence(_left(d)), *followed], Where.PAGE),
-            Section("What this data cannot tell", [*alike, following, *untestable, *detectable]),
-            Section("The noise", [table_by(NOISE, d.noise)] if d.noise else []),
+            *(_of_series(d, series) if series is not None else []),
+            section(
+                "What is left",
+                Sentence(_left(d)),
+                followed,
+                where=Where.PAGE,
+            ),
+            section(
+                "What this data cannot tell",
+                *_alike(d),
+                Sentence(f"Next: {d.next_manoeuvre}."),
+                table_by(NEEDS, d.untestable.items()),
+                _detectable_table(d),
+            ),
+            section("The noise", table_by(NOISE, d.noise)),
         ],
     )
 
 
-# ------------------------------------------------------------------ figures
-
-
-def _traces(d: Diagnosis, series: DiagnosisSeries) -> list[Section]:
-    note = (
-        "Measured: the residual without the other effects. From both, what misalignment and scale take in has been "
-        "left out, so only that is shown which speaks for the effect."
-    )
-    return [
-        Section(
-            f"{each.name}: measured and as the effect says",
-            [figures("diagnosis_pictures.trace_pictures", each.name, series, _axes(series)), Sentence(note, soft=True)],
-            Where.PAGE,
-        )
-        for each in d.effects
-        if series.traces[each.name].any()
-    ]
-
-
-def _twins(d: Diagnosis, series: DiagnosisSeries) -> list[Section]:
-    axes, has_effects = _axes(series), bool(d.effects)
-    note = (
-        "The twin is a simulated DVL on the recorded motion, without and with what was found. What is shown is what "
-        "was recorded less what the twin measured, on stretches that its parameters had not seen."
-    )
-    first: list[Item] = [Sentence(note, soft=True), twin_table(series.twins, has_effects)]
-    return [
-        Section("Recorded against the simulated twin", first, Where.PAGE),
-        *(
-            Section(each.name, [figures("twin_section.twin_pictures", each, axes, has_effects)], Where.PAGE)
-            for each in series.twins
-        ),
-    ]
+def _of_series(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
+    """What a page shows over time: each effect as measured, and the recorded against the twin."""
+    axes, has_effects = series.axes, bool(d.effects)
+    for each in d.effects:
+        if series.traces[each.name].any():
+            drawn = figures("diagnosis_pictures.trace_pictures", each.name, series, axes)
+            title = f"{each.name}: measured and as the effect says"
+            yield section(title, drawn, Sentence(TRACES_NOTE, soft=True), where=Where.PAGE)
+    table = twin_table(series.twins, has_effects)
+    yield section("Recorded against the simulated twin", Sentence(TWINS_NOTE, soft=True), table, where=Where.PAGE)
+    for twin in series.twins:
+        yield section(twin.name, figures("twin_pictures.twin_pictures", twin, axes, has_effects), where=Where.PAGE)
 
 
 # ------------------------------------------------------------------ sentences
+
+
+def _alike(d: Diagnosis) -> Iterator[Sentence]:
+    """Effects that cannot be told apart, and what is known of a lever arm and a clock together."""
+    for each in d.effects:
+        if each.equivalent_to:
+            others = " or ".join(each.equivalent_to)
+            yield Sentence(f"This data cannot tell {each.name} from {others}; each explains it as well.")
+    for known in (each.combination for each in d.effects):
+        if known is not None:
+            value, low, high = known.value
+            sign = "-" if known.speed > 0.0 else "+"
+            yield Sentence(
+                f"Known of both is lever_arm {known.parameter} {sign} {abs(known.speed):.2f} m/s · {known.clock} = "
+                f"{value:.2f} m ({low:.2f} to {high:.2f})."
+            )
 
 
 def _units(effect: str) -> dict[str, str]:
@@ -192,32 +215,6 @@ def _numbers(d: Diagnosis) -> list[Number]:
     claimed = "" if gap.reported is None else f"; the messages claim {_mm(gap.reported)}"
     found.append(Number("noise", _mm(gap.noise_floor), note=f"as high frequencies show it{claimed}"))
     return [*found, Number("not explained", _mm(gap.not_explained), note="left beyond the noise")]
-
-
-def _facts(series: DiagnosisSeries) -> list[tuple[str, str]]:
-    lengths = [float(np.ptp(series.time[series.recording_of == i])) for i in range(len(series.recordings))]
-    angle_std, scale_std = np.split(series.calibration_std, 2)
-    angles, scales = (
-        ", ".join(
-            f"{axis} {with_std(*each, signed=True)}{unit}" for axis, *each in zip("xyz", values, std, strict=True)
-        )
-        for values, std, unit in (
-            (np.degrees(series.phi), np.degrees(angle_std), "°"),
-            (100.0 * series.scale, 100.0 * scale_std, " %"),
-        )
-    )
-    held = "whole recordings in turn" if len(series.recordings) > 1 else "a fifth of the run in turn"
-    return [
-        ("Recordings", ", ".join(f"{n} ({s:.0f} s)" for n, s in zip(series.recordings, lengths, strict=True))),
-        ("Samples compared", f"{len(series.time)}, on the axes {''.join(_axes(series))}"),
-        ("Held out", held),
-        ("Calibration beside", f"misalignment {angles}; scale error {scales} (1σ)"),
-    ]
-
-
-def _axes(series: DiagnosisSeries) -> dict[str, str]:
-    """Axes that the reference measures, with what they are called."""
-    return {axis: where for (axis, where), measured in zip(BODY_AXES.items(), series.measured, strict=True) if measured}
 
 
 def _left(d: Diagnosis) -> str:

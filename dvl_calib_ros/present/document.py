@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -120,7 +120,7 @@ class Figures:
 
 
 def figures(function: str, *given: Any) -> Figures:
-    """Those that a function draws, such as ``twin_section.twin_pictures``."""
+    """Those that a function draws, such as ``twin_pictures.twin_pictures``."""
     module, _, name = function.partition(".")
     return Figures(module, name, given)
 
@@ -142,9 +142,14 @@ class Commands:
 
 @dataclass(frozen=True)
 class Facts:
-    """Short texts by name."""
+    """Short texts by name; an empty one is left out."""
 
-    facts: Sequence[tuple[str, str]]
+    facts: Mapping[str, str]
+
+
+def facts_by(facts: Mapping[str, Callable[[T], str]], of: T) -> Facts:
+    """What each says of an object."""
+    return Facts({name: fact(of) for name, fact in facts.items()})
 
 
 @dataclass(frozen=True)
@@ -224,6 +229,11 @@ class Section:
     where: Where = Where.BOTH
 
 
+def section(title: str, *items: Item | None, where: Where = Where.BOTH) -> Section:
+    """What there is of the items, under a heading: no None, and no table without rows."""
+    return Section(title, [each for each in items if each is not None and getattr(each, "rows", True)], where)
+
+
 @dataclass(frozen=True)
 class Answer:
     """What a result says first: a word, how good or bad that is, and sentences. advice: what to do."""
@@ -247,7 +257,7 @@ class Document:
     answer: Answer | None
     warnings: Sequence[str]
     sections: Sequence[Section]
-    parameters: Sequence[tuple[str, str]] = ()
+    parameters: Mapping[str, Any] = field(default_factory=dict)
     lead: Reason | None = None
     folded: Sequence[str] = ()
 
@@ -288,29 +298,13 @@ def three(value: float) -> str:
     return text.replace("-", "−")
 
 
-def interval(each: tuple[float, float, float]) -> str:
-    """A value, and from where to where it may be."""
-    value, low, high = map(three, each)
-    return f"{value} ({low} to {high})"
-
-
 def intervals(parameters: Mapping[str, tuple[float, float, float]], units: Mapping[str, str] | None = None) -> str:
-    """Values with their intervals, by name; – where there are none."""
-    said = (f"{name} {interval(each)} {(units or {}).get(name, '')}".strip() for name, each in parameters.items())
+    """Values and from where to where each may be, by name; – where there are none."""
+    said = (
+        f"{name} {three(value)} ({three(low)} to {three(high)}) {(units or {}).get(name, '')}".strip()
+        for name, (value, low, high) in parameters.items()
+    )
     return "; ".join(said) or "–"
-
-
-def parameter_texts(parameters: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Parameters as they are shown, with their names."""
-    return [(name, _plain(value)) for name, value in parameters.items()]
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, list):
-        return " ".join(_plain(each) for each in value)
-    return str(value) if value != "" else "''"
 
 
 def fitting_unit(seconds: float) -> tuple[float, str]:

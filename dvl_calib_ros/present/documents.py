@@ -19,7 +19,7 @@ from .evaluation import evaluation
 from .examination import examination
 from .unpaired import unpaired
 
-_DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
+DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
     Comparison: comparison,
     CrossCheck: cross_check,
     Diagnosis: diagnosis,
@@ -27,8 +27,3 @@ _DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
     Examination: examination,
     UnpairedComparison: unpaired,
 }
-
-
-def document_of(result: Any) -> Document:
-    """What a result of any of these types says."""
-    return _DOCUMENTS[type(result)](result)

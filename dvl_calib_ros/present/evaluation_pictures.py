@@ -10,7 +10,6 @@ from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from . import evaluation_figures as figures
-from .evaluation import best_of_trace, published_of, run_names
 from .replay_figures import held_out_errors
 from .style import Picture, picture
 
@@ -24,7 +23,7 @@ def improvement_picture(e: Evaluation) -> Picture:
     base = e.columns.index(UNCALIBRATED)
     models = [e.columns.index(name) for name in e.models]
     gone = 1.0 - e.seed_mean[:, models] / e.seed_mean[:, [base]]
-    published = 1.0 - published_of(e)[:, models] / published_of(e)[:, [base]]
+    published = 1.0 - e.published_of_these[:, models] / e.published_of_these[:, [base]]
     alt = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
     return picture(
         "Improvement over uncalibrated", f"Mean over the sets: {alt}",
@@ -42,7 +41,7 @@ def time_pictures(e: Evaluation) -> Iterable[Picture]:
             f"{each.name}: calibrated on {each.calibration_run}",
             f"Avg.VRMSE against calibration time for set {each.name}, all models",
             figures.error_over_calibration_time, e.models, e.windows_s, float(e.seed_mean[i, base]),
-            by_time[i][:, models], each.window_s, published_of(e)[i, models],
+            by_time[i][:, models], each.window_s, e.published_of_these[i, models],
         )  # fmt: skip
 
 
@@ -88,7 +87,7 @@ def study_picture(e: Evaluation, study: EachStudy) -> Picture:
     models = [e.columns.index(name) for name in e.models]
     return picture(
         "Avg.VRMSE by calibration run", f"Avg.VRMSE, median over the runs, m/s: {alt}",
-        figures.error_by_run, run_names(study), e.models, errors[:, base], errors[:, models],
+        figures.error_by_run, study.run_names, e.models, errors[:, base], errors[:, models],
         caption="Bars: uncalibrated. Filled: models with GNSS. Hollow: without.",
     )  # fmt: skip
 
@@ -108,7 +107,7 @@ def trace_pictures(trace: Trace) -> list[Picture]:
     time_s, truth, uncorrected = trace.time[::step], trace.truth[::step], trace.uncorrected[::step]
     corrected = {name: velocity[::step] for name, velocity in trace.corrected.items()}
     errors = {name: np.linalg.norm(velocity - truth, axis=1) for name, velocity in corrected.items()}
-    best = best_of_trace(trace)
+    best = trace.best
     pictures = [
         picture(
             f"Velocity {where}", f"Velocity {where} of {trace.trajectory}: truth, DVL, and corrected by {best}, m/s",

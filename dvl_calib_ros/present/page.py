@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Mapping
 from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
@@ -29,6 +28,13 @@ def breakable(text: str) -> Markup:
     return Markup(re.sub(r"([/_])(?=\w)", r"\1<wbr>", str(escape(text))))
 
 
+def plain(value: Any) -> str:
+    """A parameter as it is shown."""
+    if isinstance(value, list):
+        return " ".join(map(plain, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value) or "''"
+
+
 @cache
 def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
@@ -38,20 +44,8 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["breakable"] = breakable
+    environment.filters |= {"breakable": breakable, "plain": plain}
     return environment
-
-
-def render_page(template: str, context: Mapping[str, Any]) -> str:
-    """HTML of a page."""
-    environment = _environment()
-    # uPlot (MIT, uplot.LICENSE) draws, explore.js gives it the data of the figures
-    scripts = [Markup(environment.get_template(name).render().strip()) for name in ("uplot.js", "explore.js")]
-    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
-    sources = Markup(" ".join(f"'sha256-{digest}'" for digest in digests))
-    return environment.get_template(template).render(
-        version=__version__, styles=MODEL_STYLES, scripts=scripts, script_sources=sources, **context
-    )
 
 
 def write_document(path: Path, document: Document) -> None:
@@ -59,9 +53,20 @@ def write_document(path: Path, document: Document) -> None:
     sections = [each for each in document.sections if each.where is not Where.TERMINAL and each.items]
     if not any(isinstance(item, Warned) for section in sections for item in section.items):
         sections.insert(0, Section("", [Warned()]))
-    context = {"title": document.title, "subtitle": document.subtitle, "document": document, "sections": sections}
-    written = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
-    save_text(path, render_page("document.html", context | {"written": written}))
+    environment = _environment()
+    # uPlot (MIT, uplot.LICENSE) draws, explore.js gives it the data of the figures
+    scripts = [Markup(environment.get_template(name).render().strip()) for name in ("uplot.js", "explore.js")]
+    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
+    page = environment.get_template("document.html").render(
+        document=document,
+        sections=sections,
+        written=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"),
+        version=__version__,
+        styles=MODEL_STYLES,
+        scripts=scripts,
+        script_sources=Markup(" ".join(f"'sha256-{digest}'" for digest in digests)),
+    )
+    save_text(path, page)
 
 
 def fragment(document: Document) -> str:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,13 +17,12 @@ from ..calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from ..calibration.models import MODELS
 from ..calibration.navigation import in_words, metres
 from ..calibration.parameters import Parameters
-from ..calibration.quantities import quantities
+from ..calibration.quantities import not_shown, quantities
 from ..calibration.results import Result
 from ..calibration.samples import VelocityFrame
 from ..calibration.verification import Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag
-from ..replay.recorder import RunHistory
 from ..replay.replay import Replayed
 from ..verdict.kinds import Severity
 from .document import (
@@ -33,7 +32,6 @@ from .document import (
     Columns,
     Commands,
     Document,
-    Facts,
     Item,
     Legend,
     Map,
@@ -41,13 +39,13 @@ from .document import (
     Numbers,
     Section,
     Sentence,
-    Table,
     Warned,
     Where,
     Worth,
+    facts_by,
     figures,
     fitting_unit,
-    parameter_texts,
+    section,
     table_by,
 )
 from .terms import estimate_table
@@ -70,6 +68,24 @@ _AXES = {
 }
 
 
+AGAINST_TRAVEL = (
+    "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like yaw, and "
+    "driving astern looks like a DVL turned by 180°."
+)
+AGAINST_IMU = (
+    "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll and "
+    "pitch. Both are harmless as long as the same IMU is used."
+)
+NO_RESIDUALS = ". No reference is beside enough of them for residuals."
+RESIDUALS = (
+    "; residuals are at the reference point, corrected by estimates that had not seen the data, with all that was "
+    "found, lever arm and delay too. The noise of the reference is in them. Lines are running means."
+)
+HELD_OUT_NOTE = (
+    "Each block of the run was held back in turn and corrected with a calibration that had not seen it. Velocity error "
+    "against the reference, m/s rms, with the noise of the reference in all of them; predicted is what that noise and "
+    "the uncertainty of the calibration lead one to expect."
+)
 HELD_OUT: Columns[Verification] = {
     "model": lambda each: each.model,
     "uncorrected": lambda each: "–" if each.held_out is None else f"{each.held_out.uncorrected:.4f}",
@@ -77,6 +93,49 @@ HELD_OUT: Columns[Verification] = {
     "predicted": lambda each: "–" if each.held_out is None else f"{each.held_out.predicted:.4f}",
     "samples": lambda each: "0" if each.held_out is None else str(each.held_out.samples),
     "verdict": lambda each: Cell(each.verdict.value, CELL_KINDS[each.verdict]),
+}
+
+
+STREAMS: Columns[tuple[str, Mapping[str, int]]] = {
+    "": lambda each: each[0],
+    "received": lambda each: str(each[1].get("received", "–")),
+    "of which": lambda each: Cell(
+        ", ".join(f"{n} {what.replace('_', ' ')}" for what, n in each[1].items() if n and what != "received") or "–",
+        "text",
+    ),
+}
+_STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pairing", "pairing of DVL and GNSS"))
+
+
+def _when(run: Replayed) -> str:
+    result = run.result
+    if result.first_ns is None or result.last_ns is None:
+        return "nothing"
+    seconds = (result.last_ns - result.first_ns) * 1e-9
+    unit_s, unit = fitting_unit(seconds)
+    duration = f"{seconds / unit_s:.1f} {unit}"
+    first, last = (datetime.fromtimestamp(ns // 10**9, timezone.utc) for ns in (result.first_ns, result.last_ns))
+    return f"{first:%Y-%m-%d %H:%M:%S} to {last:%Y-%m-%d %H:%M:%S} UTC, {duration}"
+
+
+def _used(run: Replayed) -> str:
+    estimate = run.result.estimate
+    what = "references" if MODELS[estimate.model].estimator else "DVL samples"
+    return f"{estimate.used} {what}, {estimate.gated} rejected as outliers"
+
+
+FACTS: Mapping[str, Callable[[Replayed], str]] = {
+    "Model": lambda run: (
+        f"{run.result.selected} ({run.result.selected_because.sentence}); {run.result.estimate.convergence.value}"
+    ),
+    "Angles": lambda run: "against the IMU's heading and level" if run.reference_frame in EARTH else "",
+    "Recorded": _when,
+    "DVL data": lambda run: run.dvl_data,
+    "Samples": lambda run: (
+        f"{run.result.counts['dvl']['accepted']} of the DVL, {run.result.counts['pairing']['paired']} of them paired "
+        "with GNSS"
+    ),
+    "Used by the model": _used,
 }
 
 
@@ -107,7 +166,7 @@ def replayed(
         What to type next.
 
     """
-    result = run.result
+    result, history, drift = run.result, run.history, run.navigation
     shown = [name for name in MODELS if name in models or name == result.selected]
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Severity.REJECT
@@ -116,56 +175,51 @@ def replayed(
     notes = [note for note in run.notes if first is None or note != str(first)]
     own = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
-    history = run.history
-    velocities: list[Item] = []
-    data: list[Item] = []
-    if history is not None:
-        drawn = figures("replay_pictures.velocity_pictures", run, history)
-        velocities = [Sentence(_velocity_note(run), soft=True), drawn]
-        data = [figures("replay_pictures.data_pictures", result, history, shown)]
-    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
-    counted = [
-        ("selected", f"{result.selected} ({result.selected_because.sentence})"),
-        ("dvl data", run.dvl_data),
-        ("samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} with a reference velocity at their time"),
-    ]
-    drift = run.navigation
-    worth = [] if drift is None else [Worth(metres(drift.before.per_km), metres(drift.after.per_km))]
-    said = [
-        Sentence(f"? {axes}: not shown by this recording; it needs {lacks}")
-        for lacks, axes in not_shown(result).items()
-    ]
+    streams = [(name, result.counts[key]) for key, name in _STREAMS]
     # an angle that the data do not show is none to put on a vehicle
     is_shown = not rejected and any(each.shown for each in quantities(result)[:3])
+    worth = Worth(metres(drift.before.per_km), metres(drift.after.per_km)) if drift and not rejected else None
     return Document(
         title="DVL calibration",
-        subtitle=", ".join(bag.name or str(bag) for bag in bags),
+        subtitle=", ".join(map(str, bags)),
         answer=_answer(verification),
         warnings=own,
         sections=[
-            Section("", worth if not rejected else [], Where.PAGE),
-            Section(_headline(run, rejected), _mounting(run, rejected)),
-            Section("", [] if rejected else [figures("mounting_figures.mounting_pictures", result)], Where.PAGE),
-            Section("", [Facts(_facts(run, bags))], Where.PAGE),
-            Section("", [Sentence("Corrected mounting, ready to paste:", soft=True)] if is_shown else [], Where.PAGE),
-            Section("", [_paste(run)] if is_shown else []),
-            Section("", [Warned()], Where.PAGE),
-            Section("What it means for navigation", _navigation(run)),
-            Section("", said, Where.TERMINAL),
-            Section(
+            section(
                 "",
-                [Commands([("next" if not k else "", each) for k, each in enumerate(commands)])] if commands else [],
-                Where.TERMINAL,
+                worth,
+                where=Where.PAGE,
             ),
-            Section("Held-out verification", _held_out(result, shown), Where.PAGE),
-            Section("Estimates", [estimate_table(result, shown)], where),
-            *_families(result, history, shown),
-            Section("Velocity before and after correction", velocities, Where.PAGE),
-            Section("Data", [Facts(counted)] if details else [], Where.TERMINAL),
-            Section("" if details else "Data", [_stream_table(result)], where),
-            Section("", data, Where.PAGE),
+            section(_headline(run, rejected), *_mounting(run, rejected)),
+            section("", None if rejected else figures("mounting_figures.mounting_pictures", result), where=Where.PAGE),
+            section("", facts_by(FACTS, run), where=where),
+            section(
+                "", Sentence("Corrected mounting, ready to paste:", soft=True) if is_shown else None, where=Where.PAGE
+            ),
+            section("", _paste(run) if is_shown else None),
+            section("", Warned(), where=Where.PAGE),
+            section(
+                "What it means for navigation",
+                *map(Sentence, in_words(drift) if drift else ()),
+                Map(drift) if drift and drift.on_a_map else None,
+                figures("replay_pictures.navigation", drift, history) if drift and history else None,
+            ),
+            section(
+                "",
+                Commands([("next" if not k else "", each) for k, each in enumerate(commands)]) if commands else None,
+                where=Where.TERMINAL,
+            ),
+            section("Held-out verification", *_held_out(result, shown), where=Where.PAGE),
+            section("Estimates", estimate_table(result, shown), where=where),
+            *_over_time(run, shown),
+            section("Data", table_by(STREAMS, streams), where=where),
+            section(
+                "",
+                figures("replay_pictures.data_pictures", result, history, shown) if history else None,
+                where=Where.PAGE,
+            ),
         ],
-        parameters=parameter_texts(result.parameters),
+        parameters=result.parameters,
         lead=first,
         folded=[note for note in run.notes if note.startswith(others)] if warnings is None else (),
     )
@@ -192,37 +246,26 @@ def _headline(run: Replayed, rejected: bool) -> str:
     return f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} {data}"
 
 
-def _mounting(run: Replayed, rejected: bool) -> list[Item]:
-    numbers = Numbers(
-        [
-            Number(
-                _AXES.get(each.name, each.name),
-                each.in_unit(each.value, signed=True),
-                each.in_unit(each.std),
-                each.in_unit(each.nominal),
-                "" if each.shown else "not shown by this data",
-                each.shown,
-            )
-            for each in quantities(run.result)
-        ],
-        is_valid=not rejected,
-    )
-    return [numbers, *([Sentence(against)] if (against := _against(run)) and not rejected else [])]
-
-
-def _against(run: Replayed) -> str:
-    """What the angles are measured against, whose own error no data of this kind tell from the DVL's."""
-    if not MODELS[run.result.selected].aided:
-        return (
-            "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like "
-            "yaw, and driving astern looks like a DVL turned by 180°."
+def _mounting(run: Replayed, rejected: bool) -> Iterator[Item]:
+    """What was found, what the angles are measured against, whose own error stays in them, and what is not shown."""
+    numbers = [
+        Number(
+            _AXES.get(each.name, each.name),
+            each.in_unit(each.value, signed=True),
+            each.in_unit(each.std),
+            each.in_unit(each.nominal),
+            "" if each.shown else "not shown by this data",
+            each.shown,
         )
-    if run.reference_frame in EARTH:
-        return (
-            "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll "
-            "and pitch. Both are harmless as long as the same IMU is used."
-        )
-    return ""
+        for each in quantities(run.result)
+    ]
+    yield Numbers(numbers, is_valid=not rejected)
+    if not rejected and not MODELS[run.result.selected].aided:
+        yield Sentence(AGAINST_TRAVEL)
+    elif not rejected and run.reference_frame in EARTH:
+        yield Sentence(AGAINST_IMU)
+    for lacks, axes in not_shown(run.result).items():
+        yield Sentence(f"? {axes}: not shown by this recording; it needs {lacks}")
 
 
 def _paste(run: Replayed) -> Commands:
@@ -243,109 +286,33 @@ def _paste(run: Replayed) -> Commands:
     return Commands(lines, on_page=[("tf", static)] if static else [])
 
 
-def _navigation(run: Replayed) -> list[Item]:
-    navigation = run.navigation
-    if navigation is None:
-        return []
-
-    history = run.history
-    pictures = [] if history is None else [figures("replay_pictures.navigation", navigation, history)]
-    return [*map(Sentence, in_words(navigation)), *([Map(navigation)] if navigation.on_a_map else []), *pictures]
-
-
-def not_shown(result: Result) -> dict[str, str]:
-    """The axes that the data do not show, by what they lack.
-
-    An angle is that about an axis of the vehicle, and says so where the DVL's own angle of the same name is shown: of a
-    DVL that is mounted across, the vehicle's roll is the DVL's pitch.
-    """
-    shown = {each.name for each in quantities(result) if each.shown}
-    causes: dict[str, dict[str, None]] = {}
-    for entry in result.estimate.observability:
-        if entry.missing:
-            axis = f"the vehicle's {entry.axis} axis" if entry.axis in shown else entry.axis
-            causes.setdefault(entry.missing, {})[axis] = None
-    return {missing: " and ".join(axes) for missing, axes in causes.items()}
-
-
-def _facts(run: Replayed, bags: Sequence[Path]) -> list[tuple[str, str]]:
-    result = run.result
-    dvl, pairing = result.counts["dvl"], result.counts["pairing"]
-    estimate = result.estimate
-    missing = [f"{axes}: shown by {lacking}" for lacking, axes in not_shown(result).items()]
-    used = "references" if MODELS[result.selected].estimator else "DVL samples"
-    return [
-        ("Model", f"{result.selected} ({result.selected_because.sentence}); {estimate.convergence.value}"),
-        *([("Angles", "against the IMU's heading and level")] if run.reference_frame in EARTH else []),
-        ("Recorded", _when(result)),
-        ("DVL data", run.dvl_data),
-        ("Samples", f"{dvl['accepted']} of the DVL, {pairing['paired']} of them paired with GNSS"),
-        ("Used by " + result.selected, f"{estimate.used} {used}, {estimate.gated} rejected as outliers"),
-        *([("Not shown yet", "; ".join(missing))] if missing else []),
-        ("Bags", ", ".join(map(str, bags))),
-    ]
-
-
-def _when(result: Result) -> str:
-    if result.first_ns is None or result.last_ns is None:
-        return "nothing"
-    seconds = (result.last_ns - result.first_ns) * 1e-9
-    unit_s, unit = fitting_unit(seconds)
-    duration = f"{seconds / unit_s:.1f} {unit}"
-    first, last = (datetime.fromtimestamp(ns // 10**9, timezone.utc) for ns in (result.first_ns, result.last_ns))
-    return f"{first:%Y-%m-%d %H:%M:%S} to {last:%Y-%m-%d %H:%M:%S} UTC, {duration}"
-
-
-def _held_out(result: Result, shown: Sequence[str]) -> list[Item]:
+def _held_out(result: Result, shown: Sequence[str]) -> Iterator[Item]:
     """What each model's correction did to data that it had not seen."""
     verifications = {name: result.verifications[name] for name in shown if name in result.verifications}
     judged = {name: each.held_out for name, each in verifications.items() if each.held_out is not None}
-    if not judged:
-        return []
-
-    return [
-        Sentence(
-            "Each block of the run was held back in turn and corrected with a calibration that had not seen it. "
-            "Velocity error against the reference, m/s rms, with the noise of the reference in all of them; predicted "
-            "is what that noise and the uncertainty of the calibration lead one to expect."
-        ),
-        replace(table_by(HELD_OUT, verifications.values()), marked=list(verifications).index(result.selected)),
-        figures("replay_pictures.held_out_picture", judged),
-    ]
+    if judged:
+        yield Sentence(HELD_OUT_NOTE)
+        yield replace(table_by(HELD_OUT, verifications.values()), marked=list(verifications).index(result.selected))
+        yield figures("replay_pictures.held_out_picture", judged)
 
 
-def _families(result: Result, history: RunHistory | None, shown: Sequence[str]) -> list[Section]:
-    """Estimates over time and innovations, for the models with GNSS and for those without."""
-    sections = []
+def _over_time(run: Replayed, shown: Sequence[str]) -> Iterator[Section]:
+    """Estimates over time and innovations, for the models with GNSS and for those without; velocities."""
+    result, history = run.result, run.history
+    if history is None:
+        return
     for aided, title in FAMILIES:
         models = [name for name in shown if MODELS[name].aided == aided and result.estimates[name].used]
-        if models and history is not None:
+        if models:
             drawn = figures("replay_pictures.estimate_pictures", result, history, models)
-            sections.append(Section(title, [Legend(models, result.selected), drawn], Where.PAGE))
-    return sections
-
-
-def _velocity_note(run: Replayed) -> str:
-    estimate = run.result.estimate
-    turned = f"Body frame. Velocities are of the DVL's own place, corrected with the final estimate of {estimate.model}"
-    if run.navigation is None:
-        return f"{turned}. No reference is beside enough of them for residuals."
-    return (
-        f"{turned}; residuals are at the reference point, corrected by estimates that had not seen the data, with all "
-        "that was found, lever arm and delay too. The noise of the reference is in them. Lines are running means."
+            yield section(title, Legend(models, result.selected), drawn, where=Where.PAGE)
+    by = f"Body frame. Velocities are of the DVL's own place, corrected with the final estimate of {result.selected}"
+    yield section(
+        "Velocity before and after correction",
+        Sentence(by + (NO_RESIDUALS if run.navigation is None else RESIDUALS), soft=True),
+        figures("replay_pictures.velocity_pictures", run, history),
+        where=Where.PAGE,
     )
-
-
-_STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pairing", "pairing of DVL and GNSS"))
-
-
-def _stream_table(result: Result) -> Table:
-    rows = []
-    for key, name in _STREAMS:
-        counts = result.counts[key]
-        rest = [f"{value} {what.replace('_', ' ')}" for what, value in counts.items() if value and what != "received"]
-        rows.append((name, str(counts.get("received", "–")), Cell(", ".join(rest) or "–", "text")))
-    return Table(("", "received", Cell("of which", "text")), rows)
 
 
 def next_commands(

@@ -13,7 +13,7 @@ from ..calibration.comparison import Comparison
 from ..disk.atomic import save_bytes
 from ..replay.replay import Replayed
 from .comparison_figures import trend_png
-from .documents import document_of
+from .documents import DOCUMENTS
 from .page import write_document
 from .replay import replayed
 
@@ -28,7 +28,7 @@ def write_report(path: Path, result: Any) -> None:
     if isinstance(result, Comparison) and path.suffix.lower() == ".png":
         save_bytes(path, trend_png(result))
     else:
-        write_document(path, document_of(result))
+        write_document(path, DOCUMENTS[type(result)](result))
 
 
 def write_replay_report(path: Path, run: Replayed, bags: Sequence[Path], models: Sequence[str]) -> None:

@@ -12,8 +12,9 @@ from .document import Cell, Commands, Document, Facts, FindingLine, Map, Numbers
 
 if TYPE_CHECKING:
     from rich.padding import Padding
-    from rich.table import Table as RichTable
     from rich.text import Text
+
+    from .folding import Folding
 
 COLOURS = {
     Severity.ACCEPT: "green",
@@ -53,7 +54,7 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
             yield Text(printable(section.title), "bold")
         for item in section.items:
             if isinstance(item, Table):
-                yield _table(item)
+                yield rich_table(item)
             elif isinstance(item, Sentence):
                 yield Text(printable(item.text), "dim" if item.soft else "")
             elif isinstance(item, FindingLine):
@@ -62,11 +63,9 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
                 for name, line in item.lines:  # to be copied: never broken
                     yield Text(f"{name:5} {line}", no_wrap=True)
             elif isinstance(item, Facts):
-                yield from (Text(printable(f"{name}: {value}")) for name, value in item.facts)
+                yield from (Text(printable(f"{name}: {value}")) for name, value in item.facts.items() if value)
             elif isinstance(item, Numbers):
-                made = _table(item.table)
-                made.style = "none" if item.is_valid else "dim"
-                yield made
+                yield rich_table(item.table, "none" if item.is_valid else "dim")
             elif isinstance(item, Map) and width is not None:
                 yield terminal_map(item.navigation, width)
 
@@ -79,9 +78,12 @@ def _found(reason: Reason) -> Iterator[Padding]:
     yield Padding(Text.assemble(printable(reason.remedy), " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
 
 
-def _table(table: Table) -> RichTable:
+def rich_table(table: Table, style: str = "none") -> Folding:
+    """A table as rich prints it, folded where the terminal is too narrow."""
     from rich import box
     from rich.table import Table as RichTable
+
+    from .folding import Folding
 
     made = RichTable(
         show_header=any(_cell(name).plain for name in table.head),
@@ -90,13 +92,14 @@ def _table(table: Table) -> RichTable:
         box=box.SIMPLE_HEAD,
         caption=" ".join(table.notes) or None,
         caption_justify="left",
+        style=style,
     )
     for index, name in enumerate(table.head):
         is_word = index < table.words
         made.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
     for index, row in enumerate(table.rows):
         made.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
-    return made
+    return Folding(made)
 
 
 def _cell(cell: str | Cell) -> Text:

@@ -37,7 +37,6 @@ SCALES = (
     Term(5, "δk z", "Scale error along z", " %", 100.0),
 )
 ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
-ESTIMATE_COLUMNS = tuple(f"{term.name}, {term.unit.strip()}" for term in (*ANGLES, ANY_SCALE))
 
 
 def _error_terms(estimate: Estimate) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -68,7 +67,7 @@ def estimate_table(result: Result, shown: Sequence[str]) -> Table:
     for name in shown:
         estimate = result.estimates[name]
         nis = f"{estimate.mean_nis / MODELS[name].n_measurement:.2f}" if estimate.used else "–"
-        cells = estimate_cells(estimate, terms)
+        cells = _cells(estimate, terms)
         rows.append((name, *cells, str(estimate.used), str(estimate.gated), nis, estimate.convergence.value))
     return Table(
         ("model", *(f"{term.name}, {term.unit.strip()}" for term in terms), "used", "gated", "NIS/m", "convergence"),
@@ -83,7 +82,7 @@ def estimate_table(result: Result, shown: Sequence[str]) -> Table:
     )
 
 
-def estimate_cells(estimate: Estimate, terms: Sequence[Term] = (*ANGLES, ANY_SCALE)) -> list[str]:
+def _cells(estimate: Estimate, terms: Sequence[Term]) -> list[str]:
     """Error terms with their ±1σ; – where the model has none; ? marks what is not shown."""
     model = MODELS[estimate.model]
     value, std, estimated = _error_terms(estimate)

@@ -11,12 +11,6 @@ from ..diagnosis.series import HeldOutTwin
 from .document import Table
 
 ALL = "all of the run"
-WITHOUT, WITH, ALONE = "without", "with", "twin"
-
-
-def differences(twin: HeldOutTwin, has_effects: bool) -> dict[str, Array]:
-    """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
-    return {WITHOUT: twin.without, WITH: twin.with_effects} if has_effects else {ALONE: twin.without}
 
 
 def rms(values: Array) -> float:
@@ -30,7 +24,7 @@ def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
     for twin in twins:
         noise = float(np.sqrt((twin.noise**2).sum()))
         for regime, mask in {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}.items():
-            errors = [f"{rms(values[mask]):.4f}" for values in differences(twin, has_effects).values()]
+            errors = [f"{rms(values[mask]):.4f}" for values in twin.errors(has_effects).values()]
             rows.append(
                 (twin.name if regime == ALL else "", regime, f"{100.0 * mask.mean():.0f} %", *errors, f"{noise:.4f}")
             )

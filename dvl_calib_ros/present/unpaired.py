@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from ..unpaired.results import (
     ComparedEffect,
     ComparedNoise,
@@ -18,14 +16,13 @@ from .document import (
     Cell,
     Columns,
     Document,
-    Section,
     Sentence,
     Table,
     Where,
     figures,
-    interval,
     intervals,
     p_value,
+    section,
     table_by,
 )
 
@@ -66,8 +63,8 @@ RUNGS_NOTE = (
 NOISE: Columns[ComparedNoise] = {
     "property": lambda each: each.name,
     "": lambda each: Cell(each.status.words, CELLS.get(each.status, "")),
-    "vehicle (95 %)": lambda each: interval(each.vehicle),
-    "simulator (95 %)": lambda each: interval(each.simulator),
+    "vehicle (95 %)": lambda each: intervals({"": each.vehicle}),
+    "simulator (95 %)": lambda each: intervals({"": each.simulator}),
     "unit": lambda each: each.unit,
     "p, adjusted": lambda each: p_value(each.p),
     "remarks": lambda each: each.note,
@@ -76,40 +73,37 @@ NOISE: Columns[ComparedNoise] = {
 
 def unpaired(c: UnpairedComparison) -> Document:
     """What the simulator's DVL lacks, how far the gap shrinks with it, and what could not be told."""
-    needs = [Sentence(f"To tell {each.name}: {each.needs}.") for each in c.effects if each.needs]
     effects = table_by(EFFECTS, c.effects, (EFFECTS_NOTE,), words=len(EFFECTS))
     rungs = table_by(RUNGS, c.rungs, (RUNGS_NOTE.format(MM * c.floor_mps),))
     levels = [(name, *(f"{MM * each:.1f}" for each in both)) for name, both in c.levels.items()]
     sides = {"vehicle": c.vehicle, "simulator": c.simulator}
+    names = sorted({name for side in c.not_shown.values() for name in side})
+    unseen = [(name, *(side.get(name, "would have shown") for side in c.not_shown.values())) for name in names]
     return Document(
         title="The DVL of a simulator against that of the vehicle",
         subtitle="; ".join(f"{side}: {', '.join(name for name, _ in d.recordings)}" for side, d in sides.items()),
         answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [each.full_sentence for each in c.reasons]),
         warnings=c.notes,
         sections=[
-            Section("Effect by effect", [effects, *needs] if c.effects else []),
-            Section(
-                "How far the gap shrinks",
-                [rungs] if c.rungs else [],
+            section(
+                "Effect by effect",
+                effects,
+                *(Sentence(f"To tell {each.name}: {each.needs}.") for each in c.effects if each.needs),
             ),
-            Section("", [figures("unpaired_figures.shrink_pictures", c)] if c.rungs else [], Where.PAGE),
-            Section("Noise and stream", [table_by(NOISE, c.noise, words=len(NOISE))] if c.noise else []),
-            Section("", [Table(LEVELS, levels)] if levels else [], Where.TERMINAL),
-            Section("", [figures("unpaired_figures.noise_pictures", c)], Where.PAGE),
-            Section("What the motions could not have shown", _not_shown(c)),
-            Section(
+            section(
+                "How far the gap shrinks", rungs, figures("unpaired_figures.shrink_pictures", c) if c.rungs else None
+            ),
+            section("Noise and stream", table_by(NOISE, c.noise, words=len(NOISE))),
+            section("", Table(LEVELS, levels), where=Where.TERMINAL),
+            section("", figures("unpaired_figures.noise_pictures", c), where=Where.PAGE),
+            section(
+                "What the motions could not have shown",
+                Table(("effect", *c.not_shown), unseen, words=1 + len(sides)),
+            ),
+            section(
                 "Each side by itself",
-                [Sentence(f"{side}: {d.verdict.value.replace('_', ' ')}. {d.sentence}") for side, d in sides.items()],
-                Where.PAGE,
+                *(Sentence(f"{side}: {d.verdict.value.replace('_', ' ')}. {d.sentence}") for side, d in sides.items()),
+                where=Where.PAGE,
             ),
         ],
     )
-
-
-def _not_shown(c: UnpairedComparison) -> list[Table]:
-    names = sorted({name for side in c.not_shown.values() for name in side})
-    if not names:
-        return []
-    sides: Mapping[str, Mapping[str, str]] = c.not_shown
-    rows = [(name, *(sides[side].get(name, "would have shown") for side in sides)) for name in names]
-    return [Table(("effect", *sides), rows, words=1 + len(sides))]

@@ -7,13 +7,12 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.markup import escape
-
 from dvl_calib_ros import __version__
 from dvl_calib_ros.cli import common
-from dvl_calib_ros.cli.tables import titled
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.present.document import Table as Shown
+from dvl_calib_ros.present.terminal import rich_table
 
 from .motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
 from .pairs_run import by_row, figures, misses, run_pairs, score_pair
@@ -21,7 +20,7 @@ from .plan import KINDS, Case, Family, plan
 from .recorded import NO_RECORDINGS, has_ins, recordings_folder
 from .run import Trial
 from .scored import join
-from .tables import Table, score
+from .tables import score
 from .truth import Category, unseal
 
 DEFAULT_CASES = 100
@@ -97,7 +96,7 @@ def _run(arguments: argparse.Namespace) -> None:
         save_text(arguments.page, result.page(_command(arguments), __version__))
     out = common.console()
     for table in result.tables:
-        out.print(_rich(table))
+        out.print(rich_table(Shown(table.columns, table.rows, table.title)))
     if result.n_failed:
         errors.print(f"[red]{result.n_failed} cases failed[/]; {trial.answers} says how")
 
@@ -147,11 +146,3 @@ def _check(arguments: argparse.Namespace) -> None:
         raise InputError(f"--minutes: {arguments.minutes} is no time; give 0 or more")
     if arguments.seed < 0:
         raise InputError(f"--seed: {arguments.seed} is negative; give 0 or more")
-
-
-def _rich(table: Table) -> object:
-    first, *others = map(escape, table.columns)
-    shown = titled(table.title, [first], others)
-    for row in table.rows:
-        shown.add_row(*map(escape, row))
-    return shown

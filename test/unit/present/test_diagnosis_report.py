@@ -18,7 +18,7 @@ from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.reports import write_report
-from dvl_calib_ros.present.twin_section import spectrum
+from dvl_calib_ros.present.twin_pictures import spectrum
 from dvl_calib_ros.present.twin_table import rms
 from dvl_calib_ros.verdict.reasons import finding
 

@@ -10,9 +10,8 @@ import pytest
 from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.quantities import quantities
+from dvl_calib_ros.calibration.quantities import not_shown, quantities
 from dvl_calib_ros.calibration.results import Result
-from dvl_calib_ros.present.replay import not_shown
 
 
 @cache

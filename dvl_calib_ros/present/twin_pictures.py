@@ -13,7 +13,7 @@ from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
 from .style import Picture, picture
 from .time_axis import TimeAxis
-from .twin_table import ALL, differences, rms
+from .twin_table import ALL, rms
 
 # Points of a spectrum in each decade of frequency
 SPECTRUM_STEPS = 10
@@ -23,7 +23,7 @@ WINDOW_SHARE, WINDOW_S = 1.0 / 100.0, 3.0
 
 def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool) -> Iterable[Picture]:
     """Over time along each axis, by frequency, distribution, and by regime."""
-    found = differences(twin, has_effects)
+    found = twin.errors(has_effects)
     stamps_ns = np.asarray(1e9 * twin.time, dtype=np.int64)
     time = TimeAxis(stamps_ns)
     interval = float(np.median(np.diff(twin.time)))
