@@ -132,8 +132,8 @@ FACTS: Mapping[str, Callable[[Replayed], str]] = {
     "Recorded": _when,
     "DVL data": lambda run: run.dvl_data,
     "Samples": lambda run: (
-        f"{run.result.counts['dvl']['accepted']} of the DVL, {run.result.counts['pairing']['paired']} of them paired "
-        "with GNSS"
+        f"{run.result.counts['dvl']['accepted']} of the DVL, {run.result.counts['pairing']['paired']} with a reference "
+        "velocity at their time"
     ),
     "Used by the model": _used,
 }

@@ -243,7 +243,7 @@ def test_a_model_that_is_none_is_named_with_those_there_are(capsys, bag, models,
 
 def test_replay_shows_estimates_and_counts_and_keeps_warnings_apart(capsys, bag):
     out, errors = succeed(capsys, "replay", bag, bag, "-v", "-p", "prior_source:=initial_window")
-    assert "200 duplicate" in out and "selected: G1" in out
+    assert "200 duplicate" in out and "Model: G1" in out
     assert errors.startswith("warning: prior_source initial_window")
 
 

@@ -41,7 +41,7 @@ MADE = Document(
         Section("Terminal", [Sentence("For the terminal.")], Where.TERMINAL),
         Section("Empty", []),
     ],
-    parameters=[("min_speed", "0.3")],
+    parameters={"min_speed": 0.3},
 )
 
 
