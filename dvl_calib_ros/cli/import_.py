@@ -1,4 +1,4 @@
-"""Turn trajectories in CSV or NPY, and logs of DVLs, into bags.
+"""Turn trajectories in CSV or NPY, and logs of DVLs and autopilots, into bags.
 
 A file holds rows of time and three values; a folder holds recordings NAME_dvl.csv, each with NAME_gnss.csv and
 NAME_attitude.csv where there are such, and becomes one bag per recording. Units are SI and radians; velocities are
@@ -6,8 +6,9 @@ forward-right-down (frd) unless said otherwise and become ROS's forward-left-up;
 forward-right-down body in north-east-down. Files whose header names speed and course (over ground, from true north), or
 heading (of a compass, with pitch and roll or without), are read by their columns; units are in the names (_deg, knots).
 
-A log of Water Linked's JSON reports or of RDI's PD0 ensembles is known by its content. It has its own times: give
---start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.
+A log of Water Linked's JSON reports, of RDI's PD0 ensembles (with the DVL's own heading, pitch and roll) or of
+ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known by its content; so are a receiver's RMC sentences.
+They have their own times: give --start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ from . import common
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument(
-        "dvl", type=Path, metavar="DVL", help="CSV or NPY of DVL velocities, a DVL's own log, or a folder of recordings"
+        "dvl",
+        type=Path,
+        metavar="DVL",
+        help="CSV or NPY of DVL velocities, a log of a DVL or an autopilot, or a folder of recordings",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write (for a folder: folder of bags)")
-    parser.add_argument("--gnss", type=Path, metavar="FILE", help="reference velocities")
+    parser.add_argument("--gnss", type=Path, metavar="FILE", help="reference velocities, or a receiver's NMEA (RMC)")
     parser.add_argument("--attitude", type=Path, metavar="FILE", help="roll, pitch, yaw in north-east-down")
     parser.add_argument("--frame", choices=("frd", "flu"), default="frd", help="of the DVL; default: %(default)s")
     frames = ("frd", "flu", "enu", "ned")

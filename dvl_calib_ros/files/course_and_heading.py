@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration.frames import Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
+from ..calibration.frames import Array
 from ..calibration.samples import ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
-from .trajectories import angular_velocities, cells, numbers_of, stamps_ns
+from .attitudes import imu_samples
+from .trajectories import cells, numbers_of, stamps_ns
 
 KNOT = 1852.0 / 3600.0
 # Units that a column's name may hold, with what takes them to SI
@@ -52,12 +53,7 @@ def read_heading(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]
     rpy[:, 2] = values[:, 0]
     for place, name in enumerate(tilt, start=1):
         rpy[:, ("roll", "pitch").index(name)] = values[:, place]
-    rotations = attitude_enu_flu_from_ned_frd(rpy)
-    rates = angular_velocities(time, rotations)
-    return [
-        ImuSample(at, quaternion_from_rotation(rotation), (x, y, z))
-        for at, rotation, (x, y, z) in zip(stamps_ns(path, time, start_ns), rotations, rates.tolist(), strict=True)
-    ]
+    return imu_samples(stamps_ns(path, time, start_ns), rpy)
 
 
 def _header(path: Path) -> list[str]:

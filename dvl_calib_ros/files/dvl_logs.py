@@ -1,17 +1,21 @@
 """Logs of DVLs as the instruments write them: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
 
+Those of ArduPilot, which hold DVL, GNSS and attitude of one vehicle, are in `ardupilot_logs`.
+
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
 PD0 in instrument or ship axes (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is
 turned. Instrument axes are taken for ship's, as with beam 3 forward; a replay finds a DVL that is mounted otherwise.
+The attitude, where there is no other, is that of its own sensors.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,10 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array
-from ..calibration.samples import DvlSample
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from ..errors import InputError
+from .attitudes import imu_samples
 
 PD0_START = b"\x7f\x7f"
+_DATAFLASH_START, _MAVLINK_STARTS = b"\xa3\x95", (b"\xfe", b"\xfd")
 # Of a file so much is looked at to tell what it is.
 _SNIFFED = 65536
 _FIXED_LEADER, _VARIABLE_LEADER, _BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
@@ -34,10 +40,16 @@ _FLU_FROM_RDI: Array = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1
 
 
 class DvlLog(NamedTuple):
-    """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason."""
+    """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason.
+
+    references, attitudes: what else the log holds. notes: in sentences, what to know of it.
+    """
 
     samples: list[DvlSample]
     left_out: Counter[str]
+    references: Sequence[ReferenceSample] = ()
+    attitudes: Sequence[ImuSample] = ()
+    notes: tuple[str, ...] = ()
 
 
 def is_dvl_log(path: Path) -> bool:
@@ -47,19 +59,32 @@ def is_dvl_log(path: Path) -> bool:
             start = file.read(_SNIFFED)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    if _is_ardupilot_log(path, start):
+        return True
     return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or b'"vx"' in start
+
+
+def _is_ardupilot_log(path: Path, start: bytes) -> bool:
+    """By its first bytes; a telemetry log, whose messages have 8 bytes of time before, by its name as well."""
+    is_telemetry = path.suffix.lower() == ".tlog" and start[8:9] in _MAVLINK_STARTS
+    return is_telemetry or start.startswith(_DATAFLASH_START)
 
 
 def read_dvl_log(path: Path) -> DvlLog:
     """Read a log of either kind. Raises InputError for what is none, or holds no velocity that can be used."""
     content = path.read_bytes()
-    log = _read_json(path, content) if b'"vx"' in content[:_SNIFFED] else _read_pd0(path, content)
+    if _is_ardupilot_log(path, content):
+        from .ardupilot_logs import read_ardupilot_log  # which gives this module's log
+
+        log = read_ardupilot_log(path)
+    else:
+        log = _read_json(path, content) if b'"vx"' in content[:_SNIFFED] else _read_pd0(path, content)
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
         raise InputError(f"{path}: no velocity that can be used ({why})")
     in_order = sorted({sample.stamp_ns: sample for sample in log.samples}.values(), key=lambda each: each.stamp_ns)
     log.left_out["of a time that was there already"] += len(log.samples) - len(in_order)
-    return DvlLog(in_order, +log.left_out)
+    return log._replace(samples=in_order, left_out=+log.left_out)
 
 
 # ---------------------------------------------------------------------- Water Linked
@@ -138,16 +163,33 @@ def _ensembles(content: bytes) -> Iterator[dict[int, bytes]]:
 
 def _read_pd0(path: Path, content: bytes) -> DvlLog:
     samples: list[DvlSample] = []
+    attitudes: dict[int, tuple[float, float, float]] = {}
     left_out: Counter[str] = Counter()
     for data in _ensembles(content):
         try:
             sample = _pd0_sample(path, data, left_out)
+            if sample is not None:
+                samples.append(sample)
+                attitudes[sample.stamp_ns] = _pd0_attitude(data)
         except (struct.error, IndexError, KeyError, ValueError):
             left_out["damaged"] += 1
-            continue
-        if sample is not None:
-            samples.append(sample)
-    return DvlLog(samples, left_out)
+    rpy = np.array([attitudes[at] for at in sorted(attitudes)]).reshape(-1, 3)
+    if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: what was typed in, or 0
+        return DvlLog(samples, left_out)
+    note = (
+        f"{path}: heading, pitch and roll are those of the DVL's own sensors, the heading magnetic but for what "
+        "was set (EB); give --attitude for another's"
+    )
+    return DvlLog(samples, left_out, attitudes=imu_samples(sorted(attitudes), rpy), notes=(note,))
+
+
+def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float]:
+    """Roll, pitch, heading, rad. Pitch of a sensor that tilts with the DVL: tan P = tan T1 · cos T2 (RDI, "ADCP
+    Coordinate Transformation", 2008, eq. 19)."""
+    heading, tilt_1, tilt_2 = struct.unpack_from("<H2h", data[_VARIABLE_LEADER], 18)
+    roll = math.radians(0.01 * tilt_2)
+    pitch = math.atan(math.tan(math.radians(0.01 * tilt_1)) * math.cos(roll))
+    return roll, pitch, math.radians(0.01 * heading)
 
 
 def _pd0_sample(path: Path, data: dict[int, bytes], left_out: Counter[str]) -> DvlSample | None:

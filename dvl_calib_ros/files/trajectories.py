@@ -12,6 +12,7 @@ import math
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +21,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bags.writer import BagWriter, Compression, Storage
-from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
+from ..calibration.frames import FLU_FROM_FRD, Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SampleWriter
-from .dvl_logs import is_dvl_log, read_dvl_log
+from .attitudes import imu_samples
+from .dvl_logs import DvlLog, is_dvl_log, read_dvl_log
 
 N_COLUMNS = 4
 FRAMES = ("frd", "flu", "enu", "ned")  # those of a body first
@@ -197,26 +199,7 @@ def read_attitude(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample
     """
     time, rpy, left_out = read_columns(path, "rad")
     notes += left_out
-    rotations = attitude_enu_flu_from_ned_frd(rpy)
-    rates = angular_velocities(time, rotations)
-    return [
-        ImuSample(at, quaternion_from_rotation(rotation), (x, y, z))
-        for at, rotation, (x, y, z) in zip(stamps_ns(path, time, start_ns), rotations, rates.tolist(), strict=True)
-    ]
-
-
-def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
-    """Angular velocity (N, 3) rad/s in the body frame of a run of attitudes (N, 3, 3) at times (N,) s.
-
-    That of a smooth curve through them, at the times themselves: the mean rate from each to the next is half an
-    interval late, which at 1 Hz costs a lever arm of 2 m 3 cm/s in turns.
-    """
-    from scipy.spatial.transform import Rotation, RotationSpline
-
-    if len(time) < 2:
-        return np.zeros((len(time), 3))
-    rates: Array = RotationSpline(time, Rotation.from_matrix(rotation_enu_from_body))(time, 1)
-    return rates
+    return imu_samples(stamps_ns(path, time, start_ns), rpy)
 
 
 @dataclass(frozen=True)
@@ -278,27 +261,39 @@ def import_recording(
     if os.path.lexists(output):
         raise InputError(f"{output}: exists already; give another name, or remove it first")
     start_ns = options.start_ns
-    left_out: dict[str, int] = {}
     notes: list[str] = []
     if dvl.is_file() and dvl.suffix not in (".csv", ".npy") and is_dvl_log(dvl):
-        dvl_samples, left_out = read_dvl_log(dvl)
+        log = read_dvl_log(dvl)
     else:
-        dvl_samples = read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes)
-    from .course_and_heading import names_columns, read_course, read_heading  # which read by this module's functions
-
-    if gnss is not None and names_columns(gnss, "speed", "course"):
-        references = read_course(gnss, start_ns, options.gnss_std, notes)
+        log = DvlLog(read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes), Counter())
+    references = list(log.references) if gnss is None else _references(gnss, options, notes)
+    if attitude is None:
+        attitudes = list(log.attitudes)
+        notes += log.notes
     else:
-        references = read_reference(gnss, start_ns, options.gnss_frame, options.gnss_std, notes) if gnss else []
-    if attitude is not None and names_columns(attitude, "heading"):
-        attitudes = read_heading(attitude, start_ns, notes)
-    else:
-        attitudes = read_attitude(attitude, start_ns, notes) if attitude else []
+        attitudes = _attitudes(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
-        SampleWriter(bag).recording(attitudes, references, dvl_samples)
-    written = {"dvl/twist": len(dvl_samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
-    written |= {f"reports {reason}, left out": count for reason, count in left_out.items()}
+        SampleWriter(bag).recording(attitudes, references, log.samples)
+    written = {"dvl/twist": len(log.samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
+    written |= {f"reports {reason}, left out": count for reason, count in log.left_out.items()}
     return Imported(written, tuple(notes))
+
+
+def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
+    from .course_and_heading import names_columns, read_course  # which reads by this module's functions
+    from .nmea import is_nmea, read_rmc
+
+    if is_nmea(path):
+        return read_rmc(path, options.gnss_std, notes)
+    if names_columns(path, "speed", "course"):
+        return read_course(path, options.start_ns, options.gnss_std, notes)
+    return read_reference(path, options.start_ns, options.gnss_frame, options.gnss_std, notes)
+
+
+def _attitudes(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
+    from .course_and_heading import names_columns, read_heading
+
+    return (read_heading if names_columns(path, "heading") else read_attitude)(path, start_ns, notes)
 
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, Imported]:

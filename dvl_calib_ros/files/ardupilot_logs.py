@@ -1,0 +1,145 @@
+"""Logs of ArduPilot: DataFlash (.BIN) of the autopilot and telemetry (.tlog) of a ground station.
+
+Both hold what the autopilot got of the DVL (VISO, VISION_POSITION_DELTA: how far it moved, forward-right-down), what
+the GNSS receiver said (GPS, GPS_RAW_INT; not what the autopilot's filter makes of it, which took the DVL in) and its
+attitude (ATT, ATTITUDE). Names and units are those of ArduPilot's log messages and of MAVLink's common messages. They
+are read by pymavlink. Telemetry is stamped as it arrived.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections import Counter
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..calibration.frames import FLU_FROM_FRD, Array
+from ..calibration.samples import DvlSample, ReferenceSample, VelocityFrame
+from ..errors import InputError
+from .attitudes import imu_samples
+from .dvl_logs import DvlLog
+
+# A 3-D fix.
+_FIX = 3
+# An interval of more is no s, but µs: ArduPilot's own messages say both.
+_LONGEST_S = 5.0
+
+
+def read_ardupilot_log(path: Path) -> DvlLog:
+    """Read a log of either kind. Raises InputError where pymavlink is not installed, or the log has no DVL."""
+    try:
+        from pymavlink import mavutil
+    except ImportError as error:
+        raise InputError(f"{path}: is read by pymavlink; pip install 'dvl_calib_ros[ardupilot]'") from error
+    read = _Read()
+    wanted = list(_TAKERS)
+    try:
+        with redirect_stdout(_Deaf()), redirect_stderr(_Deaf()):  # a line of each damaged byte
+            log = mavutil.mavlink_connection(str(path), notimestamps=False)
+            while (message := log.recv_match(type=wanted)) is not None:
+                read.take(message)
+    except Exception as error:  # what a damaged log makes pymavlink raise has no common class
+        if not read.moved:
+            raise InputError(f"{path}: cannot be read as a log of ArduPilot ({error})") from error
+        read.left_out["behind damage"] += 1
+    return read.finished()
+
+
+class _Deaf(io.TextIOBase):
+    """Takes what pymavlink prints."""
+
+    def write(self, text: str) -> int:
+        return len(text)
+
+
+class _Read:
+    """Messages of one vehicle so far."""
+
+    def __init__(self) -> None:
+        self.left_out: Counter[str] = Counter()
+        self.moved: list[tuple[int, list[float]]] = []  # stamp, velocity forward-right-down
+        self.fixes: list[tuple[int, list[float]]] = []  # stamp, velocity north-east-down
+        self.turned: list[tuple[int, list[float]]] = []  # stamp, roll, pitch, yaw
+        self._vehicle: int | None = None
+
+    def take(self, message: Any) -> None:
+        """One message; another vehicle's is left out."""
+        source = getattr(message, "get_srcSystem", lambda: 0)()
+        if self._vehicle is None:
+            self._vehicle = source
+        if source != self._vehicle:
+            self.left_out["of another vehicle"] += 1
+            return
+        stamp_ns = round(message._timestamp * 1e9)
+        if not 0 < stamp_ns < 2**31 * 1_000_000_000:
+            self.left_out["without a time"] += 1
+            return
+        _TAKERS[message.get_type()](self, stamp_ns, message)
+
+    def _delta(self, stamp_ns: int, metres: Array, seconds: float, is_good: bool) -> None:
+        if not (is_good and seconds > 0.0 and np.isfinite(metres).all()):
+            self.left_out["without bottom lock"] += 1
+            return
+        # the mean over the interval, so of its middle
+        self.moved.append((stamp_ns - round(0.5e9 * seconds), (metres / seconds).tolist()))
+
+    def viso(self, stamp_ns: int, m: Any) -> None:
+        seconds = m.dt if m.dt < _LONGEST_S else 1e-6 * m.dt
+        self._delta(stamp_ns, np.array([m.PosDX, m.PosDY, m.PosDZ]), seconds, m.conf > 0.0)
+
+    def vision_position_delta(self, stamp_ns: int, m: Any) -> None:
+        self._delta(stamp_ns, np.array(m.position_delta), 1e-6 * m.time_delta_usec, m.confidence > 0.0)
+
+    def gps(self, stamp_ns: int, m: Any) -> None:
+        if getattr(m, "I", 0) == 0:
+            self._fix(stamp_ns, m.Status, m.Spd, m.GCrs, m.VZ)
+
+    def gps_raw_int(self, stamp_ns: int, m: Any) -> None:
+        if m.vel == 65535 or m.cog == 65535:
+            self.left_out["without a velocity of GNSS"] += 1
+            return
+        self._fix(stamp_ns, m.fix_type, 0.01 * m.vel, 0.01 * m.cog, 0.0)  # no vertical: exactly 0 says so
+
+    def _fix(self, stamp_ns: int, status: int, speed: float, course_deg: float, down: float) -> None:
+        if status < _FIX or not math.isfinite(speed + course_deg + down):
+            self.left_out["without a fix"] += 1
+            return
+        course = math.radians(course_deg)
+        self.fixes.append((stamp_ns, [speed * math.cos(course), speed * math.sin(course), down]))
+
+    def att(self, stamp_ns: int, m: Any) -> None:
+        self.turned.append((stamp_ns, [math.radians(each) for each in (m.Roll, m.Pitch, m.Yaw)]))
+
+    def attitude(self, stamp_ns: int, m: Any) -> None:
+        self.turned.append((stamp_ns, [m.roll, m.pitch, m.yaw]))
+
+    def finished(self) -> DvlLog:
+        """Samples in order of time."""
+        samples = [DvlSample(at, _tuple(FLU_FROM_FRD @ np.array(each)), None) for at, each in self.moved]
+        references = [ReferenceSample(at, _tuple(each), None, VelocityFrame.NED) for at, each in _in_order(self.fixes)]
+        turned = _in_order(self.turned)
+        attitudes = imu_samples([at for at, _ in turned], np.array([each for _, each in turned]).reshape(-1, 3))
+        return DvlLog(samples, self.left_out, references, attitudes)
+
+
+def _in_order(rows: list[tuple[int, list[float]]]) -> list[tuple[int, list[float]]]:
+    return sorted({at: (at, each) for at, each in rows if np.isfinite(each).all()}.values())
+
+
+def _tuple(values: Any) -> tuple[float, float, float]:
+    x, y, z = (float(each) + 0.0 for each in values)
+    return x, y, z
+
+
+_TAKERS = {
+    "VISO": _Read.viso,
+    "VISION_POSITION_DELTA": _Read.vision_position_delta,
+    "GPS": _Read.gps,
+    "GPS_RAW_INT": _Read.gps_raw_int,
+    "ATT": _Read.att,
+    "ATTITUDE": _Read.attitude,
+}

@@ -1,0 +1,35 @@
+"""Attitudes of a log as IMU samples, with the angular velocity that they imply."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..calibration.frames import Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
+from ..calibration.samples import ImuSample
+
+
+def imu_samples(stamps_ns: Sequence[int], rpy: Array) -> list[ImuSample]:
+    """Roll, pitch, yaw (N, 3) rad of a forward-right-down body in north-east-down, at increasing stamps."""
+    rotations = attitude_enu_flu_from_ned_frd(rpy)
+    time = 1e-9 * (np.array(stamps_ns, dtype=np.int64) - (stamps_ns[0] if len(stamps_ns) else 0))
+    rates = angular_velocities(time, rotations).tolist()
+    return [
+        ImuSample(at, quaternion_from_rotation(rotation), (x, y, z))
+        for at, rotation, (x, y, z) in zip(stamps_ns, rotations, rates, strict=True)
+    ]
+
+
+def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
+    """Angular velocity (N, 3) rad/s in the body frame of a run of attitudes (N, 3, 3) at times (N,) s.
+
+    That of a smooth curve through them, at the times themselves: the mean rate from each to the next is half an
+    interval late, which at 1 Hz costs a lever arm of 2 m 3 cm/s in turns.
+    """
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    if len(time) < 2:
+        return np.zeros((len(time), 3))
+    rates: Array = RotationSpline(time, Rotation.from_matrix(rotation_enu_from_body))(time, 1)
+    return rates

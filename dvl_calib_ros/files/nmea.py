@@ -1,0 +1,72 @@
+"""Velocities of a GNSS receiver's NMEA 0183 sentences: RMC, which has time, date, speed and course.
+
+Lines may have anything before the sentence, as loggers write it; a sentence whose checksum is wrong is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from ..calibration.samples import ReferenceSample, VelocityFrame
+from ..errors import InputError
+from .course_and_heading import KNOT
+
+_RMC = re.compile(rb"\$(\w{2}RMC,[^*\r\n]*)\*([0-9A-Fa-f]{2})")
+_SNIFFED = 65536
+# Slower than this, m/s, a receiver gives no course, and none matters.
+_STANDING = 0.05
+
+
+def is_nmea(path: Path) -> bool:
+    """Whether RMC sentences are in the beginning of a file."""
+    try:
+        with path.open("rb") as file:
+            return _RMC.search(file.read(_SNIFFED)) is not None
+    except OSError:
+        return False  # said by who reads it
+
+
+def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
+    """Velocities in ENU without a vertical (exactly 0), stamped by UTC; std (m/s) 0: covariance not given.
+
+    notes: gets what is left out. Raises InputError if there is none that can be used.
+    """
+    covariance = np.eye(3) * std**2 if std else None
+    found: dict[int, ReferenceSample] = {}
+    damaged = without = 0
+    for text, checksum in _RMC.findall(path.read_bytes()):
+        if _xor(text) != int(checksum, 16):
+            damaged += 1
+            continue
+        try:
+            fields = text.decode("ascii").split(",")
+            speed = float(fields[7]) * KNOT
+            course = math.radians(float(fields[8])) if fields[8] or speed > _STANDING else 0.0
+            at = datetime.strptime(fields[9] + fields[1].partition(".")[0], "%d%m%y%H%M%S").replace(tzinfo=timezone.utc)
+            fraction = float("0." + (fields[1].partition(".")[2] or "0"))
+            if fields[2] != "A" or not 0.0 <= speed < 100.0:
+                raise ValueError
+        except (ValueError, IndexError):
+            without += 1
+            continue
+        stamp_ns = int(at.timestamp()) * 1_000_000_000 + round(fraction * 1e9)
+        velocity = speed * math.sin(course), speed * math.cos(course), 0.0
+        found[stamp_ns] = ReferenceSample(stamp_ns, velocity, covariance, VelocityFrame.ENU)
+    if not found:
+        raise InputError(f"{path}: no RMC sentence with a fix, time, date, speed and course in it")
+    for count, why in ((damaged, "have a wrong checksum"), (without, "have no fix, time, speed or course")):
+        if count:
+            notes.append(f"{path}: {count} RMC sentences {why}, left out")
+    return [found[at] for at in sorted(found)]
+
+
+def _xor(text: bytes) -> int:
+    value = 0
+    for byte in text:
+        value ^= byte
+    return value
