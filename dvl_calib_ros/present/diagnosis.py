@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from ..calibration.frames import Array
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect
-from ..diagnosis.series import BODY_AXES, DiagnosisSeries
+from ..diagnosis.series import BODY_AXES, DiagnosisSeries, HeldOutTwin
 from ..diagnosis.where import GapPlace
 from ..effects.registry import EFFECTS
 from .document import (
@@ -37,7 +38,6 @@ from .document import (
     three,
     with_std,
 )
-from .twin_table import twin_table
 
 NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",
@@ -46,6 +46,7 @@ NOISE_MEANING = {
     "reported_covariance": "how the noise follows covariances that differ by sample: 1 as claimed, 0 not at all",
     "coloured_reference_noise": "the noise has a memory",
 }
+ALL = "all of the run"
 MAX_PLACES = 12
 PLACES = "Share: of the gap's energy. Places overlap: only the axes over all of the run add up."
 EFFECTS_NOTE = (
@@ -254,5 +255,32 @@ def _detectable_table(d: Diagnosis) -> Table:
         notes=(
             "The size that this data would show four times in five at the level of the tests; green where that is no "
             "more than the size worth knowing of.",
+        ),
+    )
+
+
+def rms(values: Array) -> float:
+    """m/s of the vector, of values (N, 3)."""
+    return float(np.sqrt((values**2).sum(axis=1).mean())) if len(values) else float("nan")
+
+
+def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
+    """Error of every recording in every regime of motion, m/s."""
+    rows = []
+    for twin in twins:
+        noise = float(np.sqrt((twin.noise**2).sum()))
+        for regime, mask in {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}.items():
+            errors = [f"{rms(values[mask]):.4f}" for values in twin.errors(has_effects).values()]
+            rows.append(
+                (twin.name if regime == ALL else "", regime, f"{100.0 * mask.mean():.0f} %", *errors, f"{noise:.4f}")
+            )
+    heads = ("without, m/s", "with, m/s") if has_effects else ("recorded less twin, m/s",)
+    return Table(
+        ("recording", "regime", "share", *heads, "noise, m/s"),
+        rows,
+        notes=(
+            "Rms of the vector, noise of DVL and reference included, where there is a reference: the error and the "
+            "noise at the top are these, of all recordings. The twin moves as the reference says, and its parameters "
+            "had not seen the samples that it is compared with.",
         ),
     )

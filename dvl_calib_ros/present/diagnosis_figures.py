@@ -12,9 +12,8 @@ from scipy.stats import norm
 from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
 from .replay_figures import AFTER, BAD
-from .series import running_mean
 from .style import FAINT, INK, legend_above, new_figure, plain_log_ticks
-from .time_axis import TimeAxis
+from .time_axis import TimeAxis, running_mean
 
 # Points of a line: running means are smooth, so more cannot be seen
 LINE_POINTS = 300

@@ -13,9 +13,8 @@ from ..diagnosis.results import Diagnosis
 from ..diagnosis.series import DiagnosisSeries
 from . import diagnosis_figures as figures
 from .document import share
-from .series import running_mean
 from .style import Picture, picture
-from .time_axis import CUT_FROM_S, TimeAxis
+from .time_axis import CUT_FROM_S, TimeAxis, running_mean
 
 # Lines over time are means over this share of the run, and over so many seconds at least
 WINDOW_SHARE, WINDOW_S = 1.0 / 50.0, 5.0

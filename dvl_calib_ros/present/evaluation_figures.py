@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from ..calibration.frames import Array
 from .evaluation import CLAIMED
 from .exploring import mark_time
-from .series import running_mean
 from .style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
 from .style import plain_log_ticks as log_ticks
+from .time_axis import running_mean
 
 # Seconds beyond the longest window at which "all" of a run stands
 ALL_STANDS_S = 40.0

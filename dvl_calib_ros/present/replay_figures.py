@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from ..calibration.frames import Array
-from .series import running_mean, thin
 from .style import (
     FAINT,
     INK,
@@ -21,7 +20,7 @@ from .style import (
     new_figure,
     plain_log_ticks,
 )
-from .time_axis import TimeAxis
+from .time_axis import TimeAxis, running_mean, thin
 
 GOOD, WARNING, BAD, AFTER = "#2a7f62", "#e0a030", "#c0392b", "#1f6fb2"
 

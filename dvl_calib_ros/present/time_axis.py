@@ -1,4 +1,4 @@
-"""Time of a run as figures show it: from its start, in a fitting unit, without the hours between two bags."""
+"""Time and series of a run as figures show them: from its start, in a fitting unit, without hours between two bags."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from ..calibration.frames import Array
 from .document import fitting_unit
 from .exploring import BREAK_MARK, mark_time
 
+# Points of a line: more cannot be seen at this width
+LINE_POINTS = 600
 # A gap is cut out if it is longer than this (s) and than this share of what was recorded in all ...
 CUT_FROM_S, CUT_SHARE = 60.0, 0.2
 # ... and this share of it is left.
@@ -53,3 +55,19 @@ class TimeAxis:
                 start, end, facecolor="white", edgecolor="#c5cbd0", hatch="////", linewidth=0.0, zorder=3,
                 gid=BREAK_MARK,
             )  # fmt: skip
+
+
+def thin(n: int) -> slice:
+    """Every so many-th of n points, and so that the last one is among them."""
+    step = max(1, -(-n // LINE_POINTS))
+    return slice((n - 1) % step if n else 0, None, step)
+
+
+def running_mean(t: Array, values: Array, points: int = 31) -> tuple[Array, Array]:
+    """Positions and mean of so many neighbours; of fewer where there are not enough, nan across a gap."""
+    width = max(1, min(points, len(values) // 5))
+    window = np.ones(width) / width
+    mean = np.convolve(values, window, "valid")
+    duration = t[width - 1 :] - t[: len(t) - width + 1]
+    mean[duration > 2.0 * np.median(duration)] = np.nan
+    return np.convolve(t, window, "valid"), mean

@@ -11,9 +11,9 @@ from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
 from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
+from .diagnosis import ALL, rms
 from .style import Picture, picture
 from .time_axis import TimeAxis
-from .twin_table import ALL, rms
 
 # Points of a spectrum in each decade of frequency
 SPECTRUM_STEPS = 10

@@ -13,8 +13,8 @@ from ..calibration.frames import Array
 from ..unpaired.results import UnpairedComparison
 from ..unpaired.shrink import ALL, AS_IT_IS, NOISE, Shrunk
 from .replay_figures import AFTER, BAD
-from .series import running_mean
 from .style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
+from .time_axis import running_mean
 
 DVL_AXES = ("x", "y", "z")
 # Lines over time are means over this share of the run
