@@ -74,6 +74,11 @@ def _rows(model: Model, parameters: Parameters) -> Array:
     return rows
 
 
+def is_good_enough(model: Model) -> Reason:
+    """What is said of a model's calibration whose drift is within its target."""
+    return finding("NEXT_IS_GOOD" if model.scale_axes else "NEXT_IS_GOOD_BUT_SCALE")
+
+
 def noise_of_a_second(estimate: Estimate, parameters: Parameters, seconds: float, mean_square_speed: float) -> float:
     """`RecentMotion.noise`, as the filter's information shows it after so many s of motion at this mean square speed.
 
@@ -97,7 +102,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     target, rows = parameters.target_drift, _rows(model, parameters)
     now = predicted_drift(model, estimate.recording_covariance, parameters)
     if now.both <= target:
-        return Outlook(finding("NEXT_IS_GOOD" if model.scale_axes else "NEXT_IS_GOOD_BUT_SCALE"), None)
+        return Outlook(is_good_enough(model), None)
     if not estimate.used or motion.speed < parameters.min_speed or motion.speed <= 0.0:
         return Outlook(finding("NEXT_WAIT"), None)
     # samples of a minute are not as independent as a filter takes them for: by so much

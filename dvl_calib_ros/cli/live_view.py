@@ -71,6 +71,8 @@ def rendered(status: Status | None, now_s: float, log: Sequence[str] = (), said:
     lines += [_goal(status, *each) for each in GOALS if f"goal {each[0]} [%]" in status.values]
     lines.append(text(_rose(status)))
     if is_usable:
+        if taken_back := status.values.get("taken back", ""):
+            lines.append(text(taken_back, "yellow"))
         seconds = status.get("seconds")
         about = "" if seconds == "-" else f", about {_duration(seconds)} until good enough"
         style = "bold green" if "GOOD" in status.get("next code") else "bold"

@@ -17,15 +17,72 @@ from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import rpy_std, scale_and_delay
 from ..calibration.results import Estimate
-from ..calibration.worth import KM, Outlook, RecentMotion, noise_of_a_second, outlook, predicted_drift
-from ..verdict.reasons import finding
+from ..calibration.worth import (
+    KM,
+    Outlook,
+    PredictedDrift,
+    RecentMotion,
+    is_good_enough,
+    noise_of_a_second,
+    outlook,
+    predicted_drift,
+)
+from ..verdict.reasons import Reason, finding
 
 # What to drive next is thought of anew so often, s: it takes a few milliseconds.
 THOUGHT_OF_EVERY_S = 5.0
+# What is predicted differs from look to look, by up to twice: the median of so long is told, s. It is good enough when
+# it has stood for so long, s, and no longer from so many times the goal on: of 25 blocks a σ is known to a
+# quarter.
+TOLD_OVER_S, STANDS_S, TAKEN_BACK = 60.0, 30.0, 1.25
 # Rates are means over so many statuses.
 RATED_OVER = 10
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 _STREAMS = {"dvl": "dvl", "reference": "gnss", "imu": "imu"}
+
+
+class Worth:
+    """What a calibration is worth of late, whether that is good enough, and why it no longer is.
+
+    taken_back: None but after it was, until it is again.
+    """
+
+    def __init__(self) -> None:
+        self._model = ""
+        self._looks: deque[tuple[float, PredictedDrift]] = deque()
+        self._within_since_s: float | None = None
+        self.is_good = False
+        self.taken_back: Reason | None = None
+
+    def look(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
+        """What is told of the drift, with this one. rejected: whether a replay would reject the calibration."""
+        was_good = self.is_good
+        if rejected or model != self._model:
+            self._looks.clear()
+            self._model, self._within_since_s, self.is_good = model, None, False
+            if rejected:
+                self.taken_back = None  # the findings say why
+            elif was_good:
+                self.taken_back = finding("WORTH_OF_ANOTHER_MODEL", model=model)
+        self._looks.append((now_s, drift))
+        while self._looks[0][0] < now_s - TOLD_OVER_S:
+            self._looks.popleft()
+        told = PredictedDrift(
+            *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
+        )
+        if rejected or told.both > target * (TAKEN_BACK if self.is_good else 1.0):
+            if self.is_good:
+                self.taken_back = finding("WORTH_HAS_FALLEN", worth=told.both)
+            self.is_good, self._within_since_s = False, None
+        elif self._within_since_s is None:
+            self._within_since_s = now_s
+        if self.seconds_left(now_s) == 0.0:
+            self.is_good, self.taken_back = True, None
+        return told
+
+    def seconds_left(self, now_s: float) -> float:
+        """How long the drift has to stay within the goal until that is good enough, s."""
+        return STANDS_S - (0.0 if self._within_since_s is None else min(now_s - self._within_since_s, STANDS_S))
 
 
 class Card:
@@ -37,8 +94,9 @@ class Card:
         self._came_s: dict[str, float] = {}
         self._driven_s = dict.fromkeys(SECTORS, 0.0)
         self._squares, self._looks = 0.0, 0
+        self._worth = Worth()
         self._outlook: Outlook | None = None
-        self._was_good, self._thought_s = False, -math.inf
+        self._thought_s = -math.inf
 
     def values(
         self,
@@ -79,10 +137,10 @@ class Card:
             if motion.heading is not None and self._received[-1][0] == self._came_s.get("dvl"):
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
                 self._driven_s[SECTORS[sector]] += now_s - (self._received[-2][0] if len(self._received) > 1 else now_s)
-        drift = predicted_drift(model, estimate.recording_covariance, parameters)
-        is_good = drift.both <= parameters.target_drift
-        if now_s - self._thought_s >= THOUGHT_OF_EVERY_S or self._outlook is None or is_good is not self._was_good:
-            self._was_good = is_good  # the bars and what is next say the same
+        target, worth = parameters.target_drift, self._worth
+        now = predicted_drift(model, estimate.recording_covariance, parameters)
+        drift = worth.look(model.name, now, target, now_s, rejected)
+        if now_s - self._thought_s >= THOUGHT_OF_EVERY_S or self._outlook is None:
             self._thought_s = now_s
             first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
             seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
@@ -92,19 +150,26 @@ class Card:
             if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
                 moving = moving._replace(speed=max(moving.speed, math.sqrt(self._squares / max(self._looks, 1))))
             self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
-        found = Outlook(finding("NEXT_REJECTED"), None) if rejected else self._outlook
+        found = self._outlook
+        if rejected:
+            found = Outlook(finding("NEXT_REJECTED"), None)
+        elif worth.is_good:
+            found = Outlook(is_good_enough(model), None)
+        elif drift.both <= target or found.next.code == is_good_enough(model).code:
+            found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(now_s))
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
-            "side": _done(drift.side, unknown[0], parameters.target_drift / math.sqrt(2.0)),
-            "ahead": _done(drift.ahead, unknown[1], parameters.target_drift / math.sqrt(2.0)),
-            "worth": _done(drift.both, math.hypot(*unknown), parameters.target_drift),
+            "side": _done(drift.side, unknown[0], target / math.sqrt(2.0)),
+            "ahead": _done(drift.ahead, unknown[1], target / math.sqrt(2.0)),
+            "worth": 100.0 if worth.is_good else min(_done(drift.both, math.hypot(*unknown), target), 99.0),
         }
         return {
             "worth": f"{drift.both:.2f}",
             "worth to the side": f"{drift.side:.2f}",
             "worth ahead": "-" if math.isnan(drift.ahead) else f"{drift.ahead:.2f}",
-            "target": f"{parameters.target_drift:g}",
+            "target": f"{target:g}",
             **{f"goal {name} [%]": f"{share:.0f}" for name, share in goals.items() if not math.isnan(share)},
+            "taken back": "" if worth.taken_back is None else worth.taken_back.sentence,
             "next": found.next.sentence,
             "next code": found.next.code,
             "seconds": "-" if found.seconds is None else f"{found.seconds:.0f}",

@@ -21,10 +21,27 @@ MANOEUVRES = (
         "nothing: the findings say why this calibration is not to be used",
         "A replay would reject it: more data of the same kind do not help.",
     ),
+    _Said(
+        "NEXT_STANDS",
+        "keep on: the goal is reached, if it stays so",
+        "What is predicted differs from second to second, so that it has to stand for half a minute.",
+    ),
     _Said("NEXT_IS_GOOD", "good enough: save", "The predicted drift is within target_drift."),
     _Said(
         "NEXT_IS_GOOD_BUT_SCALE",
         "as good as it gets without a reference: save; the scale stays unknown",
         "The drift by yaw is within target_drift. Only a reference velocity shows a scale.",
+    ),
+    _Said(
+        "WORTH_OF_ANOTHER_MODEL",
+        "no longer good enough: the model is {model} now",
+        "Model auto follows the reference. In an outage a model without a reference is in use, and would be saved.",
+        remedy="Wait for the reference, or name the model.",
+    ),
+    _Said(
+        "WORTH_HAS_FALLEN",
+        "no longer good enough: the predicted drift has grown to {worth:.1f} m per km",
+        "Newer data differ from the older by more than the σ had claimed.",
+        remedy="Drive on. If it happens again, look for the cause with `dvl-calib doctor`.",
     ),
 )

@@ -67,6 +67,8 @@ def test_the_view_shows_the_mounting_what_it_is_worth_and_what_to_drive():
 
 def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_used():
     assert "next: good enough: save\n" in drawn(status(**GOOD), 100.0)
+    back = drawn(status(**{"taken back": "no longer good enough: the model is A1 now"}), 100.0)
+    assert "no longer good enough: the model is A1 now\nnext: drive straight" in back
     assert "not to be used" not in drawn(status(2, "no DVL message for 7 s"), 100.0)
     wrong = drawn(status(2, "the data contradict the configuration", usable="no", **GOOD), 100.0)
     assert "not to be used" in wrong and "good enough: save" not in wrong

@@ -11,8 +11,8 @@ from runs import MatchedRun, calibrate, make_samples
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.calibration.worth import predicted_drift
-from dvl_calib_ros.node.card import SECTORS, THOUGHT_OF_EVERY_S, Card
+from dvl_calib_ros.calibration.worth import PredictedDrift, predicted_drift
+from dvl_calib_ros.node.card import SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, Worth
 
 RUN = MatchedRun("box", 120.0, (0.0, 0.0, 0.05), dvl_std=0.01, gnss_std=0.03, frame=VelocityFrame.ENU)
 
@@ -74,14 +74,60 @@ def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
     assert len(calls) == 1 + 10 // THOUGHT_OF_EVERY_S
 
 
-def test_bars_that_are_full_and_what_to_drive_next_say_the_same_at_once():
-    card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="G1"))
+def looks(card, calibrator, factors):
+    """What the card says each second of the estimate with its σ so many times larger."""
     estimate = calibrator.estimate()
-    coarse = replace(estimate, recording_covariance=1e4 * estimate.recording_covariance)
-    assert "GOOD" not in card.values(calibrator, coarse, counts(9), 1.0)["next code"]
-    fine = replace(estimate, recording_covariance=1e-4 * estimate.recording_covariance)
-    said = card.values(calibrator, fine, counts(9), 2.0)
-    assert said["goal worth [%]"] == "100" and said["next code"] == "NEXT_IS_GOOD"
+    for second, factor in enumerate(factors):
+        each = replace(estimate, recording_covariance=factor**2 * estimate.recording_covariance)
+        yield card.values(calibrator, each, counts(second), float(second))
+
+
+@pytest.fixture(scope="module")
+def at_the_goal() -> Calibrator:
+    """A calibration whose predicted drift is 0.9 of its target."""
+    samples = make_samples(RUN)
+    known = calibrate(samples, Parameters(model="G1"))
+    target = predicted_drift_of(known, known.estimate()).both / 0.9
+    return calibrate(samples, Parameters(model="G1", target_drift=target))
+
+
+def test_bars_that_are_full_and_what_to_drive_next_say_the_same_at_once(at_the_goal):
+    for said in looks(Card(0.0), at_the_goal, [100.0] * 5 + [0.1] * 90):
+        assert (said["goal worth [%]"] == "100") == (said["next code"] == "NEXT_IS_GOOD")
+    assert said["next code"] == "NEXT_IS_GOOD"
+
+
+def test_good_enough_is_said_when_it_has_stood_and_until_then_how_long_that_takes(at_the_goal):
+    said = list(looks(Card(0.0), at_the_goal, [1.0] * 60))
+    codes = [each["next code"] for each in said]
+    first = codes.index("NEXT_IS_GOOD")
+    assert first == STANDS_S and set(codes[:first]) == {"NEXT_STANDS"} and set(codes[first:]) == {"NEXT_IS_GOOD"}
+    assert [each["seconds"] for each in said[:2]] == ["30", "29"] and said[first]["seconds"] == "-"
+
+
+def test_a_sigma_that_differs_from_look_to_look_does_not_take_good_enough_back(at_the_goal):
+    flickering = [1.0, 1.0, 2.5] * 60  # as that of the shipped bag does
+    codes = [each["next code"] for each in looks(Card(0.0), at_the_goal, flickering)]
+    assert set(codes[codes.index("NEXT_IS_GOOD") :]) == {"NEXT_IS_GOOD"}
+    assert all(each["taken back"] == "" for each in looks(Card(0.0), at_the_goal, flickering))
+
+
+def test_a_sigma_that_has_grown_for_good_takes_good_enough_back_and_says_so_until_it_is_good_again(at_the_goal):
+    said = list(looks(Card(0.0), at_the_goal, [1.0] * 60 + [2.5] * 60 + [1.0] * 90))
+    codes = [each["next code"] for each in said]
+    back = next(at for at in range(60, 120) if codes[at] != "NEXT_IS_GOOD")
+    assert back >= 60 + STANDS_S / 2 and "m per km" in said[back]["taken back"]
+    assert said[back]["next code"] not in ("NEXT_STANDS", "NEXT_IS_GOOD")
+    assert said[119]["taken back"] and codes[-1] == "NEXT_IS_GOOD" and said[-1]["taken back"] == ""
+
+
+def test_another_model_takes_good_enough_back_at_once_and_is_named():
+    worth, drift = Worth(), PredictedDrift(1.0, 1.0, 1.4)
+    for second in range(40):
+        worth.look("G1", drift, 2.0, float(second), rejected=False)
+    assert worth.is_good and worth.taken_back is None
+    worth.look("A1", drift, 2.0, 40.0, rejected=False)
+    assert not worth.is_good and "A1" in worth.taken_back.sentence and worth.seconds_left(41.0) == STANDS_S - 1.0
 
 
 def test_a_standing_vehicle_drives_no_heading():
@@ -91,8 +137,9 @@ def test_a_standing_vehicle_drives_no_heading():
     assert sum(float(said[f"driven {name} [s]"]) for name in SECTORS) == 0.0
 
 
-def test_of_a_calibration_that_would_be_rejected_nothing_is_good_enough():
-    calibrator = calibrate(make_samples(RUN), Parameters(model="G1", target_drift=1000.0))
-    card, estimate = Card(0.0), calibrator.estimate()
-    assert card.values(calibrator, estimate, counts(1), 1.0)["next code"] == "NEXT_IS_GOOD"
-    assert card.values(calibrator, estimate, counts(1), 2.0, rejected=True)["next code"] == "NEXT_REJECTED"
+def test_of_a_calibration_that_would_be_rejected_nothing_is_good_enough(at_the_goal):
+    card, estimate = Card(0.0), at_the_goal.estimate()
+    assert list(looks(card, at_the_goal, [1.0] * 40))[-1]["next code"] == "NEXT_IS_GOOD"
+    said = card.values(at_the_goal, estimate, counts(1), 40.0, rejected=True)
+    assert said["next code"] == "NEXT_REJECTED" and said["goal worth [%]"] == "99"
+    assert card.values(at_the_goal, estimate, counts(1), 41.0)["next code"] == "NEXT_STANDS"
