@@ -82,7 +82,7 @@ def rendered(status: Status | None, now_s: float, log: Sequence[str] = (), said:
 
 
 def _head(status: Status) -> str:
-    return f"{status.get('model')} {status.get('convergence')}   {_duration(status.get('elapsed [s]'))}"
+    return f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}"
 
 
 def _duration(text: str) -> str:

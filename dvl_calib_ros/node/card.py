@@ -41,7 +41,7 @@ SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 _STREAMS = {"dvl": "dvl", "reference": "gnss", "imu": "imu"}
 
 
-class Worth:
+class RecentWorth:
     """What a calibration is worth of late, whether that is good enough, and why it no longer is.
 
     taken_back: None but after it was, until it is again.
@@ -94,7 +94,7 @@ class Card:
         self._came_s: dict[str, float] = {}
         self._driven_s = dict.fromkeys(SECTORS, 0.0)
         self._squares, self._looks = 0.0, 0
-        self._worth = Worth()
+        self._worth = RecentWorth()
         self._outlook: Outlook | None = None
         self._thought_s = -math.inf
 

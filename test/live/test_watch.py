@@ -56,7 +56,7 @@ def drawn(*arguments, width=110) -> str:
 
 def test_the_view_shows_the_mounting_what_it_is_worth_and_what_to_drive():
     text = drawn(status(), 100.5)
-    assert text.startswith("G1 coarse   12 min 34 s\nDVL 5.0 Hz, 0 s ago   reference 1.0 Hz, 3 s ago   IMU none yet\n")
+    assert text.startswith("model G1   12 min 34 s\nDVL 5.0 Hz, 0 s ago   reference 1.0 Hz, 3 s ago   IMU none yet\n")
     assert "yaw     3.036 ±0.116°" in text and "arm x   0.300 m, as set" in text
     assert re.search(r"dead reckoning  █{18}░{6}  75 %  3.45 m per km, goal 2\n", text)
     assert re.search(r"by scale      █{24} 100 %  1.96 m per km\n", text)

@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.calibration.worth import PredictedDrift, predicted_drift
-from dvl_calib_ros.node.card import SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, Worth
+from dvl_calib_ros.node.card import SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
 
 RUN = MatchedRun("box", 120.0, (0.0, 0.0, 0.05), dvl_std=0.01, gnss_std=0.03, frame=VelocityFrame.ENU)
 
@@ -122,7 +122,7 @@ def test_a_sigma_that_has_grown_for_good_takes_good_enough_back_and_says_so_unti
 
 
 def test_another_model_takes_good_enough_back_at_once_and_is_named():
-    worth, drift = Worth(), PredictedDrift(1.0, 1.0, 1.4)
+    worth, drift = RecentWorth(), PredictedDrift(1.0, 1.0, 1.4)
     for second in range(40):
         worth.look("G1", drift, 2.0, float(second), rejected=False)
     assert worth.is_good and worth.taken_back is None
