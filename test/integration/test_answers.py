@@ -97,6 +97,7 @@ def test_a_track_that_gets_worse_is_at_most_marginal_and_said(after, expected):
 
 
 @pytest.mark.parametrize(("antenna", "off"), [((0.0, 0.0, 0.0), False), ((-0.5, 0.0, 0.0), True)])
+@pytest.mark.spread(1)
 def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(tmp_path, antenna, off):
     """The reference says that it is base_link's velocity, and is an antenna's half a metre behind."""
     told = Told()
@@ -130,6 +131,7 @@ def test_the_noise_of_a_reference_that_claims_none_is_measured(tmp_path):
 
 
 @pytest.mark.parametrize(("claimed", "taken"), [(0.012, True), (1.2, False)])
+@pytest.mark.spread(1)
 def test_positions_that_claim_metres_and_show_centimetres_are_no_filter_of_the_dvl(tmp_path, claimed, taken):
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link")

@@ -90,6 +90,7 @@ def test_on_a_circle_a_displaced_dvl_is_not_taken_for_a_turned_one_and_its_yaw_i
 
 
 @pytest.mark.parametrize("late_s", [0.0, 1.3])
+@pytest.mark.spread(1)
 def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path, late_s):
     calibration = dc.replay(
         recorded(tmp_path / "bag", (1.3, 0.2, 0.0), late_s, waves_mps=0.1, spikes=0.03), history=False
@@ -126,6 +127,7 @@ def test_what_is_verified_is_what_is_published(tmp_path):
 
 
 @pytest.mark.parametrize("late_s", [0.0, 2.0])
+@pytest.mark.spread(1)
 def test_a_dvl_that_is_turned_and_displaced_is_found_to_be_turned(tmp_path, late_s):
     bag = recorded(tmp_path / "bag", (1.0, 0.0, 0.0), late_s, (0.0, 0.0, np.pi / 2.0))
     mounting = dc.replay(bag, history=False).mounting

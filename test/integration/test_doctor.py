@@ -220,7 +220,7 @@ def codes(examined: Examination) -> set[str]:
     return {found.code for found in examined.findings}
 
 
-@pytest.mark.spread(5)
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
     code, change = FAULTS[fault]
@@ -231,6 +231,7 @@ def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
 
 
 @pytest.mark.parametrize("change", [no_vertical, vertical_not_measured])
+@pytest.mark.spread(1)
 def test_of_a_horizontal_reference_no_roll_or_pitch_is_promised_as_none_is_claimed(tmp_path, change):
     bag = faulty(tmp_path / "bag", reference_only(change))
     examined = examine([bag], Parameters())
@@ -274,6 +275,7 @@ CLAIMED_RUNS: dict[str, dict[str, Any]] = {
     ["harbour_box", "straight_leg", "a figure eight, arm unknown",
      *(pytest.param(name, marks=pytest.mark.slow) for name in ("a mounting at 45 degrees", "half an hour"))],
 )  # fmt: skip
+@pytest.mark.spread(1)
 def test_the_standard_deviations_to_expect_are_those_that_the_replay_claims(name, tmp_path):
     """It expected ±0.02° of the yaw of harbour_box where ±0.12° were claimed, and 0.32° of roll for 1.18°."""
     run = CLAIMED_RUNS.get(name)

@@ -46,7 +46,7 @@ def passes(monkeypatch) -> Counter[str]:
     return counted
 
 
-@pytest.mark.spread(5)
+@pytest.mark.spread(3)
 @pytest.mark.parametrize(
     "words",
     [

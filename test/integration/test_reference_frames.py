@@ -80,6 +80,7 @@ int8 quality
 
 
 @pytest.mark.parametrize(("frame", "taken"), [(1, VelocityFrame.NED), (3, VelocityFrame.BODY)])
+@pytest.mark.spread(1)
 def test_a_px4_odometry_is_a_reference_in_the_frame_of_its_own_fields(tmp_path, frame, taken):
     told, m = Told(), motion()
     told.make.store.register(get_types_from_msg(PX4_DEFINITION, PX4))
@@ -166,7 +167,7 @@ def test_two_dvls_are_two_and_each_is_calibrated_by_itself(tmp_path):
 ANTENNA = (-0.3, 0.0, 0.4)
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("frame", "position"), [("gps_link", LEVER_ARM), ("map", LEVER_ARM), ("base_link", LEVER_ARM), ("", None)]
 )

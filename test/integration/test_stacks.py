@@ -63,6 +63,7 @@ def test_there_are_fourteen_stacks():
 
 
 @pytest.mark.parametrize("name", few(ANSWERED, WAITED_FOR))
+@pytest.mark.spread(2)
 def test_a_bag_as_it_is_gives_the_right_mounting_or_says_what_is_missing(bags, name):
     found, replayed = answered(bags[name])
     if name in list(STACKS)[:10]:

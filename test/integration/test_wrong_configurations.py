@@ -155,7 +155,7 @@ WAITED_FOR = (
 )  # fmt: skip
 
 
-@pytest.mark.spread(5)
+@pytest.mark.spread(2)
 @pytest.mark.parametrize("wrong", few(WRONG, WAITED_FOR))
 def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_refuses_it(wrong, tmp_path, capsys):
     samples, given, code = WRONG[wrong]

@@ -142,6 +142,7 @@ def test_chunks_of_one_topic_each_are_merged_in_memory_or_on_disk(tmp_path, plai
 
 @pytest.mark.parametrize("in_memory", [sorting.IN_MEMORY, 20_000])
 @pytest.mark.parametrize("is_cut", [False, True])
+@pytest.mark.spread(2)
 def test_log_times_out_of_order_in_a_file_without_index_are_put_in_order(
     tmp_path, plain, monkeypatch, in_memory, is_cut
 ):

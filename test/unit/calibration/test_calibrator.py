@@ -256,6 +256,7 @@ def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and
         ({"gnss_model": "M1", "gnss_free_model": "A1"}, ("M7", "M3")),
     ],
 )
+@pytest.mark.spread(1)
 def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expected):
     run = variant(NOISY, seconds=100, gnss_phase=0)
     outage = [
@@ -649,13 +650,14 @@ def test_a_vertical_velocity_of_exactly_zero_does_not_count_until_one_is_not():
 
 @pytest.mark.parametrize("variances", [(3e15,) * 3, (np.finfo(float).max, 0.01, 0.01), (1e308,) * 3, (1e-11, 1e2, 1e2)])
 @pytest.mark.parametrize("stream", [DvlSample, ReferenceSample])
+@pytest.mark.spread(3)
 def test_no_variance_makes_a_state_that_is_not_finite(variances, stream):
     for run, block_size in ((SPARSE, 1), (NOISY, STRETCH)):
         claimed = [s._replace(covariance=np.diag(variances)) if isinstance(s, stream) else s for s in make_samples(run)]
         check_finite(calibrate(claimed, block_size=block_size, verified=True))
 
 
-@pytest.mark.spread(2)
+@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     "options",
     [

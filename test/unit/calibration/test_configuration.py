@@ -59,7 +59,7 @@ def causes(found):
     return [*held, *(cause for each in held for cause in each.causes)]
 
 
-@pytest.mark.spread(3)
+@pytest.mark.spread(2)
 @pytest.mark.parametrize(
     ("wrong", "code", "numbers"),
     [

@@ -333,6 +333,7 @@ class Lazy:
 
 
 @pytest.mark.parametrize("worker", [Lazy, ThreadPoolExecutor])
+@pytest.mark.spread(1)
 def test_when_a_worker_is_done_changes_nothing_that_is_published(worker):
     at_once = Calibrator(NOISE, block_size=64, worker=AtOnce())  # looks on the way, as live
     beside = Calibrator(NOISE, block_size=64, worker=worker(1))

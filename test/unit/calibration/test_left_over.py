@@ -172,6 +172,7 @@ def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
 
 
 @pytest.mark.parametrize("seed", range(20))
+@pytest.mark.spread(6)
 def test_noise_of_their_own_is_not_followed(seed):
     rng = np.random.default_rng(seed)
     vehicle = Vehicle(rng, wave_deg=3.0)

@@ -207,6 +207,7 @@ def test_a_delay_follows_waves_sampled_at_1_hz():
 
 
 @pytest.mark.parametrize("time_constant", [0.02, 0.7, 40.0])
+@pytest.mark.spread(1)
 def test_the_lag_is_that_of_the_differential_equation_at_uneven_times(rng, time_constant):
     time = np.cumsum(rng.uniform(0.05, 1.0, 80))
     values = rng.normal(size=(80, 3))
