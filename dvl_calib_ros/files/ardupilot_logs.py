@@ -8,10 +8,12 @@ are read by pymavlink. Telemetry is stamped as it arrived.
 
 from __future__ import annotations
 
-import io
 import math
+import os
+import sys
 from collections import Counter
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +40,11 @@ def read_ardupilot_log(path: Path) -> DvlLog:
     read = _Read()
     wanted = list(_TAKERS)
     try:
-        with redirect_stdout(_Deaf()), redirect_stderr(_Deaf()):  # a line of each damaged byte
+        with _unheard():
             log = mavutil.mavlink_connection(str(path), notimestamps=False)
-            while (message := log.recv_match(type=wanted)) is not None:
-                read.take(message)
+            with closing(log):
+                while (message := log.recv_match(type=wanted)) is not None:
+                    read.take(message)
     except Exception as error:  # what a damaged log makes pymavlink raise has no common class
         if not read.moved:
             raise InputError(f"{path}: cannot be read as a log of ArduPilot ({error})") from error
@@ -49,11 +52,18 @@ def read_ardupilot_log(path: Path) -> DvlLog:
     return read.finished()
 
 
-class _Deaf(io.TextIOBase):
-    """Takes what pymavlink prints."""
-
-    def write(self, text: str) -> int:
-        return len(text)
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Nothing that is printed within is seen: pymavlink, and its indexer in C, print a line for each damaged byte."""
+    kept = os.dup(2)
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        sys.stderr.flush()
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 class _Read:
