@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .advice import one_heading_advice
-from .heading_deviation import comes_first, heading_advice
+from .heading_deviation import heading_advice, how_bad
 from .left_over import left_over_advice, nil_lag
 from .navigation import Navigation
 from .parameters import Parameters
@@ -43,10 +43,8 @@ def doubts(
         found += [each.weighed(Severity.MARGINAL) for each in told_arm_advice(finders, parameters)]
     if navigation is None:
         return found
-    deviation = navigation.deviation
-    advice = heading_advice(deviation)
-    is_first = deviation is not None and comes_first(deviation, estimate)
-    found += [each.weighed(Severity.REJECT) for each in advice] if is_first else advice
+    if navigation.deviation is not None:
+        found.append(heading_advice(navigation.deviation).weighed(how_bad(navigation.deviation, estimate)))
     if in_earth:
         found += one_heading_advice(estimate, parameters, navigation.speed)
     return found + left_over_advice(navigation.followed, are_positions(parameters), nil_lag(estimate, parameters))

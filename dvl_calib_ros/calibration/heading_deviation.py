@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .chi_square import chi2_isf
 from .frames import Array
@@ -23,6 +24,9 @@ SAID_FROM, CHANCE = math.radians(0.3), 1e-3
 FIRST, SURELY = math.radians(3.0), 3.0
 # ... and where more than this share of the samples was gated, which are those that it turns most.
 GATED_FROM = 0.1
+# A drift of so much (rad, rms; 1.2° from first to last) is no yaw to accept, whatever its σ holds: nobody knows when a
+# heading that drifts was right.
+DRIFTS_FROM = math.radians(0.35)
 
 
 class HeadingDeviation(NamedTuple):
@@ -70,30 +74,28 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
     )  # fmt: skip
 
 
-def comes_first(found: HeadingDeviation, estimate: Estimate) -> bool:
-    """Whether the compass is to be calibrated before an estimate is worth anything."""
-    is_large = found.rms > max(FIRST, SURELY * found.std)
-    return is_large or estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
+def how_bad(found: HeadingDeviation, estimate: Estimate) -> Severity:
+    """To a verdict: reject where the compass is to be calibrated before an estimate is worth anything."""
+    if found.rms > max(FIRST, SURELY * found.std) or estimate.gated > GATED_FROM * (estimate.used + estimate.gated):
+        return Severity.REJECT
+    is_drift = found.by_time and found.rms > max(DRIFTS_FROM, SURELY * found.std)
+    return Severity.MARGINAL if is_drift else Severity.WARNING
 
 
-def heading_advice(found: HeadingDeviation | None) -> list[Reason]:
+def heading_advice(found: HeadingDeviation) -> Reason:
     """What to say of it."""
-    if found is None:
-        return []
     degrees = math.degrees
     course = "with time" if found.by_time else "with the heading"
     first = "calibrate the compass first: " if found.rms > max(FIRST, SURELY * found.std) else ""
-    return [
-        finding(
-            "HEADING_DEVIATION",
-            course=course,
-            rms=degrees(found.rms),
-            std=degrees(found.std),
-            most=degrees(found.most),
-            most_at=degrees(found.most_at),
-            least=degrees(found.least),
-            least_at=degrees(found.least_at),
-            cost=1000.0 * found.rms,
-            first=first,
-        )
-    ]
+    return finding(
+        "HEADING_DEVIATION",
+        course=course,
+        rms=degrees(found.rms),
+        std=degrees(found.std),
+        most=degrees(found.most),
+        most_at=degrees(found.most_at),
+        least=degrees(found.least),
+        least_at=degrees(found.least_at),
+        cost=1000.0 * found.rms,
+        first=first,
+    )

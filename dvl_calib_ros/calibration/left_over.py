@@ -138,15 +138,9 @@ def left_over(
     before, after = _at(time, earth, -BEND_S), _at(time, earth, BEND_S)
     moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
     n = len(time)
-    known = np.zeros((n, 3, len(KNOWN)))
-    known[:, :, :3] = skew(moving)
-    known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
-    known[:, :, 5:8] = skew(rates)
-    known[:, :, 8] = slope
-    known[:, :, 9:] = body_from_enu
+    known = _known(moving, rates, slope, body_from_enu)
     yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
     around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)])
-    by_heading = known[:, :, 2, None] * around[:, None]
     quick = np.zeros((n, 3, 3))
     for axis in range(2):
         about = np.zeros((n, 3))
@@ -161,7 +155,10 @@ def left_over(
     fast = _fitted(time, both, error, np.concatenate([KNOWN, QUICK]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
-    means = [_means(each, starts) for each in (time, np.concatenate([known, by_heading, constant], axis=2), error)]
+    # of a mean its own noise is what the reference is further on: that alone would be a scale, and a bias against it
+    beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
+    by_heading = beside[:, :, 2, None] * around[:, None]
+    means = [_means(each, starts) for each in (time, np.concatenate([beside, by_heading, constant], axis=2), error)]
     slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, BY_HEADING, CONSTANT]))
     if fast is None or slow is None:
         return None
@@ -176,6 +173,28 @@ def left_over(
         tilt, std, slow.x[-3:], slow.std[-3:], float(fast.x[-1]), smoothed_std, lean, speed,
         *_circular(time, velocity - error, both, fast),
     )  # fmt: skip
+
+
+def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
+    """Columns (N, 3, 12) of what a calibration may have left, by velocity, turn rate, acceleration (N, 3), body."""
+    known = np.zeros((len(moving), 3, len(KNOWN)))
+    known[:, :, :3] = skew(moving)
+    known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
+    known[:, :, 5:8] = skew(rates)
+    known[:, :, 8] = slope
+    known[:, :, 9:] = body_from_enu
+    return known
+
+
+def _beside(time: Array, values: Array, starts: Index) -> Array:
+    """Means of the stretches before and after that of each value (N, 3), as far as these are near."""
+    at, of_each = _means(time, starts), _means(values, starts)
+    near = (np.diff(at) < 2.0 * MEAN_S).astype(float)[:, None]
+    before, after = np.vstack([[[0.0]], near]), np.vstack([near, [[0.0]]])
+    around = before * np.roll(of_each, 1, axis=0) + after * np.roll(of_each, -1, axis=0)
+    alone = before + after == 0.0
+    means = np.where(alone, of_each, around / np.where(alone, 1.0, before + after))
+    return np.repeat(means, np.diff(starts, append=len(time)), axis=0)
 
 
 def nil_lag(estimate: Estimate, parameters: Parameters) -> float:
@@ -261,19 +280,21 @@ def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | 
         weight = 1.0 / np.maximum(square / (OUTLYING**2 * level), 1.0)
         weighted = columns * weight[:, None, None]
         flat, z = columns.reshape(-1, n), error.reshape(-1)
-        information = weighted.reshape(-1, n).T @ flat + np.diag(level / 3.0 / likely**2)
-        p = np.linalg.inv(information)
+        prior = level / 3.0 / likely**2
+        p = np.linalg.inv(weighted.reshape(-1, n).T @ flat + np.diag(prior))
         x = p @ (weighted.reshape(-1, n).T @ z)
         rest = error - columns @ x
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
-    return _Fit(x, _std(p @ scores.T), p, weight, rest, starts)
+    # what is not looked for may be there as far as it is likely, and the data do not say that it is not
+    beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
+    return _Fit(x, np.sqrt(_std(p @ scores.T) ** 2 + (beside**2).sum(axis=1)), p, weight, rest, starts)
 
 
 def _std(scatter: Array) -> Array:
-    """σ (n,) by what each of M stretches, or of pairs of them, says (n, M)."""
+    """σ (n,) by what each of M stretches, or two or four together, say (n, M)."""
     n, m = scatter.shape
-    together = scatter[:, : m // 2 * 2].reshape(n, -1, 2).sum(axis=2)
-    return np.sqrt(np.maximum((scatter**2).sum(axis=1), (together**2).sum(axis=1)) * (m / (m - 1.0)))
+    sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in (1, 2, 4)]
+    return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
 def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:

@@ -14,8 +14,8 @@ from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuis
 
 # A DVL axis shows its scale from this speed along it, m/s: a DVL noise of 0.01 m/s then pulls by 0.1 per cent at most,
 # while a scale error of 0.5 per cent that is left out costs 1.5 mm/s.
-# ... and slower ones along which it travels, by this share of the speed: of a DVL mounted at 30° one would show it at
-# times and at times not, and a scale that is left out of half of the samples is a yaw.
+# ... and, of a vehicle that is so fast, one that is mounted along its way by this share of it: whether the velocity is
+# along it says each sample's own noise as well, and of samples chosen by their noise a mean is off by that.
 SCALE_SHOWN_FROM, ALONG_FROM = 0.3, 0.4
 
 
@@ -52,7 +52,7 @@ def g1_errors(body_from_dvl: Array, v: Array) -> Array:
     """[Tᵀ[v×], -Tᵀdiag(v)] (3, 5, N) of velocities v (3, N) m/s in the DVL's frame, as in `linearise_g1`."""
     h = np.empty((3, 5, v.shape[1]))
     h[:, :3] = turned_skew(body_from_dvl, v)
-    h[:, 3:] = -body_from_dvl[:, :2, None] * np.where(_show_scale(v), v, 0.0)[:2]
+    h[:, 3:] = -body_from_dvl[:, :2, None] * np.where(_show_scale(body_from_dvl, v), v, 0.0)[:2]
     return h
 
 
@@ -73,16 +73,15 @@ def g1_heave_errors(body_from_dvl: Array, v: Array) -> Array:
     level = body_from_dvl.T[:2, :2] @ (body_from_dvl[:2] @ v)
     row = np.empty((5, v.shape[1]))
     row[:3] = turned_skew(body_from_dvl[2:], v)[0]
-    row[3:] = -body_from_dvl[2, :2, None] * np.where(_show_scale(v)[:2], level, 0.0)
+    row[3:] = -body_from_dvl[2, :2, None] * np.where(_show_scale(body_from_dvl, v)[:2], level, 0.0)
     return row
 
 
-def _show_scale(v: Array) -> Mask:
+def _show_scale(body_from_dvl: Array, v: Array) -> Mask:
     """Whether axes show their scale by velocities (3, N) m/s in the DVL's frame."""
-    square = v * v
-    speed = square.sum(axis=0)
-    along = (square > ALONG_FROM**2 * speed) & (speed > SCALE_SHOWN_FROM**2)
-    return np.asarray(along | (square > SCALE_SHOWN_FROM**2))
+    square, along = v * v, np.abs(body_from_dvl[0]) > ALONG_FROM
+    fast = square.sum(axis=0) > SCALE_SHOWN_FROM**2
+    return np.asarray((along[:, None] & fast) | (square > SCALE_SHOWN_FROM**2))
 
 
 def noise_in_body(seen: Observations) -> Array:

@@ -102,6 +102,17 @@ def test_a_bias_shows_at_several_speeds(rng):
     assert said.severity is Severity.REJECT and said.code == "DVL_BIAS"
 
 
+def test_noise_of_the_dvl_is_no_bias_where_the_speed_hardly_changes():
+    """It was a scale, of the noise in the mean itself, and a bias against that: 3 to 5 σ on legs at one speed."""
+    found = []
+    for seed in range(8):
+        vehicle = Vehicle(np.random.default_rng(seed), seconds=300.0, speeds=(1.2, 1.2, 1.2))
+        vehicle.noise = vehicle.noise[0], 6.0 * vehicle.noise[1]
+        left = vehicle.found()
+        found.append(left.bias / left.bias_std)
+    assert np.sqrt(np.mean(np.square(found), axis=0))[0] < 1.8 and abs(np.mean(found, axis=0)[0]) < 1.0
+
+
 def test_a_bias_that_is_not_beyond_doubt_is_marginal(rng):
     """27 ± 7 mm/s, which were 1.4 degrees of yaw at 0.2, were accepted."""
     found = Vehicle(rng).found()
