@@ -69,12 +69,13 @@ def not_shown(result: Result) -> dict[str, str]:
     """The axes that the data do not show, by what they lack.
 
     An angle is that about an axis of the vehicle, and says so where the DVL's own angle of the same name is shown: of a
-    DVL that is mounted across, the vehicle's roll is the DVL's pitch.
+    DVL that is mounted across, the vehicle's roll is the DVL's pitch. A scale across is none of the quantities, and
+    few vehicles can show it.
     """
     shown = {each.name for each in quantities(result) if each.shown}
     causes: dict[str, dict[str, None]] = {}
     for entry in result.estimate.observability:
-        if entry.missing:
+        if entry.missing and entry.axis != "scale across":
             axis = f"the vehicle's {entry.axis} axis" if entry.axis in shown else entry.axis
             causes.setdefault(entry.missing, {})[axis] = None
     return {missing: " and ".join(axes) for missing, axes in causes.items()}

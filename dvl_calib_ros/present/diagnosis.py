@@ -83,7 +83,7 @@ FACTS: Mapping[str, Callable[[DiagnosisSeries], str]] = {
     ),
     "Samples compared": lambda s: f"{len(s.time)}, on the axes {''.join(s.axes)}",
     "Held out": lambda s: "whole recordings in turn" if len(s.recordings) > 1 else "a fifth of the run in turn",
-    "Calibration beside": _calibration,
+    "Calibration": _calibration,
 }
 WHERE: Columns[GapPlace] = {
     "axis": lambda place: f"{place.axis} ({BODY_AXES[place.axis]})",
@@ -278,6 +278,7 @@ def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
     return Table(
         ("recording", "regime", "share", *heads, "noise, m/s"),
         rows,
+        words=2,
         notes=(
             "Rms of the vector, noise of DVL and reference included, where there is a reference: the error and the "
             "noise at the top are these, of all recordings. The twin moves as the reference says, and its parameters "

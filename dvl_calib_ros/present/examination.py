@@ -11,6 +11,7 @@ from .document import Answer, Cell, Columns, Commands, Document, FindingLine, Se
 from .typed import options, typed
 
 BAR = 20
+SHOWN_NOTE = "A full bar is fine (fine_std_misalignment, fine_std_scale); red is not shown, and yellow between."
 ANSWERS = {
     "yes": (Severity.ACCEPT, "This recording can calibrate the DVL."),
     "partly": (Severity.MARGINAL, "This recording can calibrate a part of the DVL's errors."),
@@ -42,7 +43,10 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
                 f"Findings: {len(found)}" if found else f"Nothing {'else ' if lead else ''}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
-            Section(motion, [table_by(SHOWN, examined.shown, words=4)] if examined.shown else [Sentence(nothing)]),
+            Section(
+                motion,
+                [table_by(SHOWN, examined.shown, (SHOWN_NOTE,), words=4)] if examined.shown else [Sentence(nothing)],
+            ),
             Section("", [Commands(next_commands(examined, is_live))]),
         ],
         lead=lead,
@@ -56,7 +60,7 @@ def _why(examined: Examination) -> str:
     if not examined.has_reference:
         return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
     missing = [each.name for each in examined.shown if each.needs]
-    return f"It does not show {' and '.join(missing)}." if missing else ""
+    return f"Not shown yet: {' and '.join(missing)}." if missing else ""
 
 
 def _bar(each: Shown) -> Cell:
@@ -70,7 +74,7 @@ CONTENTS: Columns[Content] = {
     "topic": lambda each: each.topic,
     "frame": lambda each: each.frame_id,
     "Hz": lambda each: f"{each.rate_hz:.3g}" if each.rate_hz else "–",
-    "claims": lambda each: each.covariance.removesuffix(" always"),
+    "claimed σ": lambda each: each.covariance.removesuffix(" always"),
 }
 SHOWN: Columns[Shown] = {
     "": lambda each: each.name,

@@ -265,7 +265,7 @@ def _mounting(run: Replayed, rejected: bool) -> Iterator[Item]:
     elif not rejected and run.reference_frame in EARTH:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
-        yield Sentence(f"? {axes}: not shown by this recording; it needs {lacks}")
+        yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")
 
 
 def _paste(run: Replayed) -> Commands:

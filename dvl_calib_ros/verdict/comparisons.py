@@ -82,9 +82,9 @@ _KINDS = (
     ),
     Kind(
         "ARMS_DIFFER",
-        "{name} assumes another lever arm than {other} {verb}, {arm} m, and its angles suffer",
+        "{name} was calibrated with another lever arm than {other} {verb} ({arm} m); the wrong one turns its angles",
         "A lever arm that is taken as known and is wrong turns the yaw.",
-        "calibrate it again with -p lever_arm:=[{arm}]",
+        "if that one is right, calibrate {name} again with -p lever_arm:=[{arm}]",
     ),
 )
 COMPARISONS = tuple(replace(kind, page="troubleshooting.md#what-a-comparison-says") for kind in _KINDS)

@@ -43,7 +43,7 @@ _KINDS = (
     # what it found
     Kind(
         "MISALIGNMENT_LARGE",
-        "the misalignment is {degrees:.1f}°, {limit:.1f}° or more",
+        "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
         "So large an angle is more often a wrong mounting_rpy or frame than a bracket (reject_misalignment).",
         "is mounting_rpy right, and are the frames?",
         Severity.REJECT,
@@ -57,7 +57,7 @@ _KINDS = (
     ),
     Kind(
         "MOUNTING_FAR",
-        "inspect the mounting: it is {degrees:.1f}° from mounting_rpy, {limit:.1f}° or more",
+        "inspect the mounting: it is {degrees:.1f}° from mounting_rpy, which is much (from {limit:.1f}° on)",
         "The calibration may be good, and the bracket bent (accept_misalignment).",
         "",
         Severity.ACCEPT,

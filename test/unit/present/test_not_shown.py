@@ -35,3 +35,9 @@ def test_of_a_dvl_mounted_across_it_is_the_pitch_that_a_straight_leg_does_not_sh
     shown = {each.name: each.shown for each in quantities(straight(90))}
     assert shown["roll"] and not shown["pitch"]
     assert not {each.name: each.shown for each in quantities(straight(0))}["roll"]
+
+
+def test_a_scale_across_is_not_asked_for():
+    missing = {entry.axis for entry in straight(0).estimate.observability if entry.missing}
+    named = " and ".join(not_shown(straight(0)).values()).split(" and ")
+    assert "scale across" in missing and "scale across" not in named and "roll" in named
