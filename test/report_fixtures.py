@@ -56,7 +56,7 @@ class Page(HTMLParser):
         self._text: list[str] = []
         self._in_cell = self._in_style = False
         self.source = path.read_text()
-        self.feed(self.source)
+        self.feed(self.source.replace("<wbr>", ""))
 
     @property
     def text(self) -> str:

@@ -123,9 +123,8 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
 def _print_settings(chosen: InstrumentSettings, calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     from rich.markup import escape
 
-    errors, out = common.console(stderr=True), common.console()
-    for sentence in (*calibrated.objections, *calibrated.doubts):
-        errors.print(f"[yellow]warning:[/] {arguments.result}: {escape(sentence)}", soft_wrap=True)
+    common.print_warnings([f"{arguments.result}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
+    out = common.console()
     out.print(escape(f"{chosen.instrument}, by: {chosen.document}"), soft_wrap=True)
     for setting in chosen.settings:
         out.print(escape(f"  {setting}"), soft_wrap=True)

@@ -59,6 +59,7 @@ COMMAND = {
     "apply to a URDF": Command(
         "apply result.yaml --urdf r.urdf", ("result.yaml", "r.urdf"), ("-o", "--launch", "--fusion")
     ),
+    "apply to an instrument": Command("apply result.yaml --instrument ardupilot", ("result.yaml",), ("--settings",)),
     "apply in place": Command("apply result.yaml", ("result.yaml",), ("--urdf", "--launch")),
     "compare": Command("compare result.yaml bag", ("result.yaml", "bag", "bag/bag.mcap"), ("--json", "--report")),
     "export": Command("export dave result.yaml", ("result.yaml",), ("-o",)),
