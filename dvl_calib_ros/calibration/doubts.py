@@ -8,7 +8,7 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .advice import one_heading_advice
 from .heading_deviation import heading_advice, how_bad
-from .left_over import left_over_advice, nil_lag
+from .left_over import finds_nothing, lag_of, left_over_advice
 from .navigation import Navigation
 from .parameters import Parameters
 from .positions import are_positions
@@ -47,4 +47,5 @@ def doubts(
         found.append(heading_advice(navigation.deviation).weighed(how_bad(navigation.deviation, estimate)))
     if in_earth:
         found += one_heading_advice(estimate, parameters, navigation.speed)
-    return found + left_over_advice(navigation.followed, are_positions(parameters), nil_lag(estimate, parameters))
+    lag_s = lag_of(estimate, parameters)
+    return found + left_over_advice(navigation.followed, are_positions(parameters), lag_s, finds_nothing(estimate))

@@ -70,7 +70,9 @@ FORETOLD_BY, NEW_AT_MOST = 12, 4.0
 FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
 # ... where that the reference is a filter's shows by how it smooths, in so many σ: both are rare by chance, not one.
 FOLLOWED_BY_FILTER, FILTER_SHOWN = 2.4, 2.4
-# A filter lags by what it smooths over, within this factor; by less than this (s) so does anything.
+# A filter lags by what it smooths over, within this factor; by less than this (s) so does anything. That it lags so
+# shows it as well, so less of the smoothing has to, in σ.
+FILTER_SHOWN_LAGGING = 1.8
 LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
 # With less to correct than this (an angle in rad, a share of scale, an arm in m), or than so many σ, nothing is found.
 NO_ANGLE, NO_SCALE, NO_ARM_M, BY_CHANCE = math.radians(0.35), 0.005, 0.2, 3.0
@@ -197,8 +199,14 @@ def _beside(time: Array, values: Array, starts: Index) -> Array:
     return np.repeat(means, np.diff(starts, append=len(time)), axis=0)
 
 
-def nil_lag(estimate: Estimate, parameters: Parameters) -> float:
-    """By what (s) the reference lags behind the DVL where a calibration finds nothing else to correct; else 0.
+def lag_of(estimate: Estimate, parameters: Parameters) -> float:
+    """By what (s) the reference lags behind the DVL, as it was found."""
+    own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
+    return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
+
+
+def finds_nothing(estimate: Estimate) -> bool:
+    """Whether a calibration finds nothing to correct but a lag.
 
     One that knows no two angles has found nothing either way, and a filter of the DVL shows no lever arm of its own.
     """
@@ -206,29 +214,31 @@ def nil_lag(estimate: Estimate, parameters: Parameters) -> float:
     found = np.abs(terms @ estimate.state)
     std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
     if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, BY_CHANCE * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
-        return 0.0
+        return False
     arm, own = estimate.std_of(*ARM), dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    if arm is not None and (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, BY_CHANCE * arm)).any():
-        return 0.0
-    return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
+    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, BY_CHANCE * arm)).any()
 
 
-def left_over_advice(found: LeftOver | None, of_positions: bool = False, nil_lag_s: float = 0.0) -> list[Reason]:
+def left_over_advice(
+    found: LeftOver | None, of_positions: bool = False, lag_s: float = 0.0, is_nil: bool = False
+) -> list[Reason]:
     """What to say of it, as bad as it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
-    nil_lag_s: as of `nil_lag`.
+    lag_s, is_nil: as of `lag_of` and `finds_nothing`.
     """
     if found is None:
         return []
     least = FOLLOWED_BY_POSITIONS if of_positions else FOLLOWED_FROM
     seconds = math.sqrt(2.0 * abs(found.smoothed))
-    is_filter = not of_positions and found.smoothed > FILTER_SHOWN * found.smoothed_std
+    lags_so = lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and lag_s < LAGS_WITHIN * seconds
+    filter_from = FILTER_SHOWN_LAGGING if lags_so else FILTER_SHOWN
+    is_filter = not of_positions and found.smoothed > filter_from * found.smoothed_std
     surely = FOLLOWED_BY_FILTER if is_filter else FOLLOWED_SURELY
     if found.circular > max(surely * found.circular_std, least):
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    if is_filter and nil_lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and nil_lag_s < LAGS_WITHIN * seconds:
-        return [finding("FILTER_FINDS_NOTHING", late=nil_lag_s).weighed(Severity.REJECT)]
+    if is_filter and lags_so and is_nil and found.smoothed > FILTER_SHOWN * found.smoothed_std:
+        return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
     is_ours = of_positions and found.smoothed > 0.0
     if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
         word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL

@@ -177,9 +177,17 @@ def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
     vehicle.noise = 2.0 * vehicle.noise[0], vehicle.noise[1]
     found = made_by_a_filter(vehicle)._replace(circular=0.05, circular_std=0.05)
     assert [each.code for each in left_over_advice(found)] != ["FILTER_FINDS_NOTHING"]
-    assert [each.code for each in left_over_advice(found, nil_lag_s=2.5)] != ["FILTER_FINDS_NOTHING"]
-    (said,) = left_over_advice(found, nil_lag_s=0.45)
+    assert [each.code for each in left_over_advice(found, lag_s=2.5, is_nil=True)] != ["FILTER_FINDS_NOTHING"]
+    assert [each.code for each in left_over_advice(found, lag_s=0.45)] != ["FILTER_FINDS_NOTHING"]
+    (said,) = left_over_advice(found, lag_s=0.45, is_nil=True)
     assert said.severity is Severity.REJECT and said.code == "FILTER_FINDS_NOTHING"
+
+
+@pytest.mark.parametrize(("lag_s", "codes"), [(0.45, ["CIRCULAR_REFERENCE"]), (0.0, []), (3.0, [])])
+def test_that_it_lags_by_what_it_smooths_over_shows_a_filter_as_well(rng, lag_s, codes):
+    """Legs with a filter of 0.5 s and 5 cm/s of noise: followed by 4.4 σ, smoothed by 2.2, and accepted."""
+    found = Vehicle(rng).found()._replace(circular=0.13, circular_std=0.03, smoothed=0.13, smoothed_std=0.06)
+    assert [each.code for each in left_over_advice(found, lag_s=lag_s)] == codes
 
 
 @pytest.mark.parametrize("seed", range(20))
