@@ -80,7 +80,7 @@ class DvlDescription:
         if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
             raise InputError(f"{self.source}: rate_hz is {self.rate_hz:g}, which cannot be; diagnose again")
         if any(std < 0.0 for std in self.noise_std or ()):
-            raise InputError(f"{self.source}: a negative standard deviation is none; diagnose again")
+            raise InputError(f"{self.source}: a standard deviation is negative, which cannot be; diagnose again")
 
 
 def load_description(path: Path) -> DvlDescription:

@@ -48,7 +48,7 @@ NOISE_MEANING = {
 }
 ALL = "all of the run"
 MAX_PLACES = 12
-PLACES = "Share: of the gap's energy. Places overlap: only the axes over all of the run add up."
+PLACES = "Share: of the gap's energy. Places overlap, so that only the shares of the axes over all of the run add up."
 EFFECTS_NOTE = (
     "The calibration is refitted with every effect. p is adjusted for all effects that were tried. Of names joined by "
     "“or”, the parameters are those of the first."

@@ -137,7 +137,7 @@ _KINDS = (
     ),
     Kind(
         "DOCTOR_DISAGREE",
-        "DVL and reference do not agree under any frames: {left:.0%} of the speed is left",
+        "DVL and reference do not agree in any frames: {left:.0%} of the speed stays unexplained",
         "A wrong heading, clocks that differ by seconds, another vehicle's data, or a current in a water track.",
         "check the IMU's heading (yaw 0 is east and counts to the left), the stamps, and the DVL's bottom lock",
         Severity.ERROR,

@@ -346,7 +346,8 @@ FINDINGS = (
     ),
     Kind(
         "DVL_BIAS",
-        "the DVL is off by the same velocity at every speed, {axes} mm/s in the body: {degrees:.1f}° at the usual one",
+        "the DVL is off by the same velocity at every speed, {axes} mm/s in the body, which "
+        "looks like {degrees:.1f}° of mounting at the usual speed",
         "A bias of the DVL's electronics, a rounding, or water that moves in its shell. At one speed nothing tells it "
         "from a mounting.",
         "take the bias off in the driver, or have the DVL serviced",
@@ -400,8 +401,8 @@ FINDINGS = (
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes that of the reference",
-        "A constant velocity error turns with the vehicle where it is the DVL's, and does not where it is the "
-        "reference's or a current's; on one heading at one speed no data tell either from a mounting.",
+        "A constant error of the DVL turns with the vehicle; one of the reference, or a current, does not. On one "
+        "heading at one speed neither differs from a mounting.",
         "drive the opposite heading as well, at two speeds; or set reference_offset_std to how good the reference is "
         "(σ includes four times that)",
     ),

@@ -15,14 +15,14 @@ SELECTIONS = (
     _Said("GNSS_NOT_AVAILABLE", "GNSS is not available", "No reference has come for gnss_timeout.", ""),
     _Said(
         "GNSS_GOING",
-        "GNSS is available, going; waiting for gnss_hysteresis",
-        "No reference comes; the model changes if that lasts.",
+        "GNSS has stopped; the model changes if it stays away for gnss_hysteresis",
+        "No reference comes, but the outage is still short.",
         "",
     ),
     _Said(
         "GNSS_COMING",
-        "GNSS is not available, coming; waiting for gnss_hysteresis",
-        "References come again; the model changes if that lasts.",
+        "GNSS is back; the model changes if it stays for gnss_hysteresis",
+        "References come again, but not for long yet.",
         "",
     ),
     _Said(
