@@ -86,7 +86,7 @@ def comparison(result: Comparison) -> Document:
                 Where.TERMINAL,
             ),
             Section(
-                "Each less all others together",
+                "Each minus all the others together",
                 [_differences(rest, [each.second.name for each in rest])] if rest else [],
             ),
         ],

@@ -280,8 +280,7 @@ def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
         rows,
         words=2,
         notes=(
-            "Rms of the vector, noise of DVL and reference included, where there is a reference: the error and the "
-            "noise at the top are these, of all recordings. The twin moves as the reference says, and its parameters "
-            "had not seen the samples that it is compared with.",
+            "Rms of the vector, with the noise of DVL and reference, where there is a reference. The error and the noise "
+            "at the top are those of all recordings together. The twin moves as the reference says.",
         ),
     )
