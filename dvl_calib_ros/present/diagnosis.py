@@ -280,7 +280,7 @@ def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
         rows,
         words=2,
         notes=(
-            "Rms of the vector, with the noise of DVL and reference, where there is a reference. The error and the noise "
-            "at the top are those of all recordings together. The twin moves as the reference says.",
+            "Rms of the vector, with the noise of DVL and reference, where there is a reference. The error and the "
+            "noise at the top are those of all recordings together. The twin moves as the reference says.",
         ),
     )

@@ -41,7 +41,7 @@ def test_the_same_mounting_is_exit_code_0_and_a_moved_one_1_with_a_sentence(plac
     assert main(["compare", c, a, b]) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert said.startswith("moved: The mounting has moved by") and "about z between" in said and "(c.yaml)" in said
-    assert "Each less all others together" in said
+    assert "Each minus all the others together" in said
 
 
 def test_what_differs_by_some_three_sigma_is_suspicious_and_exit_code_3(place, tmp_path, capsys):
