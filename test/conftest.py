@@ -82,6 +82,17 @@ def made_once(path: Path, make: Callable[[Path], Any]) -> Path:
     return path
 
 
+@pytest.fixture
+def world(monkeypatch):
+    """A ROS domain of the test's own, which processes that it starts are in as well."""
+    from ros import World
+
+    world = World()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(world.domain))
+    yield world
+    world.close()
+
+
 @pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """For `made_once`: one folder of all processes of this run."""

@@ -8,7 +8,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from ros import NODE, World, until
+from ros import NODE, until
 from std_srvs.srv import Trigger
 
 from dvl_calib_ros.bags.writer import Compression, Storage
@@ -33,13 +33,6 @@ def bag(tmp_path_factory):
     made = Scenario("free", 300.0, 3, errors, gnss_std=0.05, imu_rate=10, effects=effects)
     write_bag(made, path, Storage.MCAP, Compression.NONE)
     return path
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
 
 
 def result_of(world, bag, path, *arguments):

@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 
 from diagnostic_msgs.msg import DiagnosticArray
 from io_fixtures import run, write_bag
-from ros import NODE, World, until
+from ros import NODE, until
 
 from dvl_calib_ros.demo.player import BagPlayer
 
@@ -19,13 +19,6 @@ TARGETS = {"dvl/twist": "/a50/velocity", "gnss/twist": "/gps", "imu/data": "/imu
 QUICKLY = (
     "import sys; from dvl_calib_ros.node import discovering, main; discovering.LISTEN_S = 1.0; sys.exit(main.main())"
 )
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
 
 
 @pytest.fixture

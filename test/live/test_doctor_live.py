@@ -12,17 +12,8 @@ pytest.importorskip("rclpy", reason="listening needs ROS 2: pip install '.[ros]'
 from command_line import fail, succeed
 from io_fixtures import run, write_bag
 from rclpy.qos import ReliabilityPolicy
-from ros import World
 
 from dvl_calib_ros.demo.player import BagPlayer
-
-
-@pytest.fixture
-def world(monkeypatch):
-    world = World()
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(world.domain))
-    yield world
-    world.close()
 
 
 @pytest.mark.spread(1)

@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 
 from conftest import ROOT
 from live_fixtures import Live, Offline, assert_agree, received, sent
-from ros import PATIENCE_S, World, until
+from ros import PATIENCE_S, until
 from stress_ending import stress
 
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -25,14 +25,6 @@ from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.node.ending import ENDING, Ending
 from dvl_calib_ros.node.main import parameter_files
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
-
 
 # ---------------------------------------------------------------- the flag
 

@@ -11,20 +11,13 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 
 import rclpy
 from rclpy.node import Node
-from ros import World, until
+from ros import until
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from dvl_calib_ros.node.executor import ReceivingExecutor
 
 FLOOD = 2000
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
 
 
 class Hearing(Node):

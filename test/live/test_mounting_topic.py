@@ -14,7 +14,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from live_fixtures import LATCHED
-from ros import NODE, World, until
+from ros import NODE, until
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import Trigger
 from test_node import Publisher, node_here, received, twist
@@ -28,13 +28,6 @@ from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
 MOUNTING = (0.1, -0.2, 0.7)
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
 
 
 def said(messages) -> dict[str, str]:

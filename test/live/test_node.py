@@ -57,13 +57,6 @@ SCENARIOS = {
 
 
 @pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
-
-
-@pytest.fixture
 def bag(tmp_path):
     path = tmp_path / "bag"
     write_bag(SCENARIOS["enu reference, outage"], path, Storage.MCAP, Compression.NONE)

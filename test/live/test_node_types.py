@@ -14,7 +14,7 @@ from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, 
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
 from nav_msgs.msg import Odometry
-from ros import World, refused_at_start, until
+from ros import refused_at_start, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -29,13 +29,6 @@ from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
 from dvl_calib_ros.replay.replay import replay
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from io_fixtures import TOPICS
 from live_fixtures import LATCHED
 from rclpy.duration import Duration
-from ros import NODE, PATIENCE_S, World, until
+from ros import NODE, PATIENCE_S, until
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -31,13 +31,6 @@ YAW = math.pi / 4
 URDF = f"""<robot name="auv"><link name="base_link"/><link name="dvl_link"/>
 <joint name="dvl_joint" type="fixed"><parent link="base_link"/><child link="dvl_link"/>
 <origin xyz="-0.6 0.1 -0.2" rpy="0 0 {YAW}"/></joint></robot>"""
-
-
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
 
 
 @pytest.mark.spread(1)

@@ -22,14 +22,6 @@ from dvl_calib_ros.cli import play
 from dvl_calib_ros.cli.main import main
 
 
-@pytest.fixture
-def world(monkeypatch):
-    world = World()
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(world.domain))
-    yield world
-    world.close()
-
-
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp("play") / "bag", run(10.0))

@@ -46,13 +46,6 @@ def scenario(seconds: float) -> Scenario:
     return Scenario("free", seconds, 7, errors, gnss_std=0.02, effects=effects)
 
 
-@pytest.fixture
-def world():
-    world = World()
-    yield world
-    world.close()
-
-
 @contextmanager
 def simulator(world: World, *options: str, ends_by_itself: bool = False):
     """`dvl-calib simulate --live` in a process of its own; told to end, and to have ended well, at the end."""

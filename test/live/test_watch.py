@@ -158,15 +158,6 @@ def test_progress_goes_from_the_prior_to_fine_by_the_logarithm(name):
 rclpy = pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
 
-@pytest.fixture
-def world():
-    from ros import World
-
-    world = World()
-    yield world
-    world.close()
-
-
 def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "dvl_calib_ros.cli.main", *arguments]
 
