@@ -61,6 +61,7 @@ from .samples import (
     VelocityFrame,
 )
 from .selection import Selection
+from .stream_clocks import StreamClocks
 from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
 from .worth import RecentMotion
 
@@ -146,7 +147,7 @@ class Calibrator:
         self._on_event = on_event
         self._on_rows = on_rows
         self._on_restart = on_restart
-        self._verified = verified
+        self._verified, self._clocks = verified, StreamClocks()
         self._trace = trace
         self._worker = worker
         self._registration = registration
@@ -224,6 +225,7 @@ class Calibrator:
 
     def feed_dvl(self, sample: DvlSample) -> DvlSample | None:
         """Take a DVL sample; None unless it is valid and in order, else as it goes on: in time, covariance screened."""
+        self._clocks.arrived(Stream.DVL, sample.stamp_ns)
         taken = self._aligner.take_dvl(sample)
         if taken is not None:
             self._advance()
@@ -231,16 +233,20 @@ class Calibrator:
 
     def feed_reference(self, sample: ReferenceSample) -> None:
         """Take a reference (GNSS) velocity."""
+        self._clocks.arrived(Stream.REFERENCE, sample.stamp_ns)
         self._aligner.take_reference(sample)
         self._advance()
 
     def feed_imu(self, sample: ImuSample) -> None:
         """Take attitude and angular velocity."""
+        self._clocks.arrived(Stream.IMU, sample.stamp_ns)
         self._aligner.take_imu(sample)
         self._advance()
 
     def feed(self, streams: Streams) -> None:
         """Take a stretch of a recording, all streams."""
+        if self._verified or self._worker is not None:
+            self._clocks.add(streams)
         self._aligner.take(streams)
         self._advance()
         self._aligner.forget_old()
@@ -756,6 +762,7 @@ class Calibrator:
             in_earth=rest is not None and rest.in_earth,
             is_level=fresh and self.is_level,
         )
+        found += self.clock_objections(fresh=fresh)
         if navigation is None:
             return found
         held_out = self._verified_so_far(fresh=fresh).reasons
@@ -764,7 +771,8 @@ class Calibrator:
     @property
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` that are not fresh, thought of anew only where there may be others: it takes a few milliseconds."""
-        of = (self.selected, *(each.n_told for each in self._further))
+        clocks = self.clock_objections(fresh=False)  # of clocks that are apart nothing is told
+        of = (self.selected, *(each.n_told for each in self._further), *(each.code for each in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self.doubts(fresh=False)
         return self._doubted[1]
@@ -835,6 +843,13 @@ class Calibrator:
     def are_clocks_known(self) -> bool:
         """Whether the data show how the clocks stand, in time or not."""
         return any(each.registration is not None and each.registration.are_known for each in self._further)
+
+    def clock_objections(self, *, fresh: bool) -> list[Reason]:
+        """What stamps say that are far apart, unless the data show how the clocks stand: then it does not matter when
+        messages arrived. fresh: as of `doubts`."""
+        seen = self.registration_so_far
+        is_known = self.are_clocks_known if fresh else seen is not None and seen.are_known
+        return [] if is_known else self._clocks.objections(self.parameters)
 
     @property
     def registration_so_far(self) -> Registration | None:

@@ -35,7 +35,6 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .clocks import StreamClocks
 from .recorder import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
@@ -118,7 +117,7 @@ def replay(
         recordings_ns=recording.between_ns,
     )
     decoder = MessageDecoder(calibrator.parameters)
-    clocks = _feed_all(recording, chosen, decoder, calibrator, on_progress)
+    _feed_all(recording, chosen, decoder, calibrator, on_progress)
     calibrator.finish()
     on_finished(calibrator)
     found += [*missing_imu(recording, chosen, decoder.frame_of_reference), *decoder.problems.values()]
@@ -138,9 +137,9 @@ def replay(
     )
     found += [each.weighed(Severity.WARNING) for each in against]
     of_drift = objections(navigation)
-    # where the data show how the clocks stand, it does not matter when messages arrived
-    of_clocks = [] if calibrator.are_clocks_known else clocks.objections(parameters)
-    of_all = of_clocks + [each for each in against if each.severity is not Severity.WARNING]
+    of_all = calibrator.clock_objections(fresh=True) + [
+        each for each in against if each.severity is not Severity.WARNING
+    ]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_all += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
     return Replayed(
@@ -199,16 +198,13 @@ def _feed_all(
     decoder: MessageDecoder,
     calibrator: Calibrator,
     on_progress: Callable[[float], None],
-) -> StreamClocks:
+) -> None:
     start_ns, end_ns = recording.span_ns
-    clocks = StreamClocks()
     streams = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     for stretch in recording.stretches(streams, decoder):
         calibrator.feed(stretch.streams)
-        clocks.add(stretch.streams)
         on_progress((stretch.log_ns - start_ns) / max(end_ns - start_ns, 1))
     on_progress(1.0)
-    return clocks
 
 
 def reference_prior(recording: Recording, parameters: Parameters, topics: Topics) -> tuple[float, float]:

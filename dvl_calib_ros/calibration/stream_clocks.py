@@ -1,4 +1,4 @@
-"""Whether the streams of a recording are stamped by one clock: by which stamps arrived together."""
+"""Whether streams are stamped by one clock: by which stamps arrived together."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.parameters import Parameters
-from ..calibration.register.arrival import apart
-from ..calibration.robust import median
-from ..calibration.samples import SampleBlock, Stamps, Stream, Streams
 from ..verdict.reasons import Reason, finding
+from .parameters import Parameters
+from .register.arrival import apart
+from .robust import median
+from .samples import SampleBlock, Stamps, Stream, Streams
 
 SPOKEN: Mapping[Stream, str] = {
     Stream.DVL: "the DVL's",
@@ -23,13 +23,31 @@ WELL_KNOWN = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37
 
 # So many messages of a stream, evenly spread, tell well enough how far its stamps are ahead; no more are kept.
 MOST = 8192
+# Live, one by one, so many are added together.
+AT_ONCE = 64
 
 
 class StreamClocks:
-    """Of messages the stamp against that of the DVL's message that arrived last before it."""
+    """Of messages the stamp against that of the DVL's message that arrived last before it, or live the next."""
 
     def __init__(self) -> None:
         self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in (Stream.REFERENCE, Stream.IMU)}
+        self._newest: dict[Stream, int] = {}  # live, stamps by stream, and what waits to be added of each
+        self._waiting: dict[Stream, list[int]] = {stream: [] for stream in self._ahead}
+
+    def arrived(self, stream: Stream, stamp_ns: int) -> None:
+        """Take one message of a stream, live."""
+        self._newest[stream] = stamp_ns
+        if stream is Stream.DVL:
+            for other, waiting in self._waiting.items():
+                if (newest := self._newest.pop(other, None)) is not None:
+                    waiting.append(newest - stamp_ns)
+                if len(waiting) == AT_ONCE:
+                    self._add_waiting(other)
+
+    def _add_waiting(self, stream: Stream) -> None:
+        self._ahead[stream].add(np.array(self._waiting[stream], dtype=np.int64))
+        self._waiting[stream] = []
 
     def add(self, streams: Streams) -> None:
         """Take what arrived one after the other."""
@@ -44,6 +62,7 @@ class StreamClocks:
         """What clocks that differ by more than any model looks for say against every calibration."""
         ahead = {Stream.DVL: 0.0}
         for stream, spread in self._ahead.items():
+            self._add_waiting(stream)
             if len(spread.kept):
                 ahead[stream] = float(median(1e-9 * spread.kept))
         said = []

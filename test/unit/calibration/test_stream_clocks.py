@@ -1,0 +1,43 @@
+"""Clocks are compared by so many messages as are enough, however long a recording is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from runs import MatchedRun, feed, feed_columns, make_samples
+
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.delay.workers import AtOnce
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.samples import ReferenceSample
+from dvl_calib_ros.calibration.stream_clocks import MOST, _Spread
+from dvl_calib_ros.verdict.kinds import Severity
+
+
+@pytest.mark.parametrize("sizes", [[10], [MOST, 1], [MOST + 1], [3, 4096, 7, 4096] * 40, [1] * 20_000])
+def test_of_many_numbers_every_so_many_th_is_kept(sizes):
+    spread, numbers, first = _Spread(), np.arange(sum(sizes)), 0
+    for size in sizes:
+        spread.add(numbers[first : first + size])
+        first += size
+    every = int(np.diff(spread.kept)[0])
+    np.testing.assert_array_equal(spread.kept, numbers[::every])
+    assert len(spread.kept) <= MOST and (every == 1 or len(spread.kept) >= MOST // 2)
+
+
+@pytest.mark.parametrize("seconds", [0, 18])
+@pytest.mark.parametrize("given", [feed, feed_columns])
+def test_live_clocks_that_are_apart_are_named_as_by_a_replay(seconds, given):
+    """Nothing was paired then, so nothing verified, and nothing said beside that no data had come."""
+    samples = make_samples(MatchedRun("straight", 60.0, imu_every=50))
+    stamped = [
+        each._replace(stamp_ns=each.stamp_ns + seconds * 10**9) if isinstance(each, ReferenceSample) else each
+        for each in samples
+    ]
+    calibrator = Calibrator(Parameters(), worker=AtOnce())
+    assert calibrator.doubts_so_far == []
+    given(calibrator, stamped)
+    said = [each for each in calibrator.doubts_so_far if each.code == "CLOCKS_APART"]
+    assert bool(said) == bool(seconds) and all("GPS time" in str(each) for each in said)
+    result = calibrator.result()
+    assert (result.verifications[result.selected].verdict is Severity.REJECT) == bool(seconds)
