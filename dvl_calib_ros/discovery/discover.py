@@ -18,6 +18,7 @@ from ..calibration.delay.rows import ImuColumns
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.register.arrival import limit_s
+from ..calibration.register.fine import white_noise
 from ..calibration.register.motion import MotionStreams, in_order, make_motion
 from ..calibration.register.readings import (
     CLEARLY,
@@ -51,8 +52,9 @@ OTHER_MOUNTING = math.radians(12.0)
 STRAIGHT_SHARE = 0.7
 # Root mean square of the better nine tenths of normal errors in three axes, as a share of that of all.
 TRIMMED = 0.85
-# A noise (m/s) that no reference is below, and how many times too much one may claim.
-QUIETEST, CLAIMS_TOO_MUCH = 0.01, 3.0
+# A noise (m/s) that no reference is below, and how many times too much one may claim, or too little: by its own
+# differences from sample to sample, which at a lower rate (Hz) are the waves'.
+QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.0
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
 # Reference frames, in the order in which they are taken for one that the data cannot tell.
@@ -554,22 +556,25 @@ class _Search:
             )
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
-        """The noise of a reference that claims none, or as positions one that its velocities do not have."""
+        """The noise of a reference that claims none, or far too little, or as positions one that its velocities do not
+        have."""
         if self._gives("gnss_aided_std") or self._gives("use_message_covariance") or chosen.best_left > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].is_position
-        if not (is_position or math.isnan(reference.claimed_std)):
+        own = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
+        too_little = not is_position and own > CLAIMS_TOO_LITTLE * reference.claimed_std
+        if not (is_position or too_little or math.isnan(reference.claimed_std)):
             return
         best, _ = self._readings.registered(chosen.reading, None if known is None else known.T)
         # of a lever arm and a delay that are yet to be found a part stays in
         left = max(min(best, chosen.best_left), 0.5 * chosen.best_left)
         shown = max(left * dvl.speed / (math.sqrt(3.0) * TRIMMED), QUIETEST)
-        if is_position:
-            if not reference.claimed_std > CLAIMS_TOO_MUCH * shown:
-                return
+        if is_position and not reference.claimed_std > CLAIMS_TOO_MUCH * shown:
+            return
+        if is_position or too_little:
             self._values["use_message_covariance"] = False
         self._values["gnss_aided_std"] = float(f"{shown:.2g}")
-        claims = f"claims {reference.claimed_std:.2g} m/s" if is_position else "claims no noise"
+        claims = "claims no noise" if math.isnan(reference.claimed_std) else f"claims {reference.claimed_std:.2g} m/s"
         self._found.append(
             f"the reference {claims}; against the DVL it shows {shown:.2g} m/s per axis, which is used "
             f"(-p gnss_aided_std:={shown:.2g})"
