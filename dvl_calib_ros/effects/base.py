@@ -157,12 +157,13 @@ class AnyEffect:
 class Effect(AnyEffect, ABC):
     """A systematic effect: the same motion always gives the same trace.
 
-    manoeuvre: what to fly to see it and to tell it from what it is confounded with. of_the_day: whether its size is
-    another in every recording; else it belongs to the vehicle. relative_to_first: whether it is a change against the
-    first of several recordings. vertical: parameters of which a reference that is horizontal shows nothing, with the
-    DVL upright.
+    remedy: what to do about it where it is found, as part of a sentence. manoeuvre: what to fly to see it and tell it
+    from what it is confounded with. of_the_day: whether its size is another in every recording; else it belongs to the
+    vehicle. relative_to_first: whether it is a change against the first of several recordings. vertical: parameters of
+    which a reference that is horizontal shows nothing, with the DVL upright.
     """
 
+    remedy: ClassVar[str] = ""
     manoeuvre: ClassVar[str]
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False

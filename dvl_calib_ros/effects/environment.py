@@ -18,6 +18,10 @@ class WaterLock(Effect):
 
     name = "water_lock"
     summary = "the DVL tracks water: an earth-fixed velocity (the negative of the current) is added from from_s to to_s"
+    remedy = (
+        "a part of the run is on the water's layer: have the driver hand on bottom track only; of a whole run "
+        "--apply takes it out"
+    )
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
         EffectParameter("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),
@@ -45,6 +49,7 @@ class HeadingError(Effect):
 
     name = "heading_error"
     summary = "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ"
+    remedy = "calibrate the compass, away from what is magnetic; no mounting makes this"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
         EffectParameter("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),

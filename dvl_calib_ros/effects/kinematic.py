@@ -15,6 +15,7 @@ class LeverArm(Effect):
 
     name = "lever_arm"
     summary = "the DVL sits at l from the reference point and moves when the vehicle turns: ω × l"
+    remedy = "--apply writes the lever arm; measure it with a tape to be sure"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
     vertical = frozenset({"z_m"})
@@ -32,6 +33,9 @@ class Sideslip(Effect):
 
     name = "sideslip"
     summary = "sway that only the DVL sees: coefficient · ω_z · horizontal speed"
+    remedy = (
+        "the DVL sees another sway than the reference: look for what moves the water at it (thrusters, its fairing)"
+    )
     manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
     parameters = (
         EffectParameter("coefficient_s", "s", 0.1, -10.0, 10.0, "sway per turn rate and speed; negative: outward"),
@@ -51,6 +55,9 @@ class TiltCoupling(Effect):
 
     name = "tilt_coupling"
     summary = "an error in proportion to pitch or roll, body frame"
+    remedy = (
+        "the velocity of DVL or reference is not turned by roll and pitch as the vehicle is: look at the driver's frame"
+    )
     manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
     parameters = (
         EffectParameter("x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)"),

@@ -17,6 +17,7 @@ class VelocityBias(Effect):
 
     name = "velocity_bias"
     summary = "a constant velocity added on the DVL's axes"
+    remedy = "let the DVL measure standing still over the bottom; a bias there is the maker's to mend"
     manoeuvre = "straight legs at two speeds or more, one of them slow"
     parameters = along_axes("mps", "m/s", 0.02, 1.0, "bias of the DVL's axis {}")
     vertical = frozenset({"z_mps"})
@@ -34,6 +35,7 @@ class QuadraticScale(Effect):
 
     name = "quadratic_scale"
     summary = "an error that grows with speed squared: coefficient · ‖v‖ · v"
+    remedy = "ask the DVL's maker; drive the survey at the speed that was calibrated"
     manoeuvre = "straight legs at three speeds or more"
     parameters = (
         EffectParameter("coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed"),
@@ -51,6 +53,7 @@ class ScaleDrift(Effect):
 
     name = "scale_drift"
     summary = "the scale-factor error changes along the run, as of sound speed: rate · (t - start) · v"
+    remedy = "measure the speed of sound along the run, or give the DVL temperature and salinity"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
     parameters = (
         EffectParameter("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),
@@ -69,6 +72,7 @@ class MisalignmentDrift(MountingEffect):
 
     name = "misalignment_drift"
     summary = "the misalignment changes along the run: φ = rate · (t - start)"
+    remedy = "look for what works loose; calibrate again before each dive"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
     parameters = along_axes(
         "rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour", linear=False
@@ -87,6 +91,7 @@ class MountFlexure(MountingEffect):
 
     name = "mount_flexure"
     summary = "the mounting bends with speed: φ = flexure · ‖v‖"
+    remedy = "stiffen the DVL's bracket; calibrate at the speed of the survey"
     manoeuvre = "straight legs at three speeds or more"
     parameters = along_axes(
         "rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed", linear=False
@@ -104,6 +109,7 @@ class MountingMoved(MountingEffect):
 
     name = "mounting_moved"
     summary = "the mounting differs from that of the first of several recordings"
+    remedy = "the DVL has been moved between the recordings: calibrate each day by itself"
     manoeuvre = "straight legs that speed up and slow down, in each recording"
     parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
     vertical = frozenset({"x_rad", "y_rad"})
@@ -120,6 +126,7 @@ class SoundSpeedMoved(Effect):
 
     name = "sound_speed_moved"
     summary = "the scale-factor error differs from that of the first of several recordings: ratio · v"
+    remedy = "set the speed of sound on each day"
     manoeuvre = "straight legs, in each recording"
     parameters = (EffectParameter("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
     acts_on = ActsOn.DVL
@@ -139,6 +146,7 @@ class AxisNonorthogonality(Effect):
 
     name = "axis_nonorthogonality"
     summary = "the DVL's axes are not at right angles: symmetric shear S v, DVL frame"
+    remedy = "ask the DVL's maker: its beams are not where they are said to be"
     manoeuvre = "sway and heave beside surge: drift across, dive or go in waves"
     parameters = tuple(
         EffectParameter(

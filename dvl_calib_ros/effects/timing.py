@@ -35,6 +35,7 @@ class DvlTimeOffset(_DvlClock):
 
     name = "dvl_time_offset"
     summary = "the DVL's stamps are late by τ: v(t - τ) - v(t), body frame"
+    remedy = "--apply writes dvl_time_offset; better, set the DVL's clock (PTP, or the time of validity in the driver)"
     manoeuvre = "straight legs that speed up and slow down, in waves or with quick changes of speed"
     parameters = _seconds("how late a stamp is; positive: late")
     confounded_with = ("reference_time_offset", "reference_lag", "attitude_time_offset")
@@ -49,6 +50,7 @@ class TimeOffsetJump(_DvlClock):
 
     name = "time_offset_jump"
     summary = "the DVL's stamps are later by τ from at_s on, as after its clock was set"
+    remedy = "--apply writes dvl_time_jump; keep who sets the DVL's clock from doing it during a run"
     manoeuvre = "turns and changes of speed before and after"
     parameters = (
         *_seconds("how much later a stamp is from then on"),
@@ -66,6 +68,7 @@ class ClockDrift(_DvlClock):
 
     name = "clock_drift"
     summary = "the DVL's clock runs fast: its stamps get later by so many seconds per hour"
+    remedy = "--apply writes dvl_clock_drift; better, discipline the DVL's clock (PTP, PPS)"
     manoeuvre = "turns and changes of speed at the beginning, in the middle and at the end"
     parameters = (
         EffectParameter("seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False),
@@ -82,6 +85,7 @@ class ReferenceTimeOffset(ClockEffect):
 
     name = "reference_time_offset"
     summary = "the reference's stamps are late by τ: -(g(t - τ) - g(t)), in the frame it was recorded in"
+    remedy = "--apply writes reference_time_offset; better, stamp the reference when it measures"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = _seconds("how late a stamp is; positive: late")
     acts_on = ActsOn.REFERENCE_CLOCK
@@ -103,6 +107,7 @@ class AttitudeTimeOffset(ClockEffect):
 
     name = "attitude_time_offset"
     summary = "the IMU's stamps are late by τ: v - R(t - τ)ᵀ R(t) v, with R its attitude"
+    remedy = "--apply writes imu_time_offset; better, stamp the IMU when it measures"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = _seconds("how late a stamp is; positive: late")
     acts_on = ActsOn.ATTITUDE_CLOCK
@@ -129,6 +134,7 @@ class ReferenceLag(Effect):
 
     name = "reference_lag"
     summary = "the reference is low-pass filtered: T dg'/dt = g - g', in the frame it was recorded in"
+    remedy = "take the receiver's own velocity as reference, not a filter's"
     manoeuvre = "sharp turns as well as wide ones, and quick changes of speed"
     parameters = (EffectParameter("time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False),)
     acts_on = ActsOn.REFERENCE

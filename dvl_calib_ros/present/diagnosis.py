@@ -32,10 +32,10 @@ from .document import (
     figures,
     intervals,
     p_value,
+    quantity,
     section,
     share,
     table_by,
-    three,
     with_std,
 )
 
@@ -97,7 +97,7 @@ FOUND: Columns[FoundEffect] = {
     "effect": lambda effect: " or ".join((effect.name, *effect.equivalent_to)),
     "closes alone": lambda effect: share(effect.closure),
     "p, adjusted": lambda effect: p_value(effect.p),
-    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, _units(effect.name)), "text"),
+    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, units_of(effect.name)), "text"),
 }
 NEEDS: Columns[tuple[str, str]] = {"not testable": lambda each: each[0], "needs": lambda each: Cell(each[1], "text")}
 NOISE: Columns[NoiseFinding] = {
@@ -112,11 +112,11 @@ def diagnosis(d: Diagnosis) -> Document:
     """Where the DVL differs from what calibration leads to expect, which effect makes it, and what cannot be told."""
     series, has_effects = d.series, bool(d.effects)
     found = [
-        f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, _units(e.name))}." for e in d.effects
+        f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, units_of(e.name))}." for e in d.effects
     ]
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
     of_each = [
-        (effect.name, recording, intervals(parameters, _units(effect.name)))
+        (effect.name, recording, intervals(parameters, units_of(effect.name)))
         for effect in d.effects
         for recording, parameters in effect.by_recording.items()
     ]
@@ -127,14 +127,12 @@ def diagnosis(d: Diagnosis) -> Document:
     return Document(
         title="Sim-to-real gap of the DVL",
         subtitle="" if series is None else ", ".join(series.recordings),
-        answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found]),
+        answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found, *_to_do(d)]),
         warnings=d.notes,
         sections=[
             section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
-            section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
-            section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),
             section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
             section("", Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)),
             section(
@@ -144,6 +142,8 @@ def diagnosis(d: Diagnosis) -> Document:
                 else None,
                 where=Where.PAGE,
             ),
+            section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
+            section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),
             *(_of_series(d, series) if series is not None else []),
             section(
                 "What is left",
@@ -180,6 +180,12 @@ def _of_series(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
 # ------------------------------------------------------------------ sentences
 
 
+def _to_do(d: Diagnosis) -> list[str]:
+    """What each effect that was found asks for."""
+    known = [effect for effect in d.effects if effect.name in EFFECTS]
+    return [f"To do for {each.name}: {EFFECTS[each.name].remedy}." for each in known if EFFECTS[each.name].remedy]
+
+
 def _alike(d: Diagnosis) -> Iterator[Sentence]:
     """Effects that cannot be told apart, and what is known of a lever arm and a clock together."""
     for each in d.effects:
@@ -196,7 +202,7 @@ def _alike(d: Diagnosis) -> Iterator[Sentence]:
             )
 
 
-def _units(effect: str) -> dict[str, str]:
+def units_of(effect: str) -> dict[str, str]:
     """Units by parameter; of an effect that was found with another library than the installed one, none."""
     return {spec.name: spec.unit for spec in EFFECTS[effect].parameters} if effect in EFFECTS else {}
 
@@ -233,7 +239,8 @@ def _left(d: Diagnosis) -> str:
         said = rest.follows.full_sentence.removesuffix(".")
     else:
         said = "Nothing in it follows motion or time more than chance would"
-    return f"{amount} {said} (p = {p_value(math.exp(rest.log_p))})."
+    p = p_value(math.exp(rest.log_p))
+    return f"{amount} {said} (p {p if p.startswith('<') else f'= {p}'})."
 
 
 # ------------------------------------------------------------------ tables
@@ -245,10 +252,11 @@ def _detectable_table(d: Diagnosis) -> Table:
         specs = {spec.name: spec for spec in EFFECTS[name].parameters} if name in EFFECTS else {}
         for i, (parameter, size) in enumerate(sizes.items()):
             spec = specs.get(parameter)
-            unit = "" if spec is None else f" {spec.unit}"
-            worth = "–" if spec is None else f"{spec.typical:g}{unit}"
-            kind = "text" if spec is None else "text good" if size <= spec.typical else "text far"
-            rows.append((name if i == 0 else "", Cell(f"{parameter} {three(size)}{unit}", kind), worth))
+            typical = math.nan if spec is None else spec.typical
+            said, (found, worth), unit = quantity(parameter, (size, typical), "" if spec is None else spec.unit)
+            kind = "text" if spec is None else "text good" if size <= typical else "text far"
+            worth = "–" if spec is None else f"{worth} {unit}"
+            rows.append((name if i == 0 else "", Cell(f"{said} {found} {unit}".strip(), kind), worth))
     return Table(
         ("effect", Cell("smallest size found", "text"), "worth knowing of"),
         rows,

@@ -282,7 +282,7 @@ def with_std(value: float, std: float, digits: int = 2, *, signed: bool = False)
 
 def p_value(p: float) -> str:
     """A probability; – for none."""
-    return "–" if p != p else f"{p:.2g}" if p >= 1e-300 else "below 1e-300"
+    return "–" if p != p else f"{p:.2g}" if p >= 1e-3 else "< 0.001"
 
 
 def share(value: float) -> str:
@@ -298,12 +298,39 @@ def three(value: float) -> str:
     return text.replace("-", "−")
 
 
+# Units that people use for those of an effect's parameters: factor and name, and the end of the parameter's name that
+# says the other one; small times and velocities have others again.
+_SPOKEN: Mapping[str, tuple[float, str, str]] = {
+    "m": (1.0, "m", "_m"),
+    "s": (1.0, "s", "_s"),
+    "m/s": (1.0, "m/s", "_mps"),
+    "rad": (math.degrees(1.0), "°", "_rad"),
+    "rad/h": (math.degrees(1.0), "°/h", "_rad_per_hour"),
+    "rad/(m/s)": (math.degrees(1.0), "° per m/s", "_rad_per_mps"),
+    "m/s/rad": (math.radians(1.0), "m/s per °", ""),
+    "1": (100.0, "%", ""),
+    "1/h": (100.0, "%/h", "_per_hour"),
+    "s/h": (1.0, "s/h", "_per_hour"),
+}
+_SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
+
+
+def quantity(name: str, values: Sequence[float], unit: str) -> tuple[str, list[str], str]:
+    """A parameter's name, its values and their unit as people say them: degrees, ms and mm/s for rad, s and m/s."""
+    factor, spoken, suffix = _SPOKEN.get(unit, (1.0, unit, ""))
+    if spoken in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
+        factor, spoken = _SMALL[spoken]
+    said = "" if name in ("seconds", "seconds_per_hour") and unit else name.removesuffix(suffix)
+    return said, [three(factor * each) for each in values], spoken
+
+
 def intervals(parameters: Mapping[str, tuple[float, float, float]], units: Mapping[str, str] | None = None) -> str:
     """Values and from where to where each may be, by name; – where there are none."""
-    said = (
-        f"{name} {three(value)} ({three(low)} to {three(high)}) {(units or {}).get(name, '')}".strip()
-        for name, (value, low, high) in parameters.items()
-    )
+    said = []
+    for name, values in parameters.items():
+        spoken, (value, low, high), unit = quantity(name, values, (units or {}).get(name, ""))
+        space = "" if unit.startswith("°") else " "
+        said.append(" ".join(f"{spoken} {value}{space}{unit} ({low} to {high})".split()))
     return "; ".join(said) or "–"
 
 

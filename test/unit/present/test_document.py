@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from html import unescape
 
@@ -10,6 +11,7 @@ import pytest
 from report_fixtures import comparison as compared
 from rich.console import Console
 
+from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.present.comparison import comparison
 from dvl_calib_ros.present.document import (
     Answer,
@@ -19,6 +21,7 @@ from dvl_calib_ros.present.document import (
     Sentence,
     Table,
     Where,
+    intervals,
     number,
     table_by,
     with_std,
@@ -100,3 +103,20 @@ def test_a_table_is_a_row_for_each_object_by_what_its_columns_hold_of_it():
 def test_a_topic_is_broken_between_its_parts_only():
     assert breakable("/a50/dvl_data") == "/<wbr>a50/<wbr>dvl_<wbr>data"
     assert breakable("<b> _ /") == "&lt;b&gt; _ /"
+
+
+def test_sizes_are_said_in_units_that_people_use():
+    values = (0.0421, 0.03, 0.05)
+    assert intervals({"sin_rad": values}, {"sin_rad": "rad"}) == "sin 2.41° (1.72 to 2.86)"
+    assert intervals({"seconds": values}, {"seconds": "s"}) == "42.1 ms (30.0 to 50.0)"
+    assert intervals({"seconds": (1.5, 1.0, 2.0)}, {"seconds": "s"}) == "1.50 s (1.00 to 2.00)"
+    assert intervals({"x_mps": values, "at_s": (0.0, 0.0, math.inf)}, {"x_mps": "m/s", "at_s": "s"}) == (
+        "x 42.1 mm/s (30.0 to 50.0); at 0.00 s (0.00 to ∞)"
+    )
+    assert intervals({"ratio": values}, {"ratio": "1"}) == "ratio 4.21 % (3.00 to 5.00)"
+    assert intervals({"share": values}) == "share 0.0421 (0.0300 to 0.0500)"
+    assert intervals({}) == "–"
+
+
+def test_every_effect_says_what_to_do_about_it():
+    assert [name for name, effect in EFFECTS.items() if not effect.remedy] == []
