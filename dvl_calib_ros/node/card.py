@@ -31,10 +31,10 @@ from ..verdict.reasons import Reason, finding
 
 # What to drive next is thought of anew so often, s: it takes a few milliseconds.
 THOUGHT_OF_EVERY_S = 5.0
-# What is predicted differs from look to look, by up to twice: the median of so long is told, s. It is good enough when
-# it has stood for so long, s, and no longer from so many times the goal on: of 25 blocks a σ is known to a
-# quarter.
-TOLD_OVER_S, STANDS_S, TAKEN_BACK = 60.0, 30.0, 1.25
+# What is predicted differs from look to look, by up to twice. It is good enough when each look of so long, s, was
+# within the goal. It no longer is when the median of so long, which is what is told, is above so many times the goal:
+# of 25 blocks a σ is known to a seventh (1σ), so that half as much again is no chance.
+STANDS_S, TAKEN_BACK = 30.0, 1.5
 # Rates are means over so many statuses.
 RATED_OVER = 10
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
@@ -65,18 +65,18 @@ class RecentWorth:
             elif was_good:
                 self.taken_back = finding("WORTH_OF_ANOTHER_MODEL", model=model)
         self._looks.append((now_s, drift))
-        while self._looks[0][0] < now_s - TOLD_OVER_S:
+        while self._looks[0][0] < now_s - STANDS_S:
             self._looks.popleft()
         told = PredictedDrift(
             *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
         )
-        if rejected or told.both > target * (TAKEN_BACK if self.is_good else 1.0):
-            if self.is_good:
-                self.taken_back = finding("WORTH_HAS_FALLEN", worth=told.both)
-            self.is_good, self._within_since_s = False, None
+        if self.is_good and told.both > TAKEN_BACK * target:
+            self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=told.both)
+        if rejected or drift.both > target:
+            self._within_since_s = None
         elif self._within_since_s is None:
             self._within_since_s = now_s
-        if self.seconds_left(now_s) == 0.0:
+        elif self.seconds_left(now_s) == 0.0:
             self.is_good, self.taken_back = True, None
         return told
 
@@ -140,23 +140,14 @@ class Card:
         target, worth = parameters.target_drift, self._worth
         now = predicted_drift(model, estimate.recording_covariance, parameters)
         drift = worth.look(model.name, now, target, now_s, rejected)
-        if now_s - self._thought_s >= THOUGHT_OF_EVERY_S or self._outlook is None:
-            self._thought_s = now_s
-            first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
-            seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
-            noise = noise_of_a_second(estimate, parameters, seconds, self._squares / max(self._looks, 1))
-            still = RecentMotion(0.0, None, False, noise)
-            moving = still if motion is None else motion._replace(noise=noise)
-            if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
-                moving = moving._replace(speed=max(moving.speed, math.sqrt(self._squares / max(self._looks, 1))))
-            self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
-        found = self._outlook
         if rejected:
             found = Outlook(finding("NEXT_REJECTED"), None)
         elif worth.is_good:
             found = Outlook(is_good_enough(model), None)
-        elif drift.both <= target or found.next.code == is_good_enough(model).code:
+        elif now.both <= target:
             found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(now_s))
+        else:
+            found = self._thought(calibrator, estimate, motion, now_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
             "side": _done(drift.side, unknown[0], target / math.sqrt(2.0)),
@@ -174,6 +165,23 @@ class Card:
             "next code": found.next.code,
             "seconds": "-" if found.seconds is None else f"{found.seconds:.0f}",
         }
+
+    def _thought(
+        self, calibrator: Calibrator, estimate: Estimate, motion: RecentMotion | None, now_s: float
+    ) -> Outlook:
+        """What to drive next, as it was thought of last."""
+        if self._outlook is None or now_s - self._thought_s >= THOUGHT_OF_EVERY_S:
+            self._thought_s = now_s
+            parameters, mean_square = calibrator.parameters, self._squares / max(self._looks, 1)
+            first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
+            seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
+            noise = noise_of_a_second(estimate, parameters, seconds, mean_square)
+            still = RecentMotion(0.0, None, False, noise)
+            moving = still if motion is None else motion._replace(noise=noise)
+            if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
+                moving = moving._replace(speed=max(moving.speed, math.sqrt(mean_square)))
+            self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
+        return self._outlook
 
 
 def _done(drift: float, unknown: float, target: float) -> float:

@@ -106,10 +106,17 @@ def test_good_enough_is_said_when_it_has_stood_and_until_then_how_long_that_take
 
 
 def test_a_sigma_that_differs_from_look_to_look_does_not_take_good_enough_back(at_the_goal):
-    flickering = [1.0, 1.0, 2.5] * 60  # as that of the shipped bag does
+    flickering = [1.0] * 40 + [1.0, 1.0, 2.5] * 60  # as that of the shipped bag does
     codes = [each["next code"] for each in looks(Card(0.0), at_the_goal, flickering)]
     assert set(codes[codes.index("NEXT_IS_GOOD") :]) == {"NEXT_IS_GOOD"}
     assert all(each["taken back"] == "" for each in looks(Card(0.0), at_the_goal, flickering))
+
+
+def test_good_enough_is_not_said_of_looks_that_are_only_mostly_within_the_goal(at_the_goal):
+    codes = {each["next code"] for each in looks(Card(0.0), at_the_goal, [1.0] * 25 + [2.5] * 20 + [1.0] * 20)}
+    assert "NEXT_IS_GOOD" not in codes and "NEXT_STANDS" in codes
+    codes = [each["next code"] for each in looks(Card(0.0), at_the_goal, [1.0, 2.5] * 40)]
+    assert set(codes[::2]) == {"NEXT_STANDS"} and not {"NEXT_STANDS", "NEXT_IS_GOOD"} & set(codes[1::2])
 
 
 def test_a_sigma_that_has_grown_for_good_takes_good_enough_back_and_says_so_until_it_is_good_again(at_the_goal):
