@@ -36,6 +36,7 @@ from .document import (
     section,
     share,
     table_by,
+    three,
     with_std,
 )
 
@@ -255,8 +256,8 @@ def _detectable_table(d: Diagnosis) -> Table:
             typical = math.nan if spec is None else spec.typical
             said, (found, worth), unit = quantity(parameter, (size, typical), "" if spec is None else spec.unit)
             kind = "text" if spec is None else "text good" if size <= typical else "text far"
-            worth = "–" if spec is None else f"{worth} {unit}"
-            rows.append((name if i == 0 else "", Cell(f"{said} {found} {unit}".strip(), kind), worth))
+            worth_knowing = "–" if spec is None else f"{worth:g} {unit}"
+            rows.append((name if i == 0 else "", Cell(f"{said} {three(found)} {unit}".strip(), kind), worth_knowing))
     return Table(
         ("effect", Cell("smallest size found", "text"), "worth knowing of"),
         rows,

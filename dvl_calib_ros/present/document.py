@@ -315,22 +315,28 @@ _SPOKEN: Mapping[str, tuple[float, str, str]] = {
 _SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
 
 
-def quantity(name: str, values: Sequence[float], unit: str) -> tuple[str, list[str], str]:
+def quantity(name: str, values: Sequence[float], unit: str) -> tuple[str, list[float], str]:
     """A parameter's name, its values and their unit as people say them: degrees, ms and mm/s for rad, s and m/s."""
     factor, spoken, suffix = _SPOKEN.get(unit, (1.0, unit, ""))
     if spoken in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
         factor, spoken = _SMALL[spoken]
     said = "" if name in ("seconds", "seconds_per_hour") and unit else name.removesuffix(suffix)
-    return said, [three(factor * each) for each in values], spoken
+    return said, [factor * each for each in values], spoken
 
 
 def intervals(parameters: Mapping[str, tuple[float, float, float]], units: Mapping[str, str] | None = None) -> str:
-    """Values and from where to where each may be, by name; – where there are none."""
+    """Values and from where to where each may be, by name, with the digits that this tells; – where there are none."""
     said = []
     for name, values in parameters.items():
         spoken, (value, low, high), unit = quantity(name, values, (units or {}).get(name, ""))
+        width = high - low
+        if math.isfinite(width) and width > 0.0:
+            digits = max(0, 1 - math.floor(math.log10(width)))
+            shown = [number(each, digits) for each in (value, low, high)]
+        else:
+            shown = [three(each) for each in (value, low, high)]
         space = "" if unit.startswith("°") else " "
-        said.append(" ".join(f"{spoken} {value}{space}{unit} ({low} to {high})".split()))
+        said.append(" ".join(f"{spoken} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
     return "; ".join(said) or "–"
 
 

@@ -49,7 +49,7 @@ def positions(text: str, *parts: str) -> list[int]:
 def test_the_answer_comes_first_then_which_effects_where_what_is_left_and_what_to_fly(page):
     found = diagnosis()
     order = positions(
-        page.text, "ambiguous", found.sentence, "x 0.300 m (0.250 to 0.350)", "To do for lever_arm", "42.1 mm/s",
+        page.text, "ambiguous", found.sentence, "x 0.30 m (0.25 to 0.35)", "To do for lever_arm", "42.1 mm/s",
         "Which effects", "Where the gap lies", "Recorded against the simulated twin", "What is left",
         found.next_manoeuvre, "The noise",
     )  # fmt: skip
@@ -77,7 +77,7 @@ def test_sizes_that_this_data_cannot_show_are_marked_against_those_worth_knowing
 
 def test_places_noise_and_untestable_effects_have_their_tables(page):
     assert page.row("y (to port)")[1:] == ["turning", "0 to 150", "0 to 2.5", "70 %", "< 0.001"]
-    assert page.row("outliers")[2] == "share 0.0200 (0.0100 to 0.0300)"
+    assert page.row("outliers")[2] == "share 0.020 (0.010 to 0.030)"
     assert page.row("water_lock") == ["water_lock", "attitude"]
 
 
