@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from io_fixtures import mcap_bytes, raw, run, write_bag
+from log_fixtures import dataflash, pd0, rmc, telemetry
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
@@ -31,6 +32,8 @@ from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import Stream
 from dvl_calib_ros.disk.yaml_files import parse_scalar
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.dvl_logs import read_dvl_log
+from dvl_calib_ros.files.nmea import read_rmc
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.trajectories import read_columns
@@ -194,6 +197,18 @@ def run_trajectory(data: bytes) -> None:
     assert values.shape == (len(time), 3) and np.isfinite(values).all() and (np.diff(time) > 0.0).all()
 
 
+def run_log(data: bytes) -> None:
+    """The first byte says what the log is called."""
+    path = _file(f"fuzzed.{('log', 'BIN', 'tlog', 'nmea')[data[0] % 4] if data else 'log'}", data[1:])
+    try:
+        samples = read_rmc(path, 0.0, []) if path.suffix == ".nmea" else read_dvl_log(path).samples
+    except InputError as error:
+        assert len(str(error)) < 10_000
+        return
+    stamps = [each.stamp_ns for each in samples]
+    assert stamps == sorted(set(stamps)) and all(np.isfinite(each.velocity).all() for each in samples)
+
+
 def run_override(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     parse_scalar(text)
@@ -314,6 +329,15 @@ def _trajectory_seeds() -> Iterator[bytes]:
         yield b"n" + output.getvalue()
 
 
+def _log_seeds() -> Iterator[bytes]:
+    yield b"\0" + b"".join(pd0(i, 4500 + 10 * i, 200, -300) for i in range(4))
+    yield b'\0{"vx": 1.0, "vy": 0, "vz": 0, "fom": 0.1, "velocity_valid": true, "time_of_validity": 1638191471563017}\n'
+    yield b"\3" + "\r\n".join(rmc(11.0 + i, "3.0", "90.0") for i in range(4)).encode()
+    with suppress(ImportError):  # without the extra ardupilot
+        yield b"\1" + dataflash(FOLDER / "seed.BIN").read_bytes()
+        yield b"\2" + telemetry(FOLDER / "seed.tlog").read_bytes()
+
+
 def _override_seeds() -> Iterator[bytes]:
     yield from (b"[0.0, 1e-3, -2]", b"M3", b"min_speed:=0.5", b"{a: [1, 2]}", b"1:30:00", b"0x1F", b"!!python/name:os")
 
@@ -336,6 +360,7 @@ TARGETS = {
     "override": Target(run_override, _override_seeds),
     "urdf": Target(run_urdf, _urdf_seeds),
     "trajectory": Target(run_trajectory, _trajectory_seeds),
+    "log": Target(run_log, _log_seeds),
     "settings": Target(run_settings, settings_seeds),
     "names": Target(partial(run_names, names=Names(FOLDER, _SMALLEST_BAG)), names_seeds),
 }
