@@ -169,13 +169,9 @@ class Number:
 
 @dataclass(frozen=True)
 class Numbers:
-    """The quantities that a result is about: large on a page, a table on a terminal.
-
-    is_valid: whether they are to be used; a page does not show them otherwise.
-    """
+    """The quantities that a result is about: large on a page, a table on a terminal."""
 
     numbers: Sequence[Number]
-    is_valid: bool = True
 
     @property
     def table(self) -> Table:

@@ -31,7 +31,7 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
     notes = (note.sentence for note in discovery.notes)
     said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"What the motion shows of the DVL (median speed {examined.speed_mps:.2f} m/s)"
-    nothing = "Without a reference only pitch, and yaw if there are opposite headings."
+    nothing = "Without a reference only pitch shows, and yaw on opposite headings."
     return Document(
         title="What is in a recording",
         subtitle=names,

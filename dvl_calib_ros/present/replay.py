@@ -68,6 +68,7 @@ _AXES = {
 }
 
 
+NO_MOUNTING = "No mounting is given. What the models estimate is in the details (--verbose)."
 AGAINST_TRAVEL = (
     "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like yaw, and "
     "driving astern looks like a DVL turned by 180°."
@@ -190,7 +191,7 @@ def replayed(
                 worth,
                 where=Where.PAGE,
             ),
-            section(_headline(run, rejected), *_mounting(run, rejected)),
+            section(_headline(run, rejected), *([Sentence(NO_MOUNTING)] if rejected else _mounting(run))),
             section("", None if rejected else figures("mounting_figures.mounting_pictures", result), where=Where.PAGE),
             section("", facts_by(FACTS, run), where=where),
             section(
@@ -228,7 +229,9 @@ def replayed(
 def _answer(verification: Verification | None) -> Answer:
     if verification is None:
         return Answer("not verified", Severity.MARGINAL, ["Nothing was held back to verify the calibration on."])
-    reasons = [*verification.reasons, *([verification.mounting] if verification.mounting is not None else [])]
+    reasons = [*verification.reasons]
+    if verification.mounting is not None and verification.verdict is not Severity.REJECT:
+        reasons.append(verification.mounting)
     said = [each.full_sentence for each in reasons]
     return Answer(verification.verdict.value, verification.verdict, said, ADVICE[verification.verdict])
 
@@ -239,14 +242,14 @@ def _headline(run: Replayed, rejected: bool) -> str:
     seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - run.pause_s
     data = f"(model {result.selected}, {seconds:.0f} s of data)"
     if rejected:
-        return f"Not to be used: no mounting is given {data}"
+        return f"Not to be used {data}"
     parameters = Parameters.from_mapping(result.parameters)
     turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
     return f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} {data}"
 
 
-def _mounting(run: Replayed, rejected: bool) -> Iterator[Item]:
+def _mounting(run: Replayed) -> Iterator[Item]:
     """What was found, what the angles are measured against, whose own error stays in them, and what is not shown."""
     numbers = [
         Number(
@@ -259,10 +262,10 @@ def _mounting(run: Replayed, rejected: bool) -> Iterator[Item]:
         )
         for each in quantities(run.result)
     ]
-    yield Numbers(numbers, is_valid=not rejected)
-    if not rejected and not MODELS[run.result.selected].aided:
+    yield Numbers(numbers)
+    if not MODELS[run.result.selected].aided:
         yield Sentence(AGAINST_TRAVEL)
-    elif not rejected and run.reference_frame in EARTH:
+    elif run.reference_frame in EARTH:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
         yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")

@@ -65,7 +65,7 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
             elif isinstance(item, Facts):
                 yield from (Text(printable(f"{name}: {value}")) for name, value in item.facts.items() if value)
             elif isinstance(item, Numbers):
-                yield rich_table(item.table, "none" if item.is_valid else "dim")
+                yield rich_table(item.table)
             elif isinstance(item, Map) and width is not None:
                 yield terminal_map(item.navigation, width)
 
@@ -78,7 +78,7 @@ def _found(reason: Reason) -> Iterator[Padding]:
     yield Padding(Text.assemble(printable(reason.remedy), " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
 
 
-def rich_table(table: Table, style: str = "none") -> Folding:
+def rich_table(table: Table) -> Folding:
     """A table as rich prints it, folded where the terminal is too narrow."""
     from rich import box
     from rich.table import Table as RichTable
@@ -92,7 +92,6 @@ def rich_table(table: Table, style: str = "none") -> Folding:
         box=box.SIMPLE_HEAD,
         caption=" ".join(table.notes) or None,
         caption_justify="left",
-        style=style,
     )
     for index, name in enumerate(table.head):
         is_word = index < table.words

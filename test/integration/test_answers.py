@@ -65,6 +65,7 @@ def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
     options = ["-p", "mounting_rpy:=[0,0,0]", "-p", "dvl_position:=told", "--save", saved, "--report", page]
     out, _ = succeed(capsys, "replay", bag, *options)
     assert "reject: Do not use" in out and "Not to be used" in out and "URDF" not in out
+    assert "±1σ" not in out  # nor a table of a mounting
     text = page.read_text()
     assert "ready to paste" not in text and "static_transform_publisher" not in text
     assert 'class="number"' not in text and 'class="number ' not in text
