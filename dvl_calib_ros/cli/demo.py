@@ -123,15 +123,16 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
     from ..disk.yaml_files import load_yaml
     from ..files.result_file import load_result
+    from ..present.document import Table
     from ..present.terminal import rich_table
     from ..present.terms import estimate_table
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     _, live = load_result(saved)
-    table = estimate_table(offline, list(offline.estimates))
-    out.print(rich_table(table))
-    truth = zip(table.head[1:], _truth().values(), strict=False)
-    out.print("True are " + "; ".join(f"{name} {value:+.2f}" for name, value in truth))
+    found = estimate_table(offline, list(offline.estimates))
+    truth = ("truth", *(f"{value:+.2f}" for value in _truth().values()))
+    of_these = [row[: len(truth)] for row in found.rows]  # what there is a truth of
+    out.print(rich_table(Table(found.head[: len(truth)], [truth, *of_these])))
     worst = max(
         float(np.abs(here - there).max())
         for name, estimate in offline.estimates.items()
