@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -34,6 +33,7 @@ from .results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_documen
 from .selection import EffectSelection, Selected, blocks_of, select
 from .series import collect_series
 from .settings import SETTINGS
+from .shown import somewhere
 from .standing import is_borne_out, matters, settled
 from .twin import twins
 from .unexplained import Unexplained, unexplained
@@ -50,11 +50,6 @@ POWER = 0.8
 MATERIAL = 0.2
 # What is left beyond the noise is told in the sentence from this share of the noise on
 WORTH_TELLING = 0.3
-# A DVL whose z axis is as near to the vehicle's measures roll and pitch about the other two
-UPRIGHT = 0.98
-# ... and one that tilts at this (rad/s, rms) moves a DVL half a metre below by a centimetre a second: a boat at 0.2°/s
-# shows nothing of that, an AUV at sea at 1.8°/s does.
-TILTING_RADPS = math.radians(1.0)
 Triple = tuple[float, float, float]
 
 
@@ -89,10 +84,13 @@ def diagnose_recordings(
         check_clocks(recording, parameters.rotation_dvl_from_body)
     available = frozenset.intersection(*(recording.available for recording in recordings))
     untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
-    testable = {
-        name: _shown_part(each, recordings, parameters) for name, each in effects.items() if name not in untestable
-    }
-    selection = select(recordings, parameters.rotation_dvl_from_body, np.array(parameters.lever_arm), testable)
+    selection = select(
+        recordings,
+        parameters.rotation_dvl_from_body,
+        np.array(parameters.lever_arm),
+        {name: effect for name, effect in effects.items() if name not in untestable},
+    )
+    testable = selection.testable
     if len(selection.fitter.problem.time) < SETTINGS.min_bins:
         samples, seconds = len(selection.fitter.problem.bin_of), sum(each.seconds for each in recordings)
         return _nothing_to_say(_too_short(samples, seconds), notes)
@@ -160,24 +158,6 @@ def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequen
     if effect.relative_to_first and len(recordings) < 2:
         lacking.append("a second recording")
     return ", ".join(sorted(lacking))
-
-
-def _shown_part(effect: Effect, recordings: Sequence[RecordedStreams], parameters: Parameters) -> Effect:
-    """An effect without what references that are horizontal do not show of it."""
-    is_upright = abs(parameters.rotation_dvl_from_body[2, 2]) > UPRIGHT
-    if not effect.vertical or any(recording.measured[2] for recording in recordings) or not is_upright:
-        return effect
-    if effect.name == ARM and any(_tilts(recording) for recording in recordings):
-        return effect
-    return effect.without(effect.vertical)
-
-
-def _tilts(recording: RecordedStreams) -> bool:
-    """Whether a vehicle rolls and pitches so fast that a height of the DVL moves it to and fro."""
-    if EffectNeeds.ANGULAR_VELOCITY not in recording.available:
-        return False
-    rates = recording.angular_velocity(recording.dvl.time)[:, :2]
-    return float(np.sqrt(np.nanmean((rates**2).sum(axis=1)))) > TILTING_RADPS
 
 
 def _compared_axes(selection: EffectSelection) -> str:
@@ -253,7 +233,7 @@ def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: in
         at = 6 + sum(len(fit.hypothesis.parameters_of(e)) for e in fit.effects[: fit.effects.index(effect)])
     else:
         at = fit.columns.shape[2]
-        columns.append(problem.columns(fit.hypothesis, fit.seen, effect, _somewhere(effect, problem.recordings)))
+        columns.append(problem.columns(fit.hypothesis, fit.seen, effect, somewhere(effect, problem)))
         std.append(np.full(columns[-1].shape[2], 1e6))
     white = fit.noise.whiten(np.concatenate(columns, axis=2))
     prior = np.concatenate(std)
@@ -261,19 +241,6 @@ def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: in
     own = np.sqrt(np.maximum(np.diag(system.covariance()), 0.0))[at:]
     factor = float(normal_isf(SETTINGS.level / n_tested / 2.0) + normal_isf(1.0 - POWER))
     return {spec.name: factor * float(each) for spec, each in zip(amplitudes(effect), own, strict=False)}
-
-
-def _somewhere(effect: Effect, recordings: Sequence[RecordedStreams]) -> list[Mapping[str, float]]:
-    """Defaults, with what comes in the midst of the run where no time is given."""
-    values: list[Mapping[str, float]] = []
-    for recording in recordings:
-        times = {
-            spec.name: 0.5 * recording.seconds
-            for spec in effect.parameters
-            if is_time_of_run(spec) and not any(is_time_of_run(o) for o in effect.parameters if o is not spec)
-        }
-        values.append(effect.defaults | times)
-    return values
 
 
 def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:

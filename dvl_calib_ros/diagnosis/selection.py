@@ -29,6 +29,7 @@ from .noise import Noise, white_noise
 from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
 from .settings import SETTINGS
+from .shown import shown_parts
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
 START = ("lever_arm", "dvl_time_offset", "reference_time_offset")
@@ -70,7 +71,7 @@ class Selected:
 @dataclass(frozen=True)
 class EffectSelection:
     """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
-    fitter; guesses per recording.
+    fitter; guesses per recording; the effects there were, with what of each is shown.
     """
 
     selected: tuple[Selected, ...]
@@ -78,6 +79,7 @@ class EffectSelection:
     fit: Fit
     fitter: Fitter
     guesses: tuple[FirstGuess, ...]
+    testable: Mapping[str, Effect]
 
     def withdrawn(self) -> EffectSelection:
         """Without any effect."""
@@ -89,10 +91,12 @@ def started(
     rotation_dvl_from_body: Array,
     lever_arm: Array,
     effects: Mapping[str, Effect],
-) -> tuple[Problem, Hypothesis, tuple[FirstGuess, ...]]:
-    """The problem about the first guess of each recording, and a hypothesis with what it holds."""
+) -> tuple[Problem, Hypothesis, tuple[FirstGuess, ...], dict[str, Effect]]:
+    """The problem about the first guess of each recording, a hypothesis with what it holds, the guesses, and effects
+    with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+    effects = shown_parts(effects, problem)
     lever = np.median([guess.lever_arm for guess in guesses], axis=0)
     found: dict[str, tuple[Values, ...]] = {
         "lever_arm": ({"x_m": float(lever[0]), "y_m": float(lever[1]), "z_m": float(lever[2])},) * len(guesses),
@@ -101,7 +105,7 @@ def started(
     }
     present = [effects[name] for name in START if name in effects]
     start = no_effect(np.median([guess.phi for guess in guesses], axis=0)).with_effects(present, len(guesses), found)
-    return problem, start, guesses
+    return problem, start, guesses, effects
 
 
 def select(
@@ -111,7 +115,7 @@ def select(
     effects: Mapping[str, Effect],
 ) -> EffectSelection:
     """Select among testable effects."""
-    problem, start, guesses = started(recordings, rotation_dvl_from_body, lever_arm, effects)
+    problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
     kept = without_contradicted(problem, fit.hypothesis)
     if kept is not None:
@@ -146,7 +150,7 @@ def select(
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_either_clock(each) for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
-    return EffectSelection(ordered, base, fit, fitter, guesses)
+    return EffectSelection(ordered, base, fit, fitter, guesses, effects)
 
 
 # ------------------------------------------------------------------ noise

@@ -159,19 +159,22 @@ class Effect(AnyEffect, ABC):
 
     remedy: what to do about it where it is found, as part of a sentence. manoeuvre: what to fly to see it and tell it
     from what it is confounded with. of_the_day: whether its size is another in every recording; else it belongs to the
-    vehicle. relative_to_first: whether it is a change against the first of several recordings. vertical: parameters of
-    which a reference that is horizontal shows nothing, with the DVL upright.
+    vehicle. relative_to_first: whether it is a change against the first of several recordings.
     """
 
     remedy: ClassVar[str] = ""
     manoeuvre: ClassVar[str]
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
-    vertical: ClassVar[frozenset[str]] = frozenset()
 
     def without(self, names: Collection[str]) -> Effect:
         """The same, without some parameters, which stay at their defaults of 0."""
-        found = copy(self)
+        if not names:
+            return self
+        found, defaults = copy(self), self.defaults
+        for name in ("trace", "late", "turn"):  # what it does goes by all parameters, which it may count
+            if act := getattr(self, name, None):
+                vars(found)[name] = lambda of, values, act=act: act(of, {**defaults, **values})
         vars(found)["parameters"] = tuple(each for each in self.parameters if each.name not in names)
         return found
 

@@ -18,7 +18,6 @@ class LeverArm(Effect):
     remedy = "--apply writes the lever arm; measure it with a tape to be sure"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
     parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
-    vertical = frozenset({"z_m"})
     acts_on = ActsOn.MOTION
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     confounded_with = ("sideslip", "reference_time_offset", "reference_lag")

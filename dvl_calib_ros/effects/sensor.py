@@ -20,7 +20,6 @@ class VelocityBias(Effect):
     remedy = "let the DVL measure standing still over the bottom; a bias there is the maker's to mend"
     manoeuvre = "straight legs at two speeds or more, one of them slow"
     parameters = along_axes("mps", "m/s", 0.02, 1.0, "bias of the DVL's axis {}")
-    vertical = frozenset({"z_mps"})
     acts_on = ActsOn.DVL
     confounded_with = ("quadratic_scale", "mount_flexure", "water_lock")
 
@@ -77,7 +76,6 @@ class MisalignmentDrift(MountingEffect):
     parameters = along_axes(
         "rad_per_hour", "rad/h", 0.05, 2.0, "change of φ about the DVL's axis {} per hour", linear=False
     )
-    vertical = frozenset({"x_rad_per_hour", "y_rad_per_hour"})
     of_the_day = True
     confounded_with = ("scale_drift",)
 
@@ -96,7 +94,6 @@ class MountFlexure(MountingEffect):
     parameters = along_axes(
         "rad_per_mps", "rad/(m/s)", 0.005, 0.2, "φ about the DVL's axis {} per m/s of speed", linear=False
     )
-    vertical = frozenset({"x_rad_per_mps", "y_rad_per_mps"})
     confounded_with = ("velocity_bias", "quadratic_scale")
 
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -112,7 +109,6 @@ class MountingMoved(MountingEffect):
     remedy = "the DVL has been moved between the recordings: calibrate each day by itself"
     manoeuvre = "straight legs that speed up and slow down, in each recording"
     parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
-    vertical = frozenset({"x_rad", "y_rad"})
     of_the_day = True
     relative_to_first = True
 
