@@ -189,6 +189,8 @@ def test_a_horizontal_reference_gives_the_same_answer_and_its_vertical_is_not_co
     assert all({*values} <= {"x_m", "y_m"} for name, values in found(boat).items() if name == "lever_arm")
     assert {*boat.minimum_detectable["lever_arm"]} == {"x_m", "y_m"}
     assert {*level.minimum_detectable["mount_flexure"]} == {"z_rad_per_mps"}
+    assert {*level.minimum_detectable["axis_nonorthogonality"]} == {"xy_rad"}  # heights were claimed of these two
+    assert {*level.minimum_detectable["tilt_coupling"]} <= {"x_per_pitch", "y_per_roll"}
 
 
 def turned(sample):

@@ -384,3 +384,14 @@ def test_the_table_of_effects_has_one_row_of_five_cells_for_each():
 
 def test_the_readme_lists_the_effects():
     assert section("effects").splitlines()[2:] == own_rows(), "take it from: dvl-calib parameters --effects"
+
+
+@pytest.mark.parametrize("name", sorted(name for name, (_, values, *_) in CASES.items() if len(values) > 1))
+def test_an_effect_without_some_of_its_parameters_does_what_it_does_with_those_at_their_defaults(name):
+    """Misaligned axes went through their parameters, and failed where two were left out."""
+    motion, values, *_ = CASES[name]
+    first, *others = EFFECTS[name].parameters
+    part = EFFECTS[name].without({each.name for each in others})
+    assert part.parameters == (first,)
+    whole = EFFECTS[name].trace(motion, {**EFFECTS[name].defaults, first.name: values[first.name]})
+    np.testing.assert_array_equal(part.trace(motion, {first.name: values[first.name]}), whole)
