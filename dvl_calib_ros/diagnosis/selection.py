@@ -115,17 +115,18 @@ def select(
     effects: Mapping[str, Effect],
 ) -> EffectSelection:
     """Select among testable effects."""
+    every = effects  # what is not shown of them is not noise all the same
     problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
     kept = without_contradicted(problem, fit.hypothesis)
     if kept is not None:
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
         fitter, fit = _first_fit(problem, fit.hypothesis)
-    fitter, fit = _about(fitter, fit, effects)
+    fitter, fit = _about(fitter, fit, every)
     far = fitter.bursts(fit)
     if far.any():
         problem = problem.without(far)
-        fitter, fit = _about(*_first_fit(problem, fit.hypothesis), effects)
+        fitter, fit = _about(*_first_fit(problem, fit.hypothesis), every)
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
@@ -136,12 +137,12 @@ def select(
         best = fitter.refined(_best(fits, effects), finer[3:])
         best = _called_for(fitter, best, len(effects))
         names = frozenset(effect.name for effect in best.effects)
-        fitter, fit = _about(fitter, best, effects)
+        fitter, fit = _about(fitter, best, every)
         if names in seen_before:
             break
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
-    fitter, fit = _about(fitter, fit, effects)
+    fitter, fit = _about(fitter, fit, every)
     fit = with_arm(fitter, fit, guesses, effects)
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]

@@ -9,10 +9,10 @@ import numpy as np
 from ..effects.base import Effect
 from .composed import Problem, Seen, Values, amplitudes, is_time_of_run, no_effect
 
-# Of what an effect's best-shown parameter of its typical size does to what is compared: one that does less is left out,
-# for what a model lacks does as much. A boat that rolls at 0.2°/s and turns at 3 shows no height of its DVL, an AUV at
-# sea does; a vehicle that keeps level shows no bias upwards, and neither roll nor pitch of a mounting.
-SHOWN_FROM = 0.2
+# A parameter of its typical size that does less to what is compared than this share of what its effect's best-shown one
+# does, or of a usual bias (m/s), is left out, for what a model lacks does as much. A boat that rolls at 0.2°/s shows no
+# height of its DVL, an AUV at sea does at 1°/s; one that keeps level no bias upwards, nor roll and pitch of a mounting.
+SHOWN_FROM, USUAL_MPS = 0.2, 0.02
 
 
 def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
@@ -26,9 +26,12 @@ def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Ef
 def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
-    of_each = (columns**2).sum(axis=(0, 1)).reshape(-1, len(specs)).max(axis=0)  # of days that which shows most
+    of_each = (
+        (columns**2).sum(axis=1).mean(axis=0).reshape(-1, len(specs)).max(axis=0)
+    )  # of days the one that shows most
     sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
-    return effect.without({s.name for s, size in zip(specs, sizes, strict=True) if size < SHOWN_FROM * sizes.max()})
+    least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
+    return effect.without({spec.name for spec, size in zip(specs, sizes, strict=True) if size < least})
 
 
 def somewhere(effect: Effect, problem: Problem) -> list[Values]:

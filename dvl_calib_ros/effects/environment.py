@@ -55,6 +55,7 @@ class HeadingError(Effect):
         EffectParameter("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),
         EffectParameter("cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False),
     )
+    of_the_day = True
     acts_on = ActsOn.REFERENCE
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("water_lock",)

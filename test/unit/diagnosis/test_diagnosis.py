@@ -314,6 +314,17 @@ def several(*changes):
     ]
 
 
+def test_a_compass_that_is_wrong_by_another_amount_each_day_is_named_with_its_size_on_each():
+    """It was asked to be the same on all: of three runs of a boat a current of each day was named instead."""
+    sines = (-0.06, -0.035, 0.0)
+    days = several(*({"effects": [f"heading_error:sin_rad={sine},cos_rad=0.02"]} for sine in sines))
+    (effect,) = diagnose_recordings(days, Parameters()).effects
+    assert effect.name == "heading_error"
+    for name, sine in zip(("day0", "day1", "day2"), sines, strict=True):
+        _, low, high = effect.by_recording[name]["sin_rad"]
+        assert low <= sine <= high
+
+
 def test_one_lever_arm_and_a_delay_for_each_day_are_fitted_together_and_whole_days_are_held_out():
     delays = (0.4, -1.1, 2.0)
     days = several(*({"effects": [LEVER, f"dvl_time_offset:seconds={delay}"]} for delay in delays))
