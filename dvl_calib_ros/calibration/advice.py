@@ -130,10 +130,11 @@ def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reaso
     said = []
     open_std = np.sqrt(np.diag(estimate.left_open))
     if open_std.any():
-        at = [estimate.state_names.index(name) for name in ARM]
-        delay = open_std[estimate.state_names.index("time_offset")]
+        by_name = dict(zip(estimate.state_names, open_std.tolist(), strict=True))
+        metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
-        said.append(finding("CLOCK_OR_ARM", metres=np.linalg.norm(open_std[at]), degrees=turn, seconds=delay))
+        seconds = by_name.get("time_offset", 0.0)
+        said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days

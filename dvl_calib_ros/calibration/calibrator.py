@@ -551,7 +551,17 @@ class Calibrator:
         estimator = self._estimators[name]
         state, covariance = estimator.of_recording()
         worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
-        return GaussianState(state, covariance + worse + self._by_unknown_arm(name, state, covariance))
+        unknown = self._by_unknown_arm(name, state, covariance) + self._by_clock(name)
+        return GaussianState(state, covariance + worse + unknown)
+
+    def _by_clock(self, name: str) -> Array:
+        """(n, n) of a model that takes clocks as known: what one in a steady turn makes of the angles, with an arm that
+        was told."""
+        n, estimator = MODELS[name].n_state, self._estimators.get(EXTENDED_BY.get(name, ""))
+        found = np.zeros((n, n))
+        if estimator is not None and any(self.parameters.lever_arm):
+            found[:3, :3] = estimator.turn_open
+        return found
 
     def _by_unknown_arm(self, name: str, state: Array, covariance: Array) -> Array:
         """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known.
@@ -590,7 +600,7 @@ class Calibrator:
             covariance=covariance + self._day_covariance(model.name),
             recording_covariance=covariance,
             filter_covariance=self._estimators[model.name].filter_covariance,
-            left_open=self._estimators[model.name].left_open,
+            left_open=self._estimators[model.name].left_open + self._by_clock(model.name),
             used=used,
             gated=gated,
             mean_nis=mean_nis,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -269,3 +270,16 @@ def test_an_angle_that_no_data_showed_is_not_offered_to_be_pasted(tmp_path, caps
     bag = write_bag(tmp_path / "bag", [sample for sample in run(seconds) if isinstance(sample, DvlSample)])
     out, _ = succeed(capsys, "replay", bag)
     assert ("URDF" in out) == is_shown
+
+
+@pytest.mark.slow
+def test_on_a_circle_sigma_of_yaw_holds_clocks_that_are_late_together(tmp_path):
+    """0.3 s at 5 degrees a second are 1.4 degrees of yaw, which were accepted as ± 0.13: nothing else shows them."""
+    told = {"transform": True, "arm": (0.5, 0.1, -0.2), "antenna": (0.0,) * 3, "mounting_yaw": 0.0}
+    late = {"reference_late": 0.3, "dvl_late": 0.3, "compass": 0.0, "outliers": 0.0, "lasting": False}
+    drawn = replace(draw(36018), manoeuvre="circle", reference="enu", seconds=240.0, **told, **late)
+    truth = write_survey(drawn, tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    off, std = run.mounting.rpy_deg[2] - truth["rpy_deg"][2], run.mounting.std_deg[2]
+    assert 0.7 < abs(off) < 2.5 * std and std < 3.0
+    assert "CLOCK_OR_ARM" in [each.code for each in run.findings]

@@ -198,7 +198,18 @@ class DelayFilter(Estimator):
             own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
             own *= posterior.shown[_OPEN, None]
             found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
+            if any(self._parameters.lever_arm):
+                found[:3, :3] += self.turn_open
         return found
+
+    @property
+    def turn_open(self) -> Array:
+        """As `Estimator`."""
+        registration = self._registration_told
+        if self.posterior is None or not self.claims or registration is None:
+            return np.zeros((3, 3))
+        about = self._parameters.rotation_dvl_from_body @ registration.turn_open
+        return np.outer(about, about)
 
     def extended(self, base: GaussianState) -> GaussianState:
         """The state of the model that this one extends, with the prior of what it does not have."""

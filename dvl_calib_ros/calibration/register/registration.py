@@ -98,7 +98,8 @@ class Registration:
     speed; spread: the same, m/s per axis; speed: RMS, m/s.
     unsteady: a clock that drifts or leaps beside the others; all else is what holds with that taken off.
     open_late: σ (s) of the reference's clock by the data alone; open_by: (7,) by how much the DVL's turn (rad, body),
-    the lever arm (m) and the DVL's delay (s) are others for each second of it.
+    the lever arm (m) and the DVL's delay (s) are others for each second of it. turn_open: (3,) rad, body, what it
+    leaves open of the turn where the lever arm is as told.
     """
 
     dvl: Clock
@@ -118,6 +119,7 @@ class Registration:
     speed: float
     open_late: float
     open_by: Array
+    turn_open: Array
     unsteady: Unsteady | None = None
 
     @property
@@ -127,8 +129,7 @@ class Registration:
         At one speed a clock looks like a lever arm, at one rate of turn like a yaw, and then none is known. Zero where
         that is nothing to speak of.
         """
-        std = 1.0 / math.hypot(1.0 / max(self.open_late, 1e-9), 1.0 / IN_TIME_STD_S)
-        open_by = self.open_by * std
+        open_by = self.open_by * _with_prior(self.open_late)
         turn, arm = (float(np.linalg.norm(part)) for part in (open_by[:3], open_by[3:6]))
         is_little = arm < OPEN_FROM_M and turn < OPEN_FROM_RAD
         return np.zeros((7, 7)) if is_little else np.outer(open_by, open_by)
@@ -296,13 +297,34 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
 def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
     """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
     if not fit.is_turned:
-        return {"open_late": 0.0, "open_by": np.zeros(7)}
+        return {"open_late": 0.0, "open_by": np.zeros(7), "turn_open": np.zeros(3)}
     std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
     if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
         # as good as in time, and so far away that it turns another arm there
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
         std, by = max(std, off), by if near is None else near.by(LATE)
-    return {"open_late": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]])}
+    return {
+        "open_late": std,
+        "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]]),
+        "turn_open": turn_open(free, late),
+    }
+
+
+def turn_open(free: Fitted, late: float) -> Array:
+    """(3,) rad, body, of the turn with the lever arm as it was told; zeros for nothing to speak of."""
+    white = free.p / np.outer(free.raised, free.raised)
+    by_arm = np.linalg.solve(white[ARM, ARM], white[ARM])  # (3, 9)
+    held = white - white[:, ARM] @ by_arm
+    # where it is not said to be as the data have it, it may be all the same
+    off = abs(float(free.x[LATE] - by_arm[:, LATE] @ free.x[ARM]) - late)
+    std = max(math.sqrt(max(float(held[LATE, LATE]), 0.0)) * float(free.raised[LATE]), off)
+    turned = held[TURN, LATE] / max(float(held[LATE, LATE]), 1e-18) * _with_prior(std)
+    return np.asarray(turned if np.linalg.norm(turned) > OPEN_FROM_RAD else np.zeros(3))
+
+
+def _with_prior(std: float) -> float:
+    """Of a reference's clock that is known to so much (σ, s) by the data alone."""
+    return 1.0 / math.hypot(1.0 / max(std, 1e-9), 1.0 / IN_TIME_STD_S)
 
 
 class _Off(Enum):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -14,9 +15,17 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.register.configuration import fitting_configuration
 from dvl_calib_ros.calibration.register.curves import Curves
-from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, MotionFit
+from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, Fitted, MotionFit, N
 from dvl_calib_ros.calibration.register.motion import MotionStreams, make_motion
-from dvl_calib_ros.calibration.register.registration import Clock, Registration, _is_possible, is_beyond_doubt, register
+from dvl_calib_ros.calibration.register.registration import (
+    IN_TIME_STD_S,
+    Clock,
+    Registration,
+    _is_possible,
+    is_beyond_doubt,
+    register,
+    turn_open,
+)
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
@@ -361,3 +370,17 @@ def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_a_calibrati
     found = replace(registered("box", 5.0), dvl=in_time, reference=in_time, imu=in_time, apart=Clock(-50.0, 0.1, True))
     assert found.not_told_apart is not None and found.not_told_apart.code == "CLOCKS_NOT_TOLD_APART"
     assert found.contradiction(Parameters()) == found.not_told_apart
+
+
+def test_a_clock_that_a_steady_turn_hides_leaves_its_yaw_open_and_one_that_turns_show_does_not():
+    """Of yaw and clock a steady turn shows the sum, by 0.1 rad/s, and the clock hardly; it was found 0.4 s late."""
+    information = np.eye(N) * 1e6
+    information[2, 2], information[2, LATE], information[LATE, 2], information[LATE, LATE] = 1e6, 1e5, 1e5, 1e4 + 10.0
+    x = np.zeros(N)
+    x[LATE] = 0.4
+    found = {"level": 0.01, "rows": 100, "speed": 1.0, "squares": np.zeros(100), "axes": 3, "inflation": 1.0}
+    fit = Fitted(x, np.linalg.inv(information), np.eye(3), **found, at=np.arange(100), raised=np.ones(N))
+    std = 1.0 / math.hypot(1.0 / 0.4, 1.0 / IN_TIME_STD_S)
+    np.testing.assert_allclose(turn_open(fit, 0.0), [0.0, 0.0, -0.1 * std], atol=1e-9)
+    information[LATE, LATE] = 1e6
+    assert not turn_open(fit._replace(p=np.linalg.inv(information), x=np.zeros(N)), 0.0).any()
