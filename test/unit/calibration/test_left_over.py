@@ -116,7 +116,7 @@ def test_noise_of_the_dvl_is_no_bias_where_the_speed_hardly_changes():
 def test_a_bias_that_is_not_beyond_doubt_is_marginal(rng):
     """27 ± 7 mm/s, which were 1.4 degrees of yaw at 0.2, were accepted."""
     found = Vehicle(rng).found()
-    for bias, words in ((0.027, [Severity.MARGINAL]), (0.02, []), (0.05, [Severity.REJECT])):
+    for bias, words in ((0.027, [Severity.MARGINAL]), (0.02, []), (0.03, [Severity.REJECT])):
         biased = found._replace(bias=np.array([0.0, bias, 0.0]), bias_std=np.full(3, 0.0067))
         assert [each.severity for each in left_over_advice(biased) if each.code == "DVL_BIAS"] == words
 
