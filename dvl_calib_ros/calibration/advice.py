@@ -24,6 +24,8 @@ SUSPICIOUS_REPEATED = 0.05
 OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
 # It is not shown from this share of its prior σ on.
 NOT_SHOWN = 0.6
+# Of a lever arm (m) and a delay (s) that a clock leaves open, what is worth a word.
+SAID_FROM_M, SAID_FROM_S = 0.05, 0.05
 # So many losses of GNSS are flapping.
 FLAPPING = 3
 
@@ -134,7 +136,10 @@ def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reaso
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
+        if metres < SAID_FROM_M and seconds < SAID_FROM_S:  # the arm was told
+            said.append(finding("CLOCK_ON_TURN", degrees=turn))
+        else:
+            said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days

@@ -391,6 +391,13 @@ FINDINGS = (
         "drive turns to both sides at two speeds",
     ),
     Kind(
+        "CLOCK_ON_TURN",
+        "in a steady turn a late reference or IMU looks like a yaw: {degrees:.1f}° cannot be told apart; σ includes it",
+        "The velocity of another time points elsewhere, always by the same angle. A reference is taken to be in time "
+        "to 0.5 s.",
+        "drive turns to both sides, or a straight leg",
+    ),
+    Kind(
         "REFERENCE_OFFSET",
         "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
         "A constant error of an inertial navigation, or a current where the DVL tracks the water. G1 and G2 estimate "

@@ -282,4 +282,4 @@ def test_on_a_circle_sigma_of_yaw_holds_clocks_that_are_late_together(tmp_path):
     run = dc.replay(tmp_path / "bag", history=False)
     off, std = run.mounting.rpy_deg[2] - truth["rpy_deg"][2], run.mounting.std_deg[2]
     assert 0.7 < abs(off) < 2.5 * std and std < 3.0
-    assert "CLOCK_OR_ARM" in [each.code for each in run.findings]
+    assert "CLOCK_ON_TURN" in [each.code for each in run.findings]
