@@ -24,6 +24,8 @@ _STANDING = 0.05
 
 def is_nmea(path: Path) -> bool:
     """Whether RMC sentences are in the beginning of a file."""
+    if not path.is_file():  # a pipe would be waited for
+        return False
     try:
         with path.open("rb") as file:
             return _RMC.search(file.read(_SNIFFED)) is not None
