@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -22,25 +20,21 @@ import numpy as np
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from . import told_arm
 from .alignment import Aligner
-from .assembly import nis_bounds
 from .bank import Group, groups_of
-from .days import day_covariance, offset_covariance
-from .delay.clocks import Rest
-from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
+from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
-from .doubts import doubts
-from .error_model import correction_matrix
+from .estimates import Estimates
 from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
-from .folds import folds_of
 from .frames import Array, Vector, rotation_from_quaternion
+from .further import FurtherEstimators
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
+from .judging import Judge
 from .kalman import GaussianState
+from .message_counts import counted
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
-from .navigation import Navigation, dead_reckoned, objections
-from .observability import MEASURES_VERTICAL, convergence, observability
+from .navigation import Navigation
 from .observations import Observations
 from .observe import Observer
 from .parameters import IAC, ParameterError, Parameters
@@ -62,20 +56,11 @@ from .samples import (
 )
 from .selection import Selection
 from .stream_clocks import StreamClocks
-from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
+from .verification import Verification
 from .worth import RecentMotion
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
-# Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
-OPEN_FROM = 4.0
-# So many σ of the difference between the two are no chance.
-NO_CHANCE = 3.0
-# What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
-JUDGED_LIVE = {
-    "HELD_OUT_WORSE", "HELD_OUT_SEVERAL_TIMES", "HELD_OUT_IMPLAUSIBLE", "HELD_OUT_OUTLIERS", "MISALIGNMENT_LARGE",
-    "SCALE_LARGE", "LEVER_ARM_TURNS_ANGLE",
-}  # fmt: skip
 # Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # G2's blocks are gathered like samples: one of 10 s counts for so many of these.
@@ -153,8 +138,6 @@ class Calibrator:
         self._registration = registration
         self._recordings_ns = recordings_ns
         self._observer = Observer(parameters)
-        self._day_covariances: dict[str, Array] = {}
-        self._compared: tuple[ThinnedRecording, Compared] | None = None  # as mounted
         self._aligner = Aligner(parameters, prior_sway_heave, self._restart, recordings_ns)
         self.reset()
 
@@ -185,7 +168,9 @@ class Calibrator:
             if MODELS[name].estimator:
                 self._estimators[name] = self._made(MODELS[name])
         # those that are more than the linear filter
-        self._further = tuple(self._estimators[name] for name in self._models if MODELS[name].estimator)
+        self._further = FurtherEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
+        self._estimates = Estimates(self._estimators, self._further, self._models, self.parameters)
+        self._judge = Judge(self._estimates)
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
         self._seen: dict[Needs, _RowsSeen] = {}
@@ -282,9 +267,9 @@ class Calibrator:
         rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
-        for each in self._further:
-            if each.told_until_ns is not None:
-                stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, each.told_until_ns))]
+        until_ns = self._further.told_until_ns
+        if until_ns is not None:
+            stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, until_ns))]
         if len(stamps_ns):
             paired = rows.pairing[first : first + len(stamps_ns)] == Pairing.PAIRED
             self._selection.update(stamps_ns, paired, self.parameters)
@@ -391,7 +376,7 @@ class Calibrator:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
         done = min(self._n_selected, *(group.next_row for group in self._groups))
-        done = min(done, *(each.n_taken for each in self._further)) if self._further else done
+        done = min(done, self._further.n_taken)
         done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
@@ -415,43 +400,9 @@ class Calibrator:
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """Where the messages went, since the start or the last restart.
-
-        dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (`refuse`) + accepted;
-        accepted = slow + frozen + turning + no_turn_rate + usable + awaiting_imu; repeated and dropouts are counted
-        beside these. pairing: accepted and decided = paired +
-        unpaired; awaiting_reference is the rest. usable = oriented + not_oriented (no attitude or no angular velocity)
-        + awaiting_attitude. A model's used + gated (+ samples in its prior window) is what it was given: usable
-        samples, for the models with GNSS those that were paired, for those with attitude the oriented ones.
-        """
-        aligner = self._aligner
-        counts = {name: dict(tally) for name, tally in aligner.tally.items()}
-        for stream, order in aligner.orders.items():
-            own = counts[stream.value]
-            own["stray"], own["held"] = order.stray, int(order.held is not None)
-            for key in ("received", "invalid", "duplicate", "out_of_order"):
-                own.setdefault(key, 0)
-        dvl, pairing = counts["dvl"], counts["pairing"]
-        unused = ("slow", "frozen", "turning", "no_turn_rate")
-        for key in (*unused, "dropouts", "wrong_frame"):
-            dvl.setdefault(key, 0)
-        dvl["repeated"] = aligner.partners.gates.repeated
-        for key in ("wrong_frame", "late"):
-            counts["reference"].setdefault(key, 0)
-        for key in ("paired", "unpaired", "without_attitude", "oriented", "not_oriented"):
-            pairing.setdefault(key, 0)
-        not_accepted = {"invalid", "duplicate", "out_of_order", "stray", "held", *aligner.refused_as["dvl"]}
-        dvl["accepted"] = dvl["received"] - sum(dvl.get(key, 0) for key in not_accepted)
-        dvl["awaiting_imu"] = aligner.rows.end - aligner.partners.n_judged
-        dvl["usable"] = dvl["accepted"] - sum(dvl[key] for key in (*unused, "awaiting_imu"))
-        pairing["gnss_losses"] = self.selection.gnss.losses
-        pairing["awaiting_reference"] = aligner.partners.n_judged - aligner.partners.n_paired
-        pairing["awaiting_attitude"] = dvl["usable"] - pairing["oriented"] - pairing["not_oriented"]
-        counts["calibration"] = {"restarts": self.restarts}
-        for name in self._models:
-            if restarted := self._estimators[name].counts.restarted:
-                counts["calibration"][f"{name} restarted"] = restarted
-        return counts
+        """Where the messages went, since the start or the last restart, see `counted`."""
+        restarted = {name: self._estimators[name].counts.restarted for name in self._models}
+        return counted(self._aligner, self.selection.gnss.losses, self.restarts, restarted)
 
     @property
     def refused_as(self) -> Mapping[str, set[str]]:
@@ -514,7 +465,7 @@ class Calibrator:
     def set_parameters(self, parameters: Parameters) -> None:
         """Change parameters that can change at run time (`ParameterSpec.read_only` False)."""
         selection = self.selection  # by what was so far
-        self.parameters = self._aligner.parameters = parameters
+        self.parameters = self._aligner.parameters = self._estimates.parameters = parameters
         self._doubted = None
         if self._n_selected:
             selection.record(self._aligner.partners.decided_ns, parameters)
@@ -538,47 +489,11 @@ class Calibrator:
 
     def next_recording(self, name: str) -> GaussianState:
         """As `of_recording`, with σ worth believing of the next recording, whatever is published."""
-        state = self.of_recording(name)
-        return GaussianState(state.x, state.p + self._day_covariance(name))
-
-    def _day_covariance(self, name: str) -> Array:
-        if name not in self._day_covariances:
-            self._day_covariances[name] = day_covariance(MODELS[name], self.parameters)
-        return self._day_covariances[name]
+        return self._estimates.next_recording(name)
 
     def of_recording(self, name: str) -> GaussianState:
         """As `state`, with σ as of the same day: the larger of what the filter claims and what blocks of time show."""
-        estimator = self._estimators[name]
-        state, covariance = estimator.of_recording()
-        worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
-        unknown = self._by_unknown_arm(name, state, covariance) + self._by_clock(name)
-        return GaussianState(state, covariance + worse + unknown)
-
-    def _by_clock(self, name: str) -> Array:
-        """(n, n) of a model that takes clocks as known: what one in a steady turn makes of the angles, with an arm that
-        was told."""
-        n, estimator = MODELS[name].n_state, self._estimators.get(EXTENDED_BY.get(name, ""))
-        found = np.zeros((n, n))
-        if estimator is not None and any(self.parameters.lever_arm):
-            found[:3, :3] = estimator.turn_open
-        return found
-
-    def _by_unknown_arm(self, name: str, state: Array, covariance: Array) -> Array:
-        """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known.
-
-        Its angles are off by what the model that finds the arm has otherwise, and by what that one is off.
-        """
-        found = np.zeros_like(covariance)
-        estimator = self._estimators.get(EXTENDED_BY.get(name, ""))
-        if estimator is None or not estimator.claims or any(self.parameters.lever_arm):
-            return found
-        other = estimator.of_recording()
-        own, open_arm = np.diag(covariance)[:3], np.diag(other.p)[:3]
-        by_arm = open_arm - own
-        away = (state - other.x[: len(state)])[:3] ** 2
-        is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.maximum(by_arm, 0.0))
-        np.fill_diagonal(found[:3, :3], np.where(is_open & (by_arm > 0.0), by_arm + away, 0.0))
-        return found
+        return self._estimates.of_recording(name)
 
     def states_at(
         self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps
@@ -591,138 +506,38 @@ class Calibrator:
 
     def estimate(self, name: str | None = None) -> Estimate:
         """Estimate of one model, by default the selected one, with all that is known about it."""
-        model = MODELS[name or self.selected]
-        state, covariance = self.of_recording(model.name)
-        used, gated, mean_nis, rows, _ = self._estimators[model.name].counts
-        return Estimate(
-            model=model.name,
-            state=state,
-            covariance=covariance + self._day_covariance(model.name),
-            recording_covariance=covariance,
-            filter_covariance=self._estimators[model.name].filter_covariance,
-            left_open=self._estimators[model.name].left_open + self._by_clock(model.name),
-            used=used,
-            gated=gated,
-            mean_nis=mean_nis,
-            nis_bounds=nis_bounds(rows, self.parameters, used),
-            convergence=convergence(model, covariance, self.parameters),
-            observability=observability(model, covariance, self.parameters),
-            heading_deviation=self._estimators[model.name].heading_deviation,
-        )
+        return self._estimates.estimate(name or self.selected)
 
     def verification(self, name: str) -> Verification:
         """The verdict on one model's calibration, by hold-out; for a calibrator made with ``verified``."""
-        estimate = self._without_tilt(self.estimate(name))
-        model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         judge = next(group for group in self._groups if group.needs is Needs.REFERENCE)
         self._update(judge)
-        held_out = self._estimators[name].held_out_error(judge.moments, self.parameters.rotation_dvl_from_body)
-        is_suspect = held_out is not None and held_out.corrected > min(
-            SEVERAL * held_out.predicted, held_out.uncorrected
-        )
-        typical = self._typical_error(model, state) if is_suspect else None
-        samples, vv, *_ = judge.moments.total
-        return self._judged(estimate, held_out, typical, (float(samples), vv), self.suggestion)
-
-    def _judged(
-        self,
-        estimate: Estimate,
-        held_out: HeldOutError | None,
-        typical: float | None,
-        judged: tuple[float, Array],
-        suggestion: Reason | None,
-    ) -> Verification:
-        """As of `verify`. judged: as of `calibration_error`."""
-        name, p = estimate.model, self.parameters
-        model, estimator = MODELS[name], self._estimators[name]
-        return verify(
-            model,
-            GaussianState(estimate.state, estimate.covariance),
-            estimate.convergence,
-            held_out,
-            p,
-            (estimate.used, estimate.gated),
-            suggestion if model.aided else None,
-            any(each.reference_claims for each in self._further),
-            next((each.doubt for each in self._further if each.doubt), None) if model.aided else None,
-            bool(model.estimator) and estimator.claims,
-            typical,
-            calibration_error(model, self.of_recording(name).p, judged, p.rotation_dvl_from_body),
-        )
-
-    def _verified_so_far(self, *, fresh: bool) -> Verification:
-        """The same of the selected model, by what the worker looked at; nothing is waited for unless fresh."""
-        estimate = self._without_tilt(self.estimate()) if fresh else self.estimate()
-        rest, suggestion = self._rest(fresh=fresh), self.suggestion if fresh else self.suggestion_so_far
-        if rest is None or not MODELS[estimate.model].aided:
-            return self._judged(estimate, None, None, (0.0, np.zeros((3, 3, 3))), suggestion)
-        return self._judged(estimate, rest.held_out, rest.typical, rest.judged, suggestion)
-
-    def _rest(self, *, fresh: bool) -> Rest | None:
-        return next((rest for each in self._further if (rest := each.rest(fresh=fresh)) is not None), None)
+        return self._judge.verification(name, judge.moments)
 
     def navigation(self, name: str) -> Navigation | None:
         """What one model's calibration is worth to dead reckoning, on data that it had not seen; for one made
         ``verified``. None without reference, or with hardly any motion."""
-        kept = self.recording
-        if kept is None:
-            return None
-        recording, epoch_ns = kept
-        try:
-            terms = self.held_out_terms(name)
-        except np.linalg.LinAlgError:
-            return None
-        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-        # of every fold and day what corrects it
-        n_days = len(terms[0])
-        parts = folds_of(stamps_ns, self.parameters) * n_days + self.day_of(stamps_ns)
-        corrections = [each for of_days in terms for each in of_days]
-        return dead_reckoned(recording, parts, corrections, self.parameters, epoch_ns, self.heading_deviation)
-
-    def _typical_error(self, model: Model, state: GaussianState) -> float | None:
-        """Velocity error of a state, m/s rms, without outliers; None where nothing was kept."""
-        kept = self.recording
-        if kept is None:
-            return None
-        x, recording = state.x, kept[0]
-        if model.estimator:
-            return typical_error(recording, Terms.of_state(x), self.parameters)
-        if self._compared is None or self._compared[0] is not recording:
-            every = np.arange(len(recording.dvl.times))
-            self._compared = recording, recording.compared(every, NO_TERMS, self.parameters)
-        seen, errors, t = self._compared[1], model.error_terms_from_state @ x, self.parameters.rotation_dvl_from_body
-        change = recording.dvl.velocity @ (t.T - correction_matrix(errors[:3], errors[3:], t)).T
-        return without_outliers(seen.error + np.matmul(seen.measured, change[..., None])[..., 0])
+        return self._judge.navigation(name, self.heading_deviation)
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """For every fold what one model corrects on every day, had it not seen that fold; for one made ``verified``.
 
         Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
         """
-        keeper = self._keeper
-        return self._estimators[name].held_out_terms(1 if keeper is None else keeper.n_days)
-
-    @property
-    def _keeper(self) -> Estimator | None:
-        """Who keeps all streams for verification, and knows of days."""
-        return next(iter(self._further), None)
+        return self._judge.held_out_terms(name)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
         """Which day (N,) stamps are of, from 0, as far as `recording` goes."""
-        keeper = self._keeper
-        return np.zeros(len(stamps_ns), dtype=np.intp) if keeper is None else keeper.day_of(stamps_ns)
+        return self._further.day_of(stamps_ns)
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
         """What was kept for verification of all streams, and the stamp (ns) of its time 0; None for nothing."""
-        keeper = self._keeper
-        return None if keeper is None else keeper.recording
+        return self._further.recording
 
     def result(self) -> Result:
         """Everything that the samples so far tell, also where it takes effect only when later ones have come."""
-        with ExitStack() as settled:
-            for each in self._further:
-                settled.enter_context(each.settled())
+        with self._further.settled():
             return self._result()
 
     def _result(self) -> Result:
@@ -731,7 +546,7 @@ class Calibrator:
         return Result(
             selected=self.selected,
             selected_because=self.selection.reason(self.parameters, None if chosen is None else chosen.evidence),
-            estimates={name: self._without_tilt(self.estimate(name)) for name in self._models},
+            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._models},
             segments=tuple(self.selection.segments),
             counts=self.counts,
             first_ns=self.first_ns,
@@ -750,7 +565,7 @@ class Calibrator:
             return {name: self.verification(name) for name in self._models}
         if self._worker is None:
             return {}
-        verification = self._verified_so_far(fresh=True)
+        verification = self._judge.so_far(self.selected, fresh=True)
         known = {each.code for each in verification.reasons}
         against = [each for each in doubts if each.severity is not Severity.WARNING and each.code not in known]
         return {self.selected: verification.with_objections(against)}
@@ -760,75 +575,21 @@ class Calibrator:
 
         fresh: by a look at all there is, for which a result waits; else by one that the worker took a little ago.
         """
-        of = self._without_tilt if fresh else _as_it_is
-        suggested, rest = self.suggestion if fresh else self.suggestion_so_far, self._rest(fresh=fresh)
-        navigation = None if rest is None else rest.navigation
-        found = doubts(
-            of(self.estimate()),
-            (of(self.estimate(name)) for name in self._models if told_arm.finds_arm(MODELS[name])),
-            navigation,
-            self.parameters,
-            suggested=suggested is not None,
-            in_earth=rest is not None and rest.in_earth,
-            is_level=fresh and self.is_level,
-        )
-        found += self.clock_objections(fresh=fresh)
-        if navigation is None:
-            return found
-        held_out = self._verified_so_far(fresh=fresh).reasons
-        return [*found, *objections(navigation), *(each for each in held_out if each.code in JUDGED_LIVE)]
+        return self._judge.doubts(self.selected, self.clock_objections(fresh=fresh), fresh=fresh)
 
     @property
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` that are not fresh, thought of anew only where there may be others: it takes a few milliseconds."""
         clocks = self.clock_objections(fresh=False)  # of clocks that are apart nothing is told
-        of = (self.selected, *(each.n_told for each in self._further), *(each.code for each in clocks))
+        of = (self.selected, *self._further.n_told, *(each.code for each in clocks))
         if self._doubted is None or self._doubted[0] != of:
-            self._doubted = of, self.doubts(fresh=False)
+            self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
         return self._doubted[1]
 
     @property
     def is_level(self) -> bool:
         """Whether references were turned into the body by a heading alone: roll and pitch then hold the trim."""
-        return any(each.is_level for each in self._further)
-
-    def _without_tilt(self, estimate: Estimate) -> Estimate:
-        """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
-        the vertical, which leaves the arm's height open too; and no roll where another lever arm is found than was
-        told: an attitude of another time makes one, and in waves a roll."""
-        model, p = MODELS[estimate.model], self.parameters
-        needs = ""
-        if self.is_level:
-            needs = "an IMU that measures roll and pitch"
-        elif any(each.is_horizontal for each in self._further):
-            needs = MEASURES_VERTICAL
-        unknown_axes = 0 if not model.aided else 2 if needs else int(self._finds_another_arm)
-        if not unknown_axes:
-            return estimate
-        level = p.rotation_dvl_from_body[:, :unknown_axes]
-        unknown = np.zeros((model.n_state, model.n_state))
-        unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
-        if needs == MEASURES_VERTICAL and told_arm.finds_arm(model):  # nor does anything show its height
-            height = model.state_names.index("lever_arm_z")
-            unknown[height, height] = p.initial_std_lever_arm**2
-        own = estimate.recording_covariance + unknown
-        return replace(
-            estimate,
-            covariance=estimate.covariance + unknown,
-            recording_covariance=own,
-            convergence=convergence(model, own, p),
-            observability=observability(model, own, p, needs),
-        )
-
-    @property
-    def _finds_another_arm(self) -> bool:
-        """Whether the lever arm that was told is contradicted."""
-        for model in (MODELS[name] for name in self._models if told_arm.finds_arm(MODELS[name])):
-            estimator = self._estimators[model.name]
-            x, p = estimator.of_recording()
-            shown = GaussianState(x, p - estimator.left_open)
-            return bool(told_arm.contradicted(model, shown, self.parameters).any())
-        return False
+        return self._further.is_level
 
     def _days_of(self, name: str) -> tuple[Day, ...]:
         return self._estimators[name].days_from((self.first_ns or 0, *self._aligner.day_starts_ns))
@@ -847,12 +608,12 @@ class Calibrator:
     @property
     def suggestion(self) -> Reason | None:
         """What configuration the data fit, where the one given is grossly wrong."""
-        return next((each.suggestion for each in self._further if each.suggestion), None)
+        return self._further.suggestion
 
     @property
     def are_clocks_known(self) -> bool:
         """Whether the data show how the clocks stand, in time or not."""
-        return any(each.registration is not None and each.registration.are_known for each in self._further)
+        return self._further.are_clocks_known
 
     def clock_objections(self, *, fresh: bool) -> list[Reason]:
         """What stamps say that are far apart, unless the data show how the clocks stand: then it does not matter when
@@ -864,16 +625,12 @@ class Calibrator:
     @property
     def registration_so_far(self) -> Registration | None:
         """How the instruments stand, as it was seen a little ago; None where that is not known."""
-        return next((each.registration_so_far for each in self._further), None)
+        return self._further.registration_so_far
 
     @property
     def suggestion_so_far(self) -> Reason | None:
         """`suggestion`, live: what a look that is not made anew for every message says."""
-        return next((each.suggestion_so_far for each in self._further if each.suggestion_so_far), None)
-
-
-def _as_it_is(estimate: Estimate) -> Estimate:
-    return estimate
+        return self._further.suggestion_so_far
 
 
 def _own(block: AlignedBlock) -> AlignedBlock:

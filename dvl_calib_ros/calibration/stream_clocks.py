@@ -34,6 +34,7 @@ class StreamClocks:
         self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in (Stream.REFERENCE, Stream.IMU)}
         self._newest: dict[Stream, int] = {}  # live, stamps by stream, and what waits to be added of each
         self._waiting: dict[Stream, list[int]] = {stream: [] for stream in self._ahead}
+        self._said: tuple[Parameters, list[Reason]] | None = None  # of all that came
 
     def arrived(self, stream: Stream, stamp_ns: int) -> None:
         """Take one message of a stream, live."""
@@ -42,6 +43,7 @@ class StreamClocks:
             for other, waiting in self._waiting.items():
                 if (newest := self._newest.pop(other, None)) is not None:
                     waiting.append(newest - stamp_ns)
+                    self._said = None
                 if len(waiting) == AT_ONCE:
                     self._add_waiting(other)
 
@@ -51,6 +53,7 @@ class StreamClocks:
 
     def add(self, streams: Streams) -> None:
         """Take what arrived one after the other."""
+        self._said = None
         dvl = _read(streams.dvl)
         for stream, block in ((Stream.REFERENCE, streams.reference), (Stream.IMU, streams.imu)):
             other = _read(block)
@@ -60,6 +63,11 @@ class StreamClocks:
 
     def objections(self, parameters: Parameters) -> list[Reason]:
         """What clocks that differ by more than any model looks for say against every calibration."""
+        if self._said is None or self._said[0] is not parameters:
+            self._said = parameters, self._objections(parameters)
+        return self._said[1]
+
+    def _objections(self, parameters: Parameters) -> list[Reason]:
         ahead = {Stream.DVL: 0.0}
         for stream, spread in self._ahead.items():
             self._add_waiting(stream)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from runs import MatchedRun, feed, feed_columns, make_samples
 
+from dvl_calib_ros.calibration import stream_clocks
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -41,3 +42,20 @@ def test_live_clocks_that_are_apart_are_named_as_by_a_replay(seconds, given):
     assert bool(said) == bool(seconds) and all("GPS time" in str(each) for each in said)
     result = calibrator.result()
     assert (result.verifications[result.selected].verdict is Severity.REJECT) == bool(seconds)
+
+
+def test_live_clocks_are_compared_again_only_where_something_came(monkeypatch):
+    """Diagnostics ask twice a second, also of a vehicle whose instruments are off."""
+    asked = []
+    monkeypatch.setattr(stream_clocks, "median", lambda ahead: asked.append(len(ahead)) or float(np.median(ahead)))
+    samples = make_samples(MatchedRun("straight", 60.0, imu_every=50))
+    late = [
+        each._replace(stamp_ns=each.stamp_ns + 18 * 10**9) if isinstance(each, ReferenceSample) else each
+        for each in samples
+    ]
+    calibrator = feed(Calibrator(Parameters(), worker=AtOnce()), late[:-20])
+    said = calibrator.doubts_so_far
+    looks = len(asked)
+    assert looks and calibrator.doubts_so_far == said and len(asked) == looks
+    feed(calibrator, late[-20:])
+    assert calibrator.doubts_so_far and len(asked) > looks

@@ -240,6 +240,6 @@ def test_what_outliers_typically_are_is_no_part_of_the_typical_error(rng):
         for each in samples
     ]
     clean, spoilt = (calibrate(each, verified=True) for each in (samples, wild))
-    typical = [each._typical_error(MODELS["G1"], clean.state("G1")) for each in (clean, spoilt)]
+    typical = [each._judge.typical_error(MODELS["G1"], clean.state("G1")) for each in (clean, spoilt)]
     assert typical[1] == pytest.approx(typical[0], rel=0.1)
     assert typical[0] == pytest.approx(np.sqrt(3.0) * np.hypot(0.03, 0.01), rel=0.2)
