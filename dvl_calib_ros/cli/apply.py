@@ -7,6 +7,7 @@ brings that back. Nothing is sent to an instrument without --send.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -86,7 +87,9 @@ def run(arguments: argparse.Namespace) -> None:
     applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
     for note in applied.notes:
         print(f"note: {note}")
-    _print(calibrated, arguments)
+    is_refused = calibrated.objections and not arguments.force
+    refused = ["nothing to apply; --force shows and writes it anyway"]
+    _show(calibrated, refused if is_refused else _mounting_lines(calibrated))
     if arguments.dry_run:
         print(applied.changes or "nothing would change", end="" if applied.changes else "\n")
         return
@@ -99,10 +102,10 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     """Show an instrument's settings; write, and send them, where that is wanted."""
     from ..disk.atomic import save_bytes
     from ..errors import InputError
-    from ..files.instruments import instrument_settings, told_settings
+    from ..files.instruments import instrument_settings
     from ..files.water_linked import configure
 
-    now = told_settings(arguments.now)
+    now = _told_settings(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
     untold = [each.name for each in chosen.settings if each.name not in now]
     if arguments.send and (arguments.instrument != "waterlinked" or untold):
@@ -110,7 +113,7 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
             "--send is for waterlinked, and needs to know what it was set to when the data were recorded: "
             + " ".join(f"--now {name}=..." for name in untold or ("mounting_rotation_offset",))
         )
-    _print_settings(chosen, calibrated, arguments)
+    _show(calibrated, _settings_lines(chosen))
     if arguments.settings and not arguments.dry_run:
         save_bytes(arguments.settings, chosen.text.encode())
         print(f"{arguments.settings}: written")
@@ -120,55 +123,69 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
         print(f"{arguments.send}: {'is so already' if is_so else done}")
 
 
-def _print_settings(chosen: InstrumentSettings, calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
-    from rich.markup import escape
+def _told_settings(words: Sequence[str]) -> dict[str, float]:
+    """Settings as --now gives them, NAME=VALUE. Raises InputError."""
+    from ..errors import InputError
 
-    common.print_warnings([f"{arguments.result}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
-    out = common.console()
-    out.print(escape(f"{chosen.instrument}, by: {chosen.document}"), soft_wrap=True)
-    for setting in chosen.settings:
-        out.print(escape(f"  {setting}"), soft_wrap=True)
-    out.print(escape(chosen.text.rstrip("\n")), soft_wrap=True)
-    for note in chosen.notes:
-        out.print(escape(f"note: {note}"), soft_wrap=True)
+    told = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            told[name.strip()] = float(value)
+        except ValueError as error:
+            raise InputError(f"--now {word}: is not NAME=VALUE with a number") from error
+    return told
 
 
-def _print(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
+def _settings_lines(chosen: InstrumentSettings) -> list[str]:
+    return [
+        f"{chosen.instrument}, by: {chosen.document}",
+        *(f"  {setting}" for setting in chosen.settings),
+        chosen.text.rstrip("\n"),
+        *(f"note: {note}" for note in chosen.notes),
+    ]
+
+
+def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     import numpy as np
-    from rich.markup import escape
 
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
-    common.print_warnings([f"{arguments.result}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
-    out = common.console()
     degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(calibrated.rpy))
     known = calibrated.position is not None
     transform = (
         f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if known else POSITION_UNKNOWN
     )
-    lines = (
+    lines = [
         f"{calibrated.model.name}: {calibrated.dvl_frame} in {calibrated.base_frame} at roll, pitch, yaw {degrees}",
         f'URDF:   rpy="{numbers(calibrated.rpy)}" (of {calibrated.dvl_frame} in {calibrated.base_frame})',
         f"TF:     {transform}",
         f"scale:  {scale_advice(calibrated)}",
-    )
-    if calibrated.objections and not arguments.force:
-        out.print("nothing to apply; --force shows and writes it anyway", soft_wrap=True)
-        return
-    for line in lines:
-        out.print(escape(line), soft_wrap=True)
+    ]
     if any(calibrated.lever_arm):
         found = "found" if calibrated.lever_arm_found else "as lever_arm says"
-        at = " ".join(f"{value:+.2f}" for value in calibrated.lever_arm)
-        out.print(f"lever arm: {at} m from the reference point, {found}", soft_wrap=True)
+        lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {found}")
     if calibrated.dvl_time_offset:
         late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
-        out.print(
+        lines.append(
             f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late}, today: URDF and TF hold no "
-            "delay; --params writes dvl_time_offset, or set the DVL's clock",
-            soft_wrap=True,
+            "delay; --params writes dvl_time_offset, or set the DVL's clock"
         )
     if calibrated.position is not None:
-        at = " ".join(f"{value:+.2f}" for value in calibrated.position)
-        out.print(f"position: {at} m in {calibrated.base_frame}", soft_wrap=True)
+        lines.append(f"position: {_metres(calibrated.position)} in {calibrated.base_frame}")
+    return lines
+
+
+def _metres(values: Sequence[float]) -> str:
+    return " ".join(f"{value:+.2f}" for value in values) + " m"
+
+
+def _show(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
+    """Lines as they are, after what is to be known of the calibration."""
+    from rich.markup import escape
+
+    common.print_warnings([f"{calibrated.path}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
+    out = common.console()
+    for line in lines:
+        out.print(escape(line), soft_wrap=True)

@@ -26,9 +26,8 @@ def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Ef
 def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
-    of_each = (
-        (columns**2).sum(axis=1).mean(axis=0).reshape(-1, len(specs)).max(axis=0)
-    )  # of days the one that shows most
+    squares = (columns**2).sum(axis=1).mean(axis=0)
+    of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of days the one that shows most
     sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
     least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
     return effect.without({spec.name for spec, size in zip(specs, sizes, strict=True) if size < least})

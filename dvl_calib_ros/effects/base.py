@@ -107,6 +107,7 @@ class EffectParameter:
 
     typical: size in `unit` that would be worth knowing of. low, high: bounds. default: its value where none is given;
     an effect with all parameters at their defaults does nothing. linear: the trace is linear in it, the others fixed.
+    said: what it is called before its value and unit, '' where the effect's name says that; None: as its name.
     """
 
     name: str
@@ -117,6 +118,12 @@ class EffectParameter:
     description: str
     default: float = 0.0
     linear: bool = True
+    said: str | None = None
+
+    @property
+    def spoken(self) -> str:
+        """What it is called before its value and unit."""
+        return self.name if self.said is None else self.said
 
 
 def along_axes(
@@ -124,7 +131,9 @@ def along_axes(
 ) -> tuple[EffectParameter, ...]:
     """One parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
     return tuple(
-        EffectParameter(f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear)
+        EffectParameter(
+            f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear, said=axis
+        )
         for axis in "xyz"
     )
 

@@ -24,10 +24,14 @@ class WaterLock(Effect):
     )
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
-        EffectParameter("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east")),
-        EffectParameter("north_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("north")),
-        EffectParameter("from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False),
-        EffectParameter("to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False),
+        EffectParameter("east_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("east"), said="east"),
+        EffectParameter("north_mps", "m/s", 0.1, -5.0, 5.0, _CURRENT.format("north"), said="north"),
+        EffectParameter(
+            "from_s", "s", 0.0, 0.0, math.inf, "when it begins, since the start", linear=False, said="from"
+        ),
+        EffectParameter(
+            "to_s", "s", math.inf, 0.0, math.inf, "when it ends", default=math.inf, linear=False, said="to"
+        ),
     )
     of_the_day = True
     acts_on = ActsOn.MOTION
@@ -52,8 +56,12 @@ class HeadingError(Effect):
     remedy = "calibrate the compass, away from what is magnetic; no mounting makes this"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
-        EffectParameter("sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False),
-        EffectParameter("cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False),
+        EffectParameter(
+            "sin_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the sine of yaw", linear=False, said="sin"
+        ),
+        EffectParameter(
+            "cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False, said="cos"
+        ),
     )
     of_the_day = True
     acts_on = ActsOn.REFERENCE

@@ -37,7 +37,15 @@ class Sideslip(Effect):
     )
     manoeuvre = "turns to both sides at two speeds (a lever arm does not grow with speed)"
     parameters = (
-        EffectParameter("coefficient_s", "s", 0.1, -10.0, 10.0, "sway per turn rate and speed; negative: outward"),
+        EffectParameter(
+            "coefficient_s",
+            "s",
+            0.1,
+            -10.0,
+            10.0,
+            "sway per turn rate and speed; negative: outward",
+            said="coefficient",
+        ),
     )
     acts_on = ActsOn.MOTION
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
@@ -59,10 +67,14 @@ class TiltCoupling(Effect):
     )
     manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
     parameters = (
-        EffectParameter("x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)"),
-        EffectParameter("z_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "heave error per pitch"),
-        EffectParameter("y_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "sway error per roll (positive: port side up)"),
-        EffectParameter("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll"),
+        EffectParameter(
+            "x_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "surge error per pitch (positive: bow down)", said="x per pitch"
+        ),
+        EffectParameter("z_per_pitch", "m/s/rad", 0.5, -20.0, 20.0, "heave error per pitch", said="z per pitch"),
+        EffectParameter(
+            "y_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "sway error per roll (positive: port side up)", said="y per roll"
+        ),
+        EffectParameter("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll", said="z per roll"),
     )
     acts_on = ActsOn.DVL
     needs = frozenset({EffectNeeds.ATTITUDE})

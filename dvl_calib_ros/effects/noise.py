@@ -20,7 +20,9 @@ class Outliers(NoiseEffect):
     summary = "some DVL samples are far off"
     parameters = (
         EffectParameter("share", "1", 0.01, 0.0, 1.0, _SHARE),
-        EffectParameter("std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis", 0.5),
+        EffectParameter(
+            "std_mps", "m/s", 0.5, 0.0, 20.0, "standard deviation of what an outlier adds, per axis", 0.5, said="std"
+        ),
     )
     acts_on = ActsOn.DVL
 
@@ -74,9 +76,11 @@ class NoiseInflation(NoiseEffect):
     name = "noise_inflation"
     summary = "the DVL's noise is larger than reported, or grows with speed or turn rate"
     parameters = (
-        EffectParameter("std_mps", "m/s", 0.02, 0.0, 10.0, "standard deviation added, per axis"),
-        EffectParameter("per_speed", "1", 0.01, 0.0, 10.0, "its growth per m/s of speed"),
-        EffectParameter("per_turn_rate_m", "m", 0.1, 0.0, 100.0, "its growth per rad/s of turn rate"),
+        EffectParameter("std_mps", "m/s", 0.02, 0.0, 10.0, "standard deviation added, per axis", said="std"),
+        EffectParameter("per_speed", "1", 0.01, 0.0, 10.0, "its growth per m/s of speed", said="per speed"),
+        EffectParameter(
+            "per_turn_rate_m", "m", 0.1, 0.0, 100.0, "its growth per rad/s of turn rate", said="per turn rate"
+        ),
     )
     acts_on = ActsOn.DVL
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
@@ -100,8 +104,10 @@ class ColouredReferenceNoise(NoiseEffect):
     name = "coloured_reference_noise"
     summary = "the reference's noise is correlated in time"
     parameters = (
-        EffectParameter("std_mps", "m/s", 0.05, 0.0, 10.0, "standard deviation, per axis"),
-        EffectParameter("correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e", 5.0),
+        EffectParameter("std_mps", "m/s", 0.05, 0.0, 10.0, "standard deviation, per axis", said="std"),
+        EffectParameter(
+            "correlation_time_s", "s", 5.0, 0.0, 3600.0, "time in which it falls to 1/e", 5.0, said="correlation time"
+        ),
     )
     acts_on = ActsOn.REFERENCE
 

@@ -37,7 +37,9 @@ class QuadraticScale(Effect):
     remedy = "ask the DVL's maker; drive the survey at the speed that was calibrated"
     manoeuvre = "straight legs at three speeds or more"
     parameters = (
-        EffectParameter("coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed"),
+        EffectParameter(
+            "coefficient_s_per_m", "s/m", 0.005, -0.2, 0.2, "scale-factor error per m/s of speed", said="coefficient"
+        ),
     )
     acts_on = ActsOn.DVL
     confounded_with = ("velocity_bias",)
@@ -55,7 +57,9 @@ class ScaleDrift(Effect):
     remedy = "measure the speed of sound along the run, or give the DVL temperature and salinity"
     manoeuvre = "the same straight leg at the beginning, in the middle and at the end"
     parameters = (
-        EffectParameter("rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour"),
+        EffectParameter(
+            "rate_per_hour", "1/h", 0.03, -2.0, 2.0, "change of the scale-factor error per hour", said="rate"
+        ),
     )
     of_the_day = True
     acts_on = ActsOn.DVL
@@ -152,6 +156,7 @@ class AxisNonorthogonality(Effect):
             -0.3,
             0.3,
             f"half of the difference between 90° and the angle of {axes[0]} and {axes[1]}",
+            said=axes,
         )
         for axes in ("xy", "xz", "yz")
     )

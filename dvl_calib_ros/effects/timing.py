@@ -18,7 +18,7 @@ LONGEST_OFFSET_S = LONGEST_S
 
 
 def _seconds(what: str) -> tuple[EffectParameter]:
-    return (EffectParameter("seconds", "s", 0.1, -LONGEST_OFFSET_S, LONGEST_OFFSET_S, what, linear=False),)
+    return (EffectParameter("seconds", "s", 0.1, -LONGEST_OFFSET_S, LONGEST_OFFSET_S, what, linear=False, said=""),)
 
 
 class _DvlClock(ClockEffect):
@@ -54,7 +54,7 @@ class TimeOffsetJump(_DvlClock):
     manoeuvre = "turns and changes of speed before and after"
     parameters = (
         *_seconds("how much later a stamp is from then on"),
-        EffectParameter("at_s", "s", 0.0, 0.0, np.inf, "when, since the start", linear=False),
+        EffectParameter("at_s", "s", 0.0, 0.0, np.inf, "when, since the start", linear=False, said="at"),
     )
     confounded_with = ("dvl_time_offset", "clock_drift")
 
@@ -71,7 +71,9 @@ class ClockDrift(_DvlClock):
     remedy = "--apply writes dvl_clock_drift; better, discipline the DVL's clock (PTP, PPS)"
     manoeuvre = "turns and changes of speed at the beginning, in the middle and at the end"
     parameters = (
-        EffectParameter("seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False),
+        EffectParameter(
+            "seconds_per_hour", "s/h", 1.0, -36.0, 36.0, "how much later stamps get", linear=False, said=""
+        ),
     )
     confounded_with = ("dvl_time_offset", "time_offset_jump")
 
@@ -136,7 +138,11 @@ class ReferenceLag(Effect):
     summary = "the reference is low-pass filtered: T dg'/dt = g - g', in the frame it was recorded in"
     remedy = "take the receiver's own velocity as reference, not a filter's"
     manoeuvre = "sharp turns as well as wide ones, and quick changes of speed"
-    parameters = (EffectParameter("time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False),)
+    parameters = (
+        EffectParameter(
+            "time_constant_s", "s", 0.2, 0.0, 5.0, "time constant of the filter", linear=False, said="time constant"
+        ),
+    )
     acts_on = ActsOn.REFERENCE
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 

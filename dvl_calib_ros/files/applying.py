@@ -66,8 +66,8 @@ def write_calibration(
     force: also what is rejected, not converged, or of another mounting. dry_run: write nothing, say what would change.
     Raises InputError.
     """
-    if targets.paths and calibrated.objections and not force:
-        raise InputError(f"{calibrated.path}: {'; '.join(calibrated.objections)}; to apply it all the same: --force")
+    if targets.paths:
+        calibrated.check_applicable(force)
     contents, notes = _contents(calibrated, targets, force)
     there = [path for path in contents if own_stream(path) is None and path.exists()]
     new = {path: content for path, content in contents.items() if path not in there or path.read_bytes() != content}

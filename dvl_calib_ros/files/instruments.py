@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,12 +23,14 @@ from .urdf import numbers
 SAID_FROM = math.radians(0.05)
 # An autopilot's orientation is a quarter turn; so far from one (rad) it is none.
 QUARTER, NEAR_QUARTER = 0.5 * math.pi, math.radians(20.0)
+# Delays that an autopilot can be told.
+DELAY_MS = (0, 250)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One value of an instrument. now: None where nobody said it; assumed: nor said that it is what it is delivered
-    with, as which it is taken."""
+    """One value of an instrument. now: None where that is not known; assumed: what it is delivered with, for nobody
+    said it."""
 
     name: str
     now: float | None
@@ -36,7 +39,7 @@ class Setting:
     assumed: bool = False
 
     def __str__(self) -> str:
-        before = "not told" if self.now is None else f"{self.now:g}" + (" (taken for it)" if self.assumed else "")
+        before = "not told" if self.now is None else f"{self.now:g}" + (" (as delivered)" if self.assumed else "")
         return f"{self.name}: {before} -> {self.new:g} {self.unit}".rstrip()
 
 
@@ -51,14 +54,22 @@ class InstrumentSettings:
     notes: tuple[str, ...]
 
 
+class Range(NamedTuple):
+    """What a setting holds, and what it is delivered with; None where that differs."""
+
+    least: float
+    most: float
+    delivered: float | None = None
+
+
 @dataclass(frozen=True)
 class Instrument:
-    """A kind of instrument. document: the one that it follows. delivered: what it has of settings, and what it is
-    delivered with, None where that differs; settings: by a calibration and what it is set to now."""
+    """A kind of instrument. document: the one that it follows. ranges: of its settings. settings: by a calibration and
+    what it is set to now, as far as that is known."""
 
     document: str
-    delivered: Mapping[str, float | None]
-    settings: Callable[[CalibratedMounting, Mapping[str, float | None]], tuple[list[Setting], str, list[str]]]
+    ranges: Mapping[str, Range]
+    settings: Callable[[CalibratedMounting, Mapping[str, float]], tuple[list[Setting], str, list[str]]]
 
 
 def instrument_settings(
@@ -71,33 +82,42 @@ def instrument_settings(
     """
     if name not in INSTRUMENTS:
         raise InputError(f"instrument {name!r} is not known; one of {', '.join(INSTRUMENTS)}")
-    if calibrated.objections and not force:
-        raise InputError(f"{calibrated.path}: {'; '.join(calibrated.objections)}; to apply it all the same: --force")
-    instrument = INSTRUMENTS[name]
-    for key, value in (now or {}).items():
-        if key not in instrument.delivered:
-            raise InputError(f"{name} has no setting {key!r}; one of {', '.join(instrument.delivered)}")
-        if not math.isfinite(value):
-            raise InputError(f"{name}: {key} is {value}, which is no setting; give a number")
-    settings, text, notes = instrument.settings(calibrated, {**instrument.delivered, **(now or {})})
-    marked = [replace(each, assumed=each.now is not None and each.name not in (now or {})) for each in settings]
+    calibrated.check_applicable(force)
+    instrument, told = INSTRUMENTS[name], dict(now or {})
+    for key, value in told.items():
+        if key not in instrument.ranges:
+            raise InputError(f"{name} has no setting {key!r}; one of {', '.join(instrument.ranges)}")
+        holds = instrument.ranges[key]
+        if not holds.least <= value <= holds.most:
+            raise InputError(
+                f"{name}: {key}={value:g} cannot have been set, it holds {holds.least:g} to {holds.most:g}; give what "
+                "it was set to when the data were recorded"
+            )
+    delivered = {key: holds.delivered for key, holds in instrument.ranges.items() if holds.delivered is not None}
+    settings, text, notes = instrument.settings(calibrated, {**delivered, **told})
+    for setting in settings:
+        holds = instrument.ranges[setting.name]
+        if not holds.least <= setting.new <= holds.most:
+            raise InputError(
+                f"{setting.name} would be {setting.new:g}, and may be {holds.least:g} to {holds.most:g}; is what it is "
+                "set to now right?"
+            )
+    marked = [replace(each, assumed=each.name in delivered and each.name not in told) for each in settings]
     return InstrumentSettings(name, instrument.document, tuple(marked), text, tuple(notes))
 
 
-def _water_linked(
-    calibrated: CalibratedMounting, now: Mapping[str, float | None]
-) -> tuple[list[Setting], str, list[str]]:
-    offset, swing = _heading(calibrated, now["mounting_rotation_offset"] or 0.0)
+def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
     turned = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     settings, notes = [turned], [*_left(calibrated, swing), *_delay(calibrated)]
-    factor, speed = 1.0 / (1.0 + calibrated.scale_ahead), now["speed_of_sound"]
+    factor, speed = calibrated.speed_of_sound_factor, now.get("speed_of_sound")
     if calibrated.model.scale_axes and speed is None:
         notes.append(
             f"speed_of_sound: times {factor:.5f}; say what it was set to (--now speed_of_sound=1500), for m/s. "
             "That is what a wrong speed of sound looks like: set the water's temperature and salinity right first"
         )
     elif calibrated.model.scale_axes and speed is not None:
-        new = _between(factor * speed, 1000.0, 2000.0, "speed_of_sound")
+        new = round(factor * speed, 2)
         settings.append(Setting("speed_of_sound", speed, new, "m/s"))
         scale = f"{100.0 * calibrated.scale_ahead:+.2f} %"
         notes.append(
@@ -107,27 +127,25 @@ def _water_linked(
     return settings, json.dumps(command) + "\n", notes
 
 
-def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float | None]) -> tuple[list[Setting], str, list[str]]:
-    heading, swing = _heading(calibrated, now["heading"] or 0.0)
+def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    heading, swing = _heading(calibrated, now["heading"])
     settings = [Setting("heading", now["heading"], round(math.remainder(heading, 360.0), 2), "°")]
-    roll, pitch = now["roll"] or 0.0, now["pitch"] or 0.0
-    lines = [f"SET-SENSOR-ORIENTATION {roll:g}, {pitch:g}, {settings[0].new:g}"]
+    lines = [f"SET-SENSOR-ORIENTATION {now['roll']:g}, {now['pitch']:g}, {settings[0].new:g}"]
     if calibrated.model.scale_axes:
-        adjustment = (now["velocity_adjustment"] or 1.0) / (1.0 + calibrated.scale_ahead)
-        new = _between(adjustment, 0.8, 1.25, "velocity_adjustment", digits=5)
+        new = round(calibrated.speed_of_sound_factor * now["velocity_adjustment"], 5)
         settings.append(Setting("velocity_adjustment", now["velocity_adjustment"], new))
         lines.append(f"SET-VELOCITY-ADJUSTMENT {new:g}")
     return settings, "\n".join(lines) + "\n", [*_left(calibrated, swing), *_delay(calibrated)]
 
 
-def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float | None]) -> tuple[list[Setting], str, list[str]]:
+def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
     settings, notes = [], []
     if calibrated.position is None:
         notes.append(f"VISO_POS_X, _Y, _Z are not set: {POSITION_UNKNOWN}")
     else:
         for axis, value in zip("XYZ", FLU_FROM_FRD @ np.array(calibrated.position), strict=True):
             name = f"VISO_POS_{axis}"
-            settings.append(Setting(name, now[name], _between(float(value) + 0.0, -5.0, 5.0, name, digits=3), "m"))
+            settings.append(Setting(name, now.get(name), round(float(value) + 0.0, 3), "m"))
         notes.append(f"VISO_POS is from {calibrated.base_frame}: move it, if the autopilot's origin is elsewhere")
     rotation = calibrated.rotation_body_from_dvl
     clockwise = -math.atan2(rotation[1, 0], rotation[0, 0])
@@ -138,17 +156,20 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float | None]) 
             f"ardupilot: the DVL is turned by {math.degrees(clockwise):+.1f}° (clockwise), and VISO_ORIENT holds "
             "quarter turns; set the rest in the DVL itself (--instrument waterlinked or cerulean)"
         )
-    settings.append(Setting("VISO_ORIENT", now["VISO_ORIENT"], float(quarters % 4 * 2)))
+    settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
     if abs(off) > SAID_FROM:
         notes.append(
             f"{math.degrees(off):+.2f}° of yaw (clockwise) stay: VISO_ORIENT holds quarter turns. Set them in the DVL "
             "itself (--instrument waterlinked or cerulean)"
         )
     delay = round(1000.0 * calibrated.dvl_time_offset)
-    if 0 <= delay <= 250:
-        settings.append(Setting("VISO_DELAY_MS", now["VISO_DELAY_MS"], float(delay), "ms"))
+    if DELAY_MS[0] <= delay <= DELAY_MS[1]:
+        settings.append(Setting("VISO_DELAY_MS", now.get("VISO_DELAY_MS"), float(delay), "ms"))
     else:
-        notes.append(f"VISO_DELAY_MS holds 0 to 250 ms, and the DVL's stamps are {delay} ms late: set its clock right")
+        notes.append(
+            f"VISO_DELAY_MS holds {DELAY_MS[0]} to {DELAY_MS[1]} ms, and the DVL's stamps are {delay} ms late: set its "
+            "clock right"
+        )
     if calibrated.model.scale_axes:
         notes.append(f"the DVL's scale, {100.0 * calibrated.scale_ahead:+.2f} %, is its own to set")
     return settings, "".join(f"{each.name},{each.new:g}\n" for each in settings), notes
@@ -193,40 +214,27 @@ def _delay(calibrated: CalibratedMounting) -> list[str]:
     return [f"the DVL's stamps are {late:+.3f} s late, which is no setting of the instrument"] if late else []
 
 
-def _between(value: float, least: float, most: float, name: str, digits: int = 2) -> float:
-    if not least <= value <= most:
-        raise InputError(
-            f"{name} would be {value:g}, and may be {least:g} to {most:g}; is what it is set to now right?"
-        )
-    return round(value, digits)
-
-
-def told_settings(words: Sequence[str]) -> dict[str, float]:
-    """Settings as an option gives them, NAME=VALUE. Raises InputError."""
-    told = {}
-    for word in words:
-        name, _, value = word.partition("=")
-        try:
-            told[name.strip()] = float(value)
-        except ValueError as error:
-            raise InputError(f"--now {word}: is not NAME=VALUE with a number") from error
-    return told
-
-
 INSTRUMENTS: Mapping[str, Instrument] = {
     "waterlinked": Instrument(
         "Water Linked DVL protocol, JSON over TCP, set_config; axes: vehicle frame (docs.waterlinked.com/dvl)",
-        {"mounting_rotation_offset": 0.0, "speed_of_sound": None},
+        {"mounting_rotation_offset": Range(0.0, 360.0, 0.0), "speed_of_sound": Range(1000.0, 2000.0)},
         _water_linked,
     ),
     "cerulean": Instrument(
         "Cerulean Sonar, commands accepted by the DVL-75 and the Tracker 650 (docs.ceruleansonar.com)",
-        {"heading": 0.0, "roll": 0.0, "pitch": 0.0, "velocity_adjustment": 1.0},
+        {
+            **dict.fromkeys(("heading", "roll", "pitch"), Range(-360.0, 360.0, 0.0)),
+            "velocity_adjustment": Range(0.8, 1.25, 1.0),
+        },
         _cerulean,
     ),
     "ardupilot": Instrument(
         "ArduPilot's complete parameter list, VISO_ (ardupilot.org/sub)",
-        dict.fromkeys(("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z", "VISO_ORIENT", "VISO_DELAY_MS")),
+        {
+            **dict.fromkeys(("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z"), Range(-5.0, 5.0)),
+            "VISO_ORIENT": Range(0.0, 25.0),
+            "VISO_DELAY_MS": Range(*DELAY_MS),
+        },
         _ardupilot,
     ),
 }

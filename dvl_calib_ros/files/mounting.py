@@ -102,6 +102,16 @@ class CalibratedMounting:
         return float(self.parameters.rotation_dvl_from_body[:, 0] ** 2 @ self.scale)
 
     @property
+    def speed_of_sound_factor(self) -> float:
+        """By how much the speed of sound, or what else scales velocities, is to be multiplied: 1 / (1 + δk) ahead."""
+        return 1.0 / (1.0 + self.scale_ahead)
+
+    def check_applicable(self, force: bool) -> None:
+        """Raise InputError for a calibration with objections, unless force is set."""
+        if self.objections and not force:
+            raise InputError(f"{self.path}: {'; '.join(self.objections)}; to apply it all the same: --force")
+
+    @property
     def static_transform(self) -> str:
         """Arguments of tf2's static_transform_publisher. Raises InputError where the position is not known."""
         if self.position is None:
@@ -318,7 +328,7 @@ def scale_advice(calibrated: CalibratedMounting) -> str:
     return (
         f"a transform holds no scale: {100.0 * error:+.2f} % ahead stays in ({abs(1000.0 * error):.1f} m per km). Use "
         "~/calibrated_twist, which is corrected in both, or multiply the driver's speed of sound by "
-        f"{1 / (1 + error):.5f} (not with a phased array, which measures ahead without it)"
+        f"{calibrated.speed_of_sound_factor:.5f} (not with a phased array, which measures ahead without it)"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import time
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from ..errors import InputError, printable
 from .instruments import Setting
 
 PORT = 16171
+ADDRESS = re.compile(r"(?:\[(?P<ipv6>[0-9A-Fa-f:.%\w]+)\]|(?P<host>[^:\[\]]+))(?::(?P<port>\d{1,5}))?", re.ASCII)
 # A DVL that has not answered for so long, s, is none; a line of its reports is no longer than this, bytes.
 PATIENCE_S, LONGEST_LINE = 10.0, 1 << 20
 # It is set with two digits; firmware before 2.2.1, with whole degrees and m/s, is told to be set by hand.
@@ -21,18 +23,15 @@ AS_SET = 0.0051
 def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) -> bool:
     """Set what is new, and read it back; nothing if dry_run. Whether it was set so already.
 
-    address: HOST or HOST:PORT. Raises InputError where nothing answers, it refuses, keeps something else, or is not set
-    to what it was when the data were recorded: what was found is relative to that.
+    address: HOST or HOST:PORT, an IPv6 address in brackets. Raises InputError where nothing answers, it refuses, keeps
+    something else, or is not set to what it was when the data were recorded: what was found is relative to that.
     """
-    host, _, port = address.partition(":")
+    parts = ADDRESS.fullmatch(address)
+    port = int(parts["port"] or PORT) if parts is not None else 0
+    if parts is None or not 0 < port < 65536:
+        raise InputError(f"--send {printable(address)}: is not HOST or HOST:PORT (IPv6 in brackets: [::1])")
     try:
-        number = int(port or PORT)
-        if not host or not 0 < number < 65536:
-            raise ValueError
-    except ValueError as error:
-        raise InputError(f"--send {printable(address)}: is not HOST or HOST:PORT") from error
-    try:
-        with socket.create_connection((host, number), timeout=PATIENCE_S) as connection:
+        with socket.create_connection((parts["ipv6"] or parts["host"], port), timeout=PATIENCE_S) as connection:
             dvl = _Dvl(connection, address)
             before = dvl.ask({"command": "get_config"})
             if all(_is(before, each.name, each.new) for each in settings):

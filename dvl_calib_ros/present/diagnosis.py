@@ -23,6 +23,7 @@ from .document import (
     Document,
     Number,
     Numbers,
+    Said,
     Section,
     Sentence,
     Table,
@@ -98,7 +99,7 @@ FOUND: Columns[FoundEffect] = {
     "effect": lambda effect: " or ".join((effect.name, *effect.equivalent_to)),
     "closes alone": lambda effect: share(effect.closure),
     "p, adjusted": lambda effect: p_value(effect.p),
-    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, units_of(effect.name)), "text"),
+    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, said_of(effect.name)), "text"),
 }
 NEEDS: Columns[tuple[str, str]] = {"not testable": lambda each: each[0], "needs": lambda each: Cell(each[1], "text")}
 NOISE: Columns[NoiseFinding] = {
@@ -113,11 +114,11 @@ def diagnosis(d: Diagnosis) -> Document:
     """Where the DVL differs from what calibration leads to expect, which effect makes it, and what cannot be told."""
     series, has_effects = d.series, bool(d.effects)
     found = [
-        f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, units_of(e.name))}." for e in d.effects
+        f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, said_of(e.name))}." for e in d.effects
     ]
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
     of_each = [
-        (effect.name, recording, intervals(parameters, units_of(effect.name)))
+        (effect.name, recording, intervals(parameters, said_of(effect.name)))
         for effect in d.effects
         for recording, parameters in effect.by_recording.items()
     ]
@@ -203,9 +204,10 @@ def _alike(d: Diagnosis) -> Iterator[Sentence]:
             )
 
 
-def units_of(effect: str) -> dict[str, str]:
-    """Units by parameter; of an effect that was found with another library than the installed one, none."""
-    return {spec.name: spec.unit for spec in EFFECTS[effect].parameters} if effect in EFFECTS else {}
+def said_of(effect: str) -> dict[str, Said]:
+    """How its parameters are said; of an effect that was found with another library than the installed one, none."""
+    parameters = EFFECTS[effect].parameters if effect in EFFECTS else ()
+    return {each.name: Said(each.spoken, each.unit) for each in parameters}
 
 
 def _mm(value: float) -> str:
@@ -254,7 +256,8 @@ def _detectable_table(d: Diagnosis) -> Table:
         for i, (parameter, size) in enumerate(sizes.items()):
             spec = specs.get(parameter)
             typical = math.nan if spec is None else spec.typical
-            said, (found, worth), unit = quantity(parameter, (size, typical), "" if spec is None else spec.unit)
+            said = parameter if spec is None else spec.spoken
+            (found, worth), unit = quantity((size, typical), "" if spec is None else spec.unit)
             kind = "text" if spec is None else "text good" if size <= typical else "text far"
             worth_knowing = "–" if spec is None else f"{worth:g} {unit}"
             rows.append((name if i == 0 else "", Cell(f"{said} {three(found)} {unit}".strip(), kind), worth_knowing))

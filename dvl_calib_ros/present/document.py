@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
@@ -294,37 +294,39 @@ def three(value: float) -> str:
     return text.replace("-", "−")
 
 
-# Units that people use for those of an effect's parameters: factor and name, and the end of the parameter's name that
-# says the other one; small times and velocities have others again.
-_SPOKEN: Mapping[str, tuple[float, str, str]] = {
-    "m": (1.0, "m", "_m"),
-    "s": (1.0, "s", "_s"),
-    "m/s": (1.0, "m/s", "_mps"),
-    "rad": (math.degrees(1.0), "°", "_rad"),
-    "rad/h": (math.degrees(1.0), "°/h", "_rad_per_hour"),
-    "rad/(m/s)": (math.degrees(1.0), "° per m/s", "_rad_per_mps"),
-    "m/s/rad": (math.radians(1.0), "m/s per °", ""),
-    "1": (100.0, "%", ""),
-    "1/h": (100.0, "%/h", "_per_hour"),
-    "s/h": (1.0, "s/h", "_per_hour"),
+# Units that people use for those of an effect's parameters, and factor; small times and velocities have others again.
+_SPOKEN: Mapping[str, tuple[float, str]] = {
+    "rad": (math.degrees(1.0), "°"),
+    "rad/h": (math.degrees(1.0), "°/h"),
+    "rad/(m/s)": (math.degrees(1.0), "° per m/s"),
+    "m/s/rad": (math.radians(1.0), "m/s per °"),
+    "1": (100.0, "%"),
+    "1/h": (100.0, "%/h"),
 }
 _SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
 
 
-def quantity(name: str, values: Sequence[float], unit: str) -> tuple[str, list[float], str]:
-    """A parameter's name, its values and their unit as people say them: degrees, ms and mm/s for rad, s and m/s."""
-    factor, spoken, suffix = _SPOKEN.get(unit, (1.0, unit, ""))
+class Said(NamedTuple):
+    """What a parameter is called before its value, and its unit."""
+
+    name: str
+    unit: str
+
+
+def quantity(values: Sequence[float], unit: str) -> tuple[list[float], str]:
+    """Values and their unit as people say them: degrees, ms and mm/s for rad, s and m/s."""
+    factor, spoken = _SPOKEN.get(unit, (1.0, unit))
     if spoken in _SMALL and 0.0 < max((abs(each) for each in values if math.isfinite(each)), default=0.0) < 1.0:
         factor, spoken = _SMALL[spoken]
-    said = "" if name in ("seconds", "seconds_per_hour") and unit else name.removesuffix(suffix)
-    return said, [factor * each for each in values], spoken
+    return [factor * each for each in values], spoken
 
 
-def intervals(parameters: Mapping[str, tuple[float, float, float]], units: Mapping[str, str] | None = None) -> str:
+def intervals(parameters: Mapping[str, tuple[float, float, float]], said: Mapping[str, Said] | None = None) -> str:
     """Values and from where to where each may be, by name, with the digits that this tells; – where there are none."""
-    said = []
+    texts = []
     for name, values in parameters.items():
-        spoken, (value, low, high), unit = quantity(name, values, (units or {}).get(name, ""))
+        of = (said or {}).get(name, Said(name, ""))
+        (value, low, high), unit = quantity(values, of.unit)
         width = high - low
         if math.isfinite(width) and width > 0.0:
             digits = max(0, 1 - math.floor(math.log10(width)))
@@ -332,8 +334,8 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], units: Mappi
         else:
             shown = [three(each) for each in (value, low, high)]
         space = "" if unit.startswith("°") else " "
-        said.append(" ".join(f"{spoken} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
-    return "; ".join(said) or "–"
+        texts.append(" ".join(f"{of.name} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
+    return "; ".join(texts) or "–"
 
 
 def fitting_unit(seconds: float) -> tuple[float, str]:

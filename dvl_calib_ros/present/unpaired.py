@@ -11,7 +11,7 @@ from ..unpaired.results import (
     UnpairedComparison,
 )
 from ..verdict.kinds import Severity
-from .diagnosis import units_of
+from .diagnosis import said_of
 from .document import (
     Answer,
     Cell,
@@ -38,8 +38,8 @@ MM = 1e3
 EFFECTS: Columns[ComparedEffect] = {
     "effect": lambda each: " or ".join((each.name, *each.equivalent_to)),
     "": lambda each: Cell(each.status.words, CELLS.get(each.status, "")),
-    "vehicle (95 %)": lambda each: Cell(intervals(each.vehicle, units_of(each.name)), "text"),
-    "simulator (95 %)": lambda each: Cell(intervals(each.simulator, units_of(each.name)), "text"),
+    "vehicle (95 %)": lambda each: Cell(intervals(each.vehicle, said_of(each.name)), "text"),
+    "simulator (95 %)": lambda each: Cell(intervals(each.simulator, said_of(each.name)), "text"),
     "adds, mm/s": lambda each: f"{MM * each.adds_mps:.1f}",
     "mostly on": lambda each: str(each.lies or "–"),
     "p, adjusted": lambda each: p_value(each.p),

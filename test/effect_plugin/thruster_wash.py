@@ -14,7 +14,9 @@ class ThrusterWash(Effect):
     name = "thruster_wash"
     summary = "a surge error in turns to either side: coefficient · |ω_z|"
     manoeuvre = "turns to both sides, sharp ones and wide ones"
-    parameters = (EffectParameter("coefficient_m", "m", 0.1, -5.0, 5.0, "surge error per turn rate"),)
+    parameters = (
+        EffectParameter("coefficient_m", "m", 0.1, -5.0, 5.0, "surge error per turn rate", said="coefficient"),
+    )
     acts_on = ActsOn.DVL
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     confounded_with = ("lever_arm",)

@@ -41,13 +41,13 @@ def saved(tmp_path_factory) -> Path:
     return folder / "result.yaml"
 
 
-def found(saved: Path, told_rpy, misaligned: np.ndarray, turned: bool = False, **changes):
+def found(saved: Path, told_rpy, misaligned: np.ndarray, **changes):
     """The calibration of another mounting, found to be misaligned (3, 3) in the DVL's own calibrated axes."""
     calibrated = load_calibrated_mounting(saved)
     parameters = calibrated.parameters.replace(mounting_rpy=tuple(float(each) for each in told_rpy))
     rotation = parameters.rotation_dvl_from_body.T @ misaligned
     changed = {"objections": (), **changes}
-    return replace(calibrated, parameters=parameters, rotation_body_from_dvl=rotation, turned=turned, **changed)
+    return replace(calibrated, parameters=parameters, rotation_body_from_dvl=rotation, **changed)
 
 
 def about_z(angle: float) -> np.ndarray:
@@ -87,6 +87,7 @@ def test_the_scale_is_taken_out_at_its_cause(saved):
     assert cerulean.settings[1].new == pytest.approx(1.01 / too_much, abs=1e-5)
     assert cerulean.text.splitlines()[0].startswith("SET-SENSOR-ORIENTATION 2, 0, -1.7")
     untold = instrument_settings(calibrated, "waterlinked")
+    assert str(untold.settings[0]).startswith("mounting_rotation_offset: 0 (as delivered) -> ")
     assert [each.name for each in untold.settings] == ["mounting_rotation_offset"]
     assert any(f"times {1.0 / too_much:.5f}" in each for each in untold.notes)
 
@@ -108,8 +109,13 @@ def test_an_autopilot_takes_place_quarter_turns_and_delay(saved):
         (["--instrument", "sonardyne"], "one of waterlinked, cerulean, ardupilot"),
         (["--instrument", "waterlinked", "--now", "colour=1"], "no setting 'colour'"),
         (["--instrument", "waterlinked", "--now", "speed_of_sound=fast"], "NAME=VALUE"),
-        (["--instrument", "waterlinked", "--now", "speed_of_sound=nan"], "no setting"),
+        (["--instrument", "waterlinked", "--now", "speed_of_sound=nan"], "1000 to 2000"),
         (["--instrument", "waterlinked", "--now", "speed_of_sound=150"], "1000 to 2000"),
+        (["--instrument", "waterlinked", "--now", "speed_of_sound=1001"], "is what it is set to now right?"),
+        (["--instrument", "waterlinked", "--now", "mounting_rotation_offset=-5"], "0 to 360"),
+        (["--instrument", "cerulean", "--now", "velocity_adjustment=0"], "0.8 to 1.25"),
+        (["--instrument", "cerulean", "--now", "roll=1000"], "-360 to 360"),
+        (["--instrument", "ardupilot", "--now", "VISO_DELAY_MS=900"], "0 to 250"),
         (["--instrument", "waterlinked", "--launch", "tf.launch.xml"], "turned twice"),
         (["--instrument", "cerulean", "--send", "192.0.2.1"], "--send is for waterlinked"),
         (["--instrument", "ardupilot", "--send", "host"], "--send is for waterlinked"),
@@ -131,13 +137,24 @@ def test_a_rejected_calibration_is_no_setting_unless_forced(saved):
     assert instrument_settings(rejected, "waterlinked", force=True).settings
 
 
+def has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
 class WaterLinked:
     """A DVL that answers over TCP as the protocol says, with reports in between."""
 
-    def __init__(self, config: dict[str, float], *, whole: bool = False, refuses: bool = False) -> None:
+    def __init__(
+        self, config: dict[str, float], *, whole: bool = False, refuses: bool = False, family=socket.AF_INET
+    ) -> None:
         self.config, self._whole, self._refuses = dict(config), whole, refuses
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.address = f"127.0.0.1:{self._server.getsockname()[1]}"
+        host, written = ("::1", "[::1]") if family == socket.AF_INET6 else ("127.0.0.1",) * 2
+        self._server = socket.create_server((host, 0), family=family)
+        self.address = f"{written}:{self._server.getsockname()[1]}"
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -196,6 +213,13 @@ def test_nothing_is_sent_to_a_dvl_that_is_set_otherwise_in_a_dry_run_or_to_one_t
     assert "--now mounting_rotation_offset=..." in capsys.readouterr().err
 
 
+@pytest.mark.skipif(not has_ipv6(), reason="no IPv6 here")
+def test_a_dvl_is_found_by_an_ipv6_address_in_brackets(saved, capsys):
+    dvl = WaterLinked(NOW, family=socket.AF_INET6)
+    assert send(saved, dvl, "--dry-run") == 0
+    assert dvl.ended() == NOW and f"{dvl.address}: would be set" in capsys.readouterr().out
+
+
 def test_a_dvl_that_refuses_rounds_or_is_not_there_is_said(saved, capsys):
     refusing = WaterLinked(NOW, refuses=True)
     assert send(saved, refusing) == 2 and refusing.ended() == NOW
@@ -205,9 +229,10 @@ def test_a_dvl_that_refuses_rounds_or_is_not_there_is_said(saved, capsys):
     assert "look at the DVL's own page" in capsys.readouterr().err
     assert send(saved, refusing) == 2
     assert "is the DVL on" in capsys.readouterr().err
-    refusing.address = "host:port"
-    assert send(saved, refusing) == 2
-    assert "is not HOST or HOST:PORT" in capsys.readouterr().err
+    for address in ("host:port", "::1", "[::1]:70000", "[::1", ":16171"):
+        refusing.address = address
+        assert send(saved, refusing) == 2
+        assert "is not HOST or HOST:PORT" in capsys.readouterr().err
 
 
 def test_a_dry_run_shows_what_files_would_change_and_changes_none(saved, tmp_path, capsys):

@@ -188,6 +188,17 @@ def test_every_effect_describes_itself():
 # ------------------------------------------------------------------ time
 
 
+def test_a_parameter_is_said_in_words_and_without_its_unit():
+    said = {
+        f"{effect.name} {parameter.name}": parameter.spoken
+        for effect in (*EFFECTS.values(), *NOISE_EFFECTS.values())
+        for parameter in effect.parameters
+    }
+    assert len(said) > 40 and not [name for name, words in said.items() if "_" in words]
+    assert said["clock_drift seconds_per_hour"] == "" and said["heading_error sin_rad"] == "sin"
+    assert said["tilt_coupling x_per_pitch"] == "x per pitch" and said["sound_speed_moved ratio"] == "ratio"
+
+
 def test_a_late_body_frame_reference_is_an_early_dvl():
     motion = replace(some_motion(), reference_frame=VelocityFrame.BODY)
     late, early = (
