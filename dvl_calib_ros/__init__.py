@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         doctor,
         evaluate,
         export,
+        fleet,
         import_files,
         instrument_settings,
         replay,
@@ -44,6 +45,7 @@ __all__ = [
     "doctor",
     "evaluate",
     "export",
+    "fleet",
     "import_files",
     "instrument_settings",
     "replay",
@@ -70,7 +72,7 @@ __version__ = _version()
 
 
 # Subpackages that have the name of a public function
-_ALSO_FUNCTIONS = ("export", "replay")
+_ALSO_FUNCTIONS = ("export", "fleet", "replay")
 
 
 class _Callable(_ModuleType):

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -23,6 +24,8 @@ Outcome = TypeVar("Outcome")
 CONNECT_TIMEOUT_S = 5.0
 WORKERS_TIMEOUT_S = 10.0
 ALL_WORKERS_LOST_S = 60.0
+# Pieces that are handed to each process of this machine, so that it never waits for the next.
+HANDED_OUT = 2
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,13 @@ class Workers:
 
     jobs: int = 1
     dask: str = ""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Stands for the outcome of an item with which every worker died that tried it. why: in a sentence."""
+
+    why: str
 
 
 def run_all(
@@ -44,8 +54,13 @@ def run_all(
     Exceptions of `work` go through. Raises InputError for a cluster that does not answer, or workers that died.
     """
     if workers.dask:
-        with _quiet_logs():
-            return _on_dask(work, items, workers.dask, on_progress)
+        found: dict[int, Outcome] = {}
+        for index, outcome in outcomes_as_done(work, items, workers):
+            if isinstance(outcome, Lost):
+                raise InputError(f"--dask {workers.dask}: {outcome.why}; start the cluster anew")
+            found[index] = outcome
+            on_progress(len(found) / len(items))
+        return [found[index] for index in range(len(items))]
     if workers.jobs == 1 or len(items) == 1:
         outcomes = []
         for done, item in enumerate(items, start=1):
@@ -81,11 +96,79 @@ def outcomes_on_cores(work: Callable[[Item], Outcome], items: Iterable[Item], jo
         raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs") from error
 
 
-def _on_dask(
-    work: Callable[[Item], Outcome], items: Sequence[Item], address: str, on_progress: Callable[[float], None]
-) -> list[Outcome]:
+def outcomes_as_done(
+    work: Callable[[Item], Outcome], items: Sequence[Item], workers: Workers
+) -> Iterator[tuple[int, Outcome | Lost]]:
+    """Index of an item and `work` of it, as they are done; `Lost` where that kills the worker, which costs no other.
+
+    Exceptions of `work` go through. Raises InputError for a cluster that does not answer, or has no workers any more.
+    """
+    if workers.dask:
+        with _quiet_logs():
+            yield from _as_done_on_dask(work, items, workers.dask)
+    elif workers.jobs == 1:
+        for index, item in enumerate(items):
+            yield index, work(item)
+    else:
+        yield from _as_done_on_cores(work, items, workers.jobs or cores())
+
+
+def cores() -> int:
+    """How many this process may use."""
+    from joblib import cpu_count
+
+    count: int = cpu_count()
+    return count
+
+
+def _as_done_on_cores(
+    work: Callable[[Item], Outcome], items: Sequence[Item], jobs: int
+) -> Iterator[tuple[int, Outcome | Lost]]:
+    left = deque(enumerate(items))
+    while left:
+        for suspect in (yield from _until_one_dies(work, left, jobs)):
+            if (yield from _until_one_dies(work, deque([suspect]), 1)):
+                yield suspect[0], Lost("the process that worked on it was killed, perhaps for want of memory")
+
+
+def _until_one_dies(
+    work: Callable[[Item], Outcome], left: deque[tuple[int, Item]], jobs: int
+) -> Generator[tuple[int, Outcome | Lost], None, list[tuple[int, Item]]]:
+    """`work` of the items that are left. Returns those that were under way when a process died; none if all is done."""
+    from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
+
+    under_way: dict[Any, tuple[int, Item]] = {}
+    broken: list[tuple[int, Item]] = []
+    # one thread of linear algebra per process: the matrices are tiny, and the processes fill the cores
+    executor = ProcessPoolExecutor(jobs, env=dict.fromkeys(_THREADS, "1"))
     try:
-        from distributed import Client, KilledWorker
+        while not broken and (left or under_way):
+            while left and len(under_way) < HANDED_OUT * jobs:
+                under_way[executor.submit(work, left[0][1])] = left[0]
+                left.popleft()
+            for future in wait(under_way, return_when=FIRST_COMPLETED).done:
+                item = under_way.pop(future)
+                try:
+                    outcome = future.result()
+                except BrokenProcessPool:
+                    broken.append(item)
+                else:
+                    yield item[0], outcome
+    except BrokenProcessPool:  # noticed when the next was handed out, which is still among those left
+        pass
+    finally:
+        executor.shutdown(kill_workers=True)
+    return [*broken, *under_way.values()]
+
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def _as_done_on_dask(
+    work: Callable[[Item], Outcome], items: Sequence[Item], address: str
+) -> Iterator[tuple[int, Outcome | Lost]]:
+    try:
+        from distributed import Client
         from distributed.comm.core import CommClosedError
     except ImportError as error:
         raise InputError(f"--dask needs Dask ({error}); pip install 'dvl_calib_ros[dask]'") from error
@@ -100,17 +183,14 @@ def _on_dask(
         except TimeoutError as error:
             raise InputError(f"--dask {address}: the scheduler has no workers; start some") from error
         # Dask runs what a dead worker had done or was doing again elsewhere, as long as somebody holds the futures
-        futures = client.map(work, items, pure=False)
         try:
-            _wait(client, futures, address, on_progress)
-            outcomes: list[Outcome] = client.gather(futures)
+            yield from _as_done(client, dict(enumerate(client.map(work, items, pure=False))), address)
         except ImportError as error:
             raise InputError(
                 f"--dask {address}: workers lack something ({error}); install this package there"
             ) from error
-        except (CancelledError, CommClosedError, KilledWorker) as error:
+        except (CancelledError, CommClosedError) as error:
             raise InputError(f"--dask {address}: the cluster was lost on the way; start it anew") from error
-        return outcomes
 
 
 async def _greet(address: str) -> None:
@@ -143,16 +223,25 @@ def _quiet_logs() -> Iterator[None]:
         logging.disable(before)
 
 
-def _wait(client: Any, futures: Sequence[Any], address: str, on_progress: Callable[[float], None]) -> None:
-    """Wait for all futures. Raises InputError once there has been no worker for ALL_WORKERS_LOST_S."""
-    from distributed import wait
+def _as_done(client: Any, pending: dict[int, Any], address: str) -> Iterator[tuple[int, Any]]:
+    """Outcomes of futures. Raises InputError once there has been no worker for ALL_WORKERS_LOST_S."""
+    from distributed import KilledWorker
+    from distributed import wait as wait_for
 
-    pending = list(futures)
     while pending:
         with suppress(TimeoutError):
-            wait(pending, timeout=ALL_WORKERS_LOST_S, return_when="FIRST_COMPLETED")
-        left = [future for future in pending if not future.done()]
-        if len(left) == len(pending) and not client.scheduler_info().get("workers"):
-            raise InputError(f"--dask {address}: all workers are gone, {len(left)} pieces not done; start some")
-        pending = left
-        on_progress(1.0 - len(pending) / len(futures))
+            wait_for(list(pending.values()), timeout=ALL_WORKERS_LOST_S, return_when="FIRST_COMPLETED")
+        done = [index for index, future in pending.items() if future.done()]
+        if not done and not client.scheduler_info().get("workers"):
+            raise InputError(f"--dask {address}: all workers are gone, {len(pending)} pieces not done; start some")
+        for index in done:
+            try:
+                outcome = pending[index].result(timeout=ALL_WORKERS_LOST_S)
+            except KilledWorker:
+                outcome = Lost("the workers that worked on it were killed, perhaps for want of memory")
+            except TimeoutError:
+                if pending[index].status == "error":
+                    raise
+                continue  # its worker died before it gave the outcome: it is done again
+            del pending[index]
+            yield index, outcome

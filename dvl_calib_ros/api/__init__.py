@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from ..files.applying import Applied
     from ..files.instruments import InstrumentSettings
     from ..files.trajectories import Imported
+    from ..fleet.fleet import Fleet
     from ..unpaired.results import UnpairedComparison
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "doctor",
     "evaluate",
     "export",
+    "fleet",
     "import_files",
     "instrument_settings",
     "replay",
@@ -178,6 +180,65 @@ def compare(
             found.append(load_extrinsics(Path(given), str(given)))
     check_distinct(found)
     return run(found)
+
+
+def fleet(
+    places: Bags,
+    out: StrPath,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    vehicle_from: str | None = None,
+    jobs: int = 0,
+    dask: str = "",
+    **parameters: Any,
+) -> Fleet:
+    """Calibrate all recordings below some places into a catalogue, as ``dvl-calib fleet``.
+
+    Parameters
+    ----------
+    places
+        Folders, files, or URLs that fsspec opens, such as ``s3://bucket/dives``; one or several.
+    out
+        Folder of the catalogue; what is done there and unchanged is not done again.
+    dvl_topic, gnss_topic, imu_topic
+        As of `replay`, for all recordings.
+    params
+        As of `replay`.
+    vehicle_from
+        A regular expression whose first group in a recording's path is the vehicle; by default the first folder below
+        a place.
+    jobs
+        Processes; 0: one per core, 1: this one.
+    dask
+        Address of a Dask scheduler to work on instead.
+    **parameters
+        As of `replay`.
+
+    Returns
+    -------
+    Fleet
+        ``vehicles`` with where each mounting moved, ``persons``: the recordings that need one; ``out`` has
+        ``rows/*.parquet`` and ``index.html``.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For a place that is none or holds no recording, for a catalogue that cannot be written, and without pyarrow.
+        What is wrong with a recording is its row.
+    """
+    from ..fleet.fleet import run_fleet
+    from ..parallel import Workers
+    from ..present.reports import write_report
+
+    merged, names = _parameters(params, parameters)
+    asked = [str(each) for each in ([places] if isinstance(places, str | os.PathLike) else places)]
+    given = Given(dvl_topic, gnss_topic, imu_topic, names)
+    found = run_fleet(asked, Path(out), merged, given, Workers(jobs, dask), vehicle_from)
+    write_report(found.page, found)
+    return found
 
 
 def doctor(

@@ -60,6 +60,11 @@ COMMANDS = (
         "dvl-calib compare monday.yaml tuesday.yaml --report compared.html",
     ),
     Command(
+        "fleet",
+        "calibrate all recordings below folders or object stores into a catalogue (Parquet), with a page",
+        "dvl-calib fleet dives --out catalogue",
+    ),
+    Command(
         "diagnose",
         "name what causes the velocity error that calibration leaves in recorded bags",
         "dvl-calib diagnose my_bag --apply compensated.yaml",

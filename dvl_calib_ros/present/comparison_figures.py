@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -12,18 +12,21 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
 from ..calibration.comparison import Change, Comparison
-from ..calibration.extrinsics import Extrinsics
+from ..calibration.extrinsics import N_COMPONENTS, Extrinsics
 from .comparison import ComparedQuantity, shown_quantities, values_of
 from .style import INK, Picture, drawing, new_figure, picture
 
 _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
 PNG_DPI = 160
+# Of more calibrations than these the first and the last are told to who cannot see the picture.
+TOLD = 20
 
 
-def trend(comparison: Comparison) -> list[Picture]:
-    """Every quantity that two have shown, a picture each."""
-    return [_picture(comparison, quantity) for quantity in shown_quantities(comparison)]
+def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
+    """Every quantity that two have shown, a picture each. components: those alone."""
+    quantities = (each for each in shown_quantities(comparison) if each.component in components)
+    return [_picture(comparison, quantity) for quantity in quantities]
 
 
 def trend_png(comparison: Comparison) -> bytes:
@@ -50,11 +53,12 @@ def _picture(comparison: Comparison, quantity: ComparedQuantity) -> Picture:
         return figure
 
     at = quantity.component
+    known = [each for each in comparison.calibrations if each.shown[at]]
     told = ", ".join(
         f"{each.name} {quantity.factor * values_of(each)[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
-        for each in comparison.calibrations
-        if each.shown[at]
+        for each in (known if len(known) <= TOLD else (known[0], known[-1]))
     )
+    told += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
     title = f"{quantity.name.capitalize()}, {quantity.unit}"
     return picture(title, f"{quantity.name} over time, in {quantity.unit}: {told}", draw)
 

@@ -10,6 +10,7 @@ from ..diagnosis.results import Diagnosis
 from ..evaluation.bags import CrossCheck
 from ..evaluation.results import Evaluation
 from ..examination.examine import Examination
+from ..fleet.fleet import Fleet
 from ..unpaired.results import UnpairedComparison
 from .comparison import comparison
 from .cross_check import cross_check
@@ -17,6 +18,7 @@ from .diagnosis import diagnosis
 from .document import Document
 from .evaluation import evaluation
 from .examination import examination
+from .fleet import fleet
 from .unpaired import unpaired
 
 DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
@@ -25,5 +27,6 @@ DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
     Diagnosis: diagnosis,
     Evaluation: evaluation,
     Examination: examination,
+    Fleet: fleet,
     UnpairedComparison: unpaired,
 }

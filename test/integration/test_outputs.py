@@ -63,6 +63,7 @@ COMMAND = {
     "apply in place": Command("apply result.yaml", ("result.yaml",), ("--urdf", "--launch")),
     "compare": Command("compare result.yaml bag", ("result.yaml", "bag", "bag/bag.mcap"), ("--json", "--report")),
     "export": Command("export dave result.yaml", ("result.yaml",), ("-o",)),
+    "fleet": Command("fleet bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), (), ("--out",)),
     "salvage": Command("salvage bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), (), ("-o",)),
     "import": Command(
         "import runs/T_dvl.npy --gnss runs/T_gnss.npy", ("runs/T_dvl.npy", "runs/T_gnss.npy"), (), ("-o",)

@@ -26,7 +26,7 @@ MODULES = sorted((ROOT / "dvl_calib_ros").rglob("*.py"))
 DISTRIBUTIONS = {"yaml": "pyyaml", "backports": "backports.zstd"}
 # of ROS, of an extra, of Python 3.14, or replaced where it is missing
 NOT_REQUIRED = {"compression", "rclpy", "ament_index_python", "rosbag2_py", "tf2_ros"}
-NOT_REQUIRED |= {"argcomplete", "distributed", "pandas", "pymavlink"}
+NOT_REQUIRED |= {"argcomplete", "distributed", "pandas", "pymavlink", "pyarrow", "fsspec"}
 
 
 def required() -> dict[str, str]:

@@ -1,0 +1,139 @@
+"""A fleet: every recording below some places calibrated once, into a catalogue that grows."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from .. import __version__
+from ..calibration.parameters import Parameters
+from ..discovery.discover import Given
+from ..errors import InputError
+from ..files.outputs import check_outputs
+from ..parallel import Lost, Workers, outcomes_as_done
+from ..verdict.answering import Answering
+from .catalogue import PAGE, SCHEMA, Catalogue, CataloguePart
+from .history import Catalogued, NeedsPerson, VehicleHistory, distinct, histories, need_person
+from .one import Task, entry_of, failed
+from .places import StoredRecording, recordings_in, vehicle_pattern
+
+# Answers of a comparison, the worst first
+WORDS = ("moved", "suspicious", "same")
+
+
+@dataclass(frozen=True, repr=False)
+class Fleet(Answering):
+    """What a catalogue holds after a run.
+
+    Parameters
+    ----------
+    out
+        Folder of the catalogue: ``rows/*.parquet``, ``index.html``.
+    recordings
+        How many the catalogue holds.
+    calibrated, unchanged
+        How many of them this run did, and found done.
+    vehicles
+        Each with its calibrations by day, and where its mounting moved.
+    persons
+        Why recordings need a person, and which.
+    notes
+        What could not be looked into.
+    """
+
+    out: Path
+    recordings: int
+    calibrated: int
+    unchanged: int
+    vehicles: tuple[VehicleHistory, ...]
+    persons: tuple[NeedsPerson, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def page(self) -> Path:
+        """The page."""
+        return self.out / PAGE
+
+    @property
+    def word(self) -> str:
+        """The answer: whether the mounting of one moved."""
+        words = [each.compared.word for each in self.vehicles if each.compared is not None]
+        return next((word for word in WORDS if word in words), "not compared")
+
+
+def run_fleet(
+    places: Sequence[str],
+    out: Path,
+    parameters: Parameters,
+    given: Given,
+    workers: Workers,
+    vehicle_from: str | None = None,
+    on_progress: Callable[[float], None] = lambda _: None,
+) -> Fleet:
+    """Calibrate what is new or has changed, and read the catalogue. The page is not written.
+
+    places: folders, files, URLs. given: what parameters and topics are named. vehicle_from: a regular expression; by
+    default the first folder below a place. Raises InputError for a place that is none, for a catalogue that cannot be
+    written, and for workers that cannot be had; what is done is kept.
+    """
+    pattern = vehicle_pattern(vehicle_from)
+    recordings, notes = recordings_in(places)
+    check_outputs({}, [Path(each.where) for each in recordings if not each.is_remote], {"--out": out})
+    catalogue = Catalogue(out)
+    options = _options(parameters, given)
+    known = {part.recording: part for part in catalogue.parts()}
+    left = []
+    for each in recordings:
+        vehicle, part = each.vehicle(pattern), known.get(each.where)
+        if part is None or part.fingerprint != _fingerprint(each, options):
+            left.append(each)
+        elif part.vehicle != vehicle:
+            catalogue.rename(part, vehicle)
+    _check_reach(left, workers)
+    tasks = [Task(each, parameters, given) for each in left]
+    for number, (index, entry) in enumerate(outcomes_as_done(entry_of, tasks, workers), start=1):
+        each = left[index]
+        if isinstance(entry, Lost):
+            entry = failed(each.where, entry.why, is_final=False)
+        fingerprint = _fingerprint(each, options) if entry.is_final else ""
+        catalogue.write(CataloguePart(each.where, each.vehicle(pattern), fingerprint, entry.extrinsics), entry)
+        on_progress(number / len(tasks))
+    return _read(catalogue, len(left), len(recordings) - len(left), notes)
+
+
+def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
+    entries = [
+        Catalogued.of(part.recording, part.vehicle, catalogue.rows_of(part.recording), part.extrinsics)
+        for part in sorted(catalogue.parts(), key=lambda part: part.recording)
+    ]
+    left, doubled = distinct(entries)
+    return Fleet(
+        out=catalogue.folder,
+        recordings=len(entries),
+        calibrated=calibrated,
+        unchanged=unchanged,
+        vehicles=tuple(histories(left)),
+        persons=(*doubled, *need_person(left)),
+        notes=tuple(notes),
+    )
+
+
+def _check_reach(left: Sequence[StoredRecording], workers: Workers) -> None:
+    """Raise InputError for what other processes cannot see."""
+    for each in left:
+        if each.where.startswith("memory://") and (workers.dask or workers.jobs != 1):
+            raise InputError(f"{each.where}: is in the memory of this process alone; read it with --jobs 1")
+
+
+def _options(parameters: Parameters, given: Given) -> str:
+    named = {**asdict(given), "parameters": sorted(given.parameters)}
+    return json.dumps([__version__, SCHEMA, parameters.as_dict(), named], sort_keys=True, default=str)
+
+
+def _fingerprint(recording: StoredRecording, options: str) -> str:
+    """Changes when the recording, the program or the options do."""
+    files = [(each.where, each.size, each.stamp) for each in recording.files]
+    return hashlib.sha256(json.dumps([options, files]).encode()).hexdigest()

@@ -1,0 +1,195 @@
+"""What a catalogue says: of each vehicle how its DVL sat day by day, and which recordings need a person.
+
+Recordings of one day share what differs from day to day (`calibration.days`): they are averaged by their own σ, and
+that of the day is added once. A mounting that moves within a day parts the day.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..calibration.comparison import Comparison, compare, fused
+from ..calibration.extrinsics import Extrinsics
+from ..calibration.frames import Array
+from ..calibration.models import MODELS
+from ..errors import InputError
+from .one import HEADING_ERRORS, Row
+
+DAY_NS = 86_400_000_000_000
+
+
+@dataclass(frozen=True)
+class Catalogued:
+    """A recording as the catalogue has it. covariance_of_recording (8, 8): without what differs from day to day."""
+
+    recording: str
+    vehicle: str
+    rows: tuple[Row, ...]
+    extrinsics: Extrinsics | None = None
+    covariance_of_recording: Array | None = None
+
+    @staticmethod
+    def of(recording: str, vehicle: str, rows: Sequence[Row], told: Mapping[str, Any] | None) -> Catalogued:
+        """From the plain data of a part."""
+        if told is None:
+            return Catalogued(recording, vehicle, tuple(rows))
+        own = {field.name: told[field.name] for field in fields(Extrinsics)}
+        for name in ("rotation_body_from_dvl", "lever_arm", "covariance"):
+            own[name] = np.array(own[name])
+        own["shown"] = np.array(own["shown"], dtype=bool)
+        return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**own), np.array(told["covariance_of_recording"]))
+
+    @property
+    def error(self) -> str:
+        """Why it could not be calibrated, without its own path; '' if it could."""
+        return (self.rows[0]["error"] or "").replace(f"{self.recording}: ", "").replace(self.recording, "it")
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether its numbers are those of the mounting."""
+        return self.extrinsics is not None and self.rows[0]["verdict"] != "reject"
+
+
+class CompassDeviation(NamedTuple):
+    """How a vehicle's heading deviates, degrees: coefficients (4,) of sine and cosine of the yaw and of twice that, σ
+    (4,), and of how many recordings."""
+
+    value: Array
+    std: Array
+    recordings: int
+
+
+@dataclass(frozen=True)
+class VehicleHistory:
+    """A vehicle. days: its calibrations by day. compared: None where there are less than two. heading: None without."""
+
+    name: str
+    recordings: int
+    days: tuple[Extrinsics, ...]
+    compared: Comparison | None
+    heading: CompassDeviation | None
+
+
+class NeedsPerson(NamedTuple):
+    """Why recordings need a person, of the first in its words.
+
+    code: of the reason of a verdict, or SAME_DATA; '' of an error.
+    """
+
+    code: str
+    why: str
+    recordings: tuple[str, ...]
+
+
+def histories(entries: Sequence[Catalogued]) -> list[VehicleHistory]:
+    """Of each vehicle, by name. entries: each recording once (`distinct`)."""
+    by_vehicle: dict[str, list[Catalogued]] = defaultdict(list)
+    for each in entries:
+        by_vehicle[each.vehicle].append(each)
+    return [_history(name, own) for name, own in sorted(by_vehicle.items())]
+
+
+def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[NeedsPerson]]:
+    """Without those that hold the same data as another, which would confirm itself; and those."""
+    first: dict[Any, Catalogued] = {}
+    left, doubled = [], []
+    for each in entries:
+        own = each.extrinsics
+        key = (
+            each.recording
+            if own is None
+            else (own.model, own.first_ns, own.last_ns, own.used, own.covariance.tobytes())
+        )
+        if key in first:
+            doubled.append(
+                NeedsPerson(
+                    "SAME_DATA", f"the same data as {first[key].recording}: only that is used", (each.recording,)
+                )
+            )
+        else:
+            first[key] = each
+            left.append(each)
+    return left, doubled
+
+
+def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
+    """Recordings that could not be calibrated, or whose calibration is rejected, by why; the most first."""
+    groups: dict[tuple[str, str], list[Catalogued]] = defaultdict(list)
+    for each in entries:
+        row = each.rows[0]
+        if each.error:
+            groups["", each.error].append(each)
+        elif row["verdict"] == "reject":
+            groups[row["codes"][0] if row["codes"] else "", ""].append(each)
+    found = [
+        NeedsPerson(code, error or own[0].rows[0]["reason"], tuple(each.recording for each in own))
+        for (code, error), own in groups.items()
+    ]
+    return sorted(found, key=lambda each: -len(each.recordings))
+
+
+def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
+    usable = [each for each in entries if each.is_usable]
+    aided = [each for each in usable if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
+    days = _days(aided or usable)  # what a model without GNSS assumes of currents is no measure of one with
+    return VehicleHistory(name, len(entries), tuple(days), _compared(days), _heading(usable))
+
+
+def _compared(several: Sequence[Extrinsics]) -> Comparison | None:
+    try:
+        return compare(several) if len(several) > 1 else None
+    except InputError:  # nothing that two of them have shown
+        return None
+
+
+def _days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
+    by_day: dict[int, list[tuple[Extrinsics, Array]]] = defaultdict(list)
+    for each in entries:
+        if each.extrinsics is not None and each.covariance_of_recording is not None:
+            by_day[each.extrinsics.first_ns // DAY_NS].append((each.extrinsics, each.covariance_of_recording))
+    found = []
+    for _, own in sorted(by_day.items()):
+        own.sort(key=lambda each: each[0].first_ns)
+        found += [_of_day(part) for part in _parted(own)]
+    return found
+
+
+def _parted(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
+    """Recordings of one day, between those where the mounting moved."""
+    compared = _compared([each for each, _ in own])
+    starts = [] if compared is None else [change.first_after.name for change in compared.moved]
+    parts: list[list[tuple[Extrinsics, Array]]] = [[]]
+    for each in own:
+        if each[0].name in starts and parts[-1]:
+            parts.append([])
+        parts[-1].append(each)
+    return parts
+
+
+def _of_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
+    """All of a day as one, with what differs from day to day once."""
+    of_days = [each.covariance - alone for each, alone in own]
+    together = fused([replace(each, covariance=alone) for each, alone in own])
+    covariance = together.covariance + max(of_days, key=np.trace)
+    name = own[0][0].name.rpartition("/")[2] if len(own) == 1 else f"{len(own)} recordings"
+    return replace(together, name=name, covariance=covariance)
+
+
+def _heading(entries: Sequence[Catalogued]) -> CompassDeviation | None:
+    """Of all recordings, weighted; None where no heading was compared."""
+    names = HEADING_ERRORS[:4]
+    values, stds = [], []
+    for each in entries:
+        own = {row["parameter"]: row for row in each.rows}
+        if all(name in own for name in names):
+            values.append([own[name]["value"] for name in names])
+            stds.append([own[name]["std_recording"] for name in names])
+    if not values:
+        return None
+    weight = 1.0 / np.square(stds)
+    return CompassDeviation((weight * values).sum(axis=0) / weight.sum(axis=0), weight.sum(axis=0) ** -0.5, len(values))

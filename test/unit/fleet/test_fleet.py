@@ -1,0 +1,297 @@
+"""A catalogue of a fleet: each recording once, what `replay` says of it, and what a person is to look at."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import fail, succeed
+from fleet_fixtures import copies, write_dive, write_fleet
+from report_fixtures import drawn
+
+import dvl_calib_ros as dc
+from dvl_calib_ros.fleet import fleet as running
+from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
+
+parquet = pytest.importorskip("pyarrow.parquet")
+
+PARAMETERS = {"roll", "pitch", "yaw"}
+
+
+def table(out: Path):
+    """All rows, as pandas reads them."""
+    return pytest.importorskip("pandas").read_parquet(out / "rows")
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted((out / "rows").iterdir())}
+
+
+@pytest.fixture(scope="module")
+def dives(tmp_path_factory) -> Path:
+    return write_fleet(tmp_path_factory.mktemp("fleet") / "dives")
+
+
+@pytest.fixture(scope="module")
+def made(dives, tmp_path_factory):
+    """The fleet calibrated, its folder."""
+    out = tmp_path_factory.mktemp("fleet_out") / "catalogue"
+    return dc.fleet(dives, out, jobs=1), out
+
+
+def test_a_row_is_a_recording_and_parameter_with_what_replay_says_of_it(made, dives):
+    rows = table(made[1])
+    assert not rows.duplicated(["recording", "parameter"]).any()
+    own = rows[rows.recording == str(dives / "auv1" / "dive1")].set_index("parameter")
+    run = dc.replay(dives / "auv1" / "dive1", history=False)
+    estimate = run.replayed.result.estimate
+    assert own.value[["roll", "pitch", "yaw"]].tolist() == list(run.mounting.rpy_deg)
+    assert own.std_next[["roll", "pitch", "yaw"]].tolist() == list(run.mounting.std_deg)
+    up = np.degrees(np.stack([estimate.filter_std, estimate.recording_std, estimate.std])[:, 2])
+    np.testing.assert_allclose(own.loc["yaw", ["std_filter", "std_recording", "std_next"]].tolist(), up, rtol=0.1)
+    assert up[0] < up[2]
+    assert set(own.verdict) == {run.verdict} and list(own.codes.iloc[0]) == list(run.codes)
+    assert set(own.drift_after) == {run.replayed.navigation.after.per_km}
+    assert set(own.vehicle) == {"auv1"} and len(set(own.day)) == 1
+    assert own.unit[["yaw", "scale"]].tolist() == ["deg", "%"]
+
+
+def test_a_bad_recording_is_one_row_with_its_error(made, dives):
+    result, out = made
+    rows = table(out)
+    bad = rows[rows.recording == str(dives / "auv2" / "no.mcap")]
+    assert len(bad) == 1 and "damaged" in bad.error.iloc[0] and bad.parameter.isna().all()
+    assert rows[rows.recording != str(dives / "auv2" / "no.mcap")].error.isna().all()
+    assert result.recordings == 5
+    (person,) = (each for each in result.persons if each.code == "")
+    assert person.recordings == (str(dives / "auv2" / "no.mcap"),)
+
+
+def test_the_day_on_which_a_mounting_moved_is_said(made):
+    result, _ = made
+    by_name = {each.name: each for each in result.vehicles}
+    (change,) = by_name["auv1"].compared.moved
+    assert (change.last_before.name, change.first_after.name) == ("dive1", "dive2")
+    assert by_name["auv2"].compared is None
+    assert result.word == "moved" and "auv1: The mounting has moved by 1.9" in repr(result)
+    page = result.page.read_text()
+    assert page.count("<img") >= 3 and "no.mcap" in page
+
+
+def test_recordings_of_one_day_share_what_differs_from_day_to_day(tmp_path):
+    for number in range(4):
+        write_dive(tmp_path / "dives" / f"dive{number}", 0, seed=number)
+    result = dc.fleet(tmp_path / "dives", tmp_path / "out", jobs=1)
+    (vehicle,) = result.vehicles
+    (day,) = vehicle.days
+    assert vehicle.name == "dives" and day.name == "4 recordings"
+    own = table(tmp_path / "out")
+    alone = own[own.parameter == "yaw"].std_recording.iloc[0]
+    assert np.degrees(day.std[2]) > 0.1  # day_std_heading, which no number of recordings makes smaller
+    assert np.degrees(day.std[2]) < np.hypot(0.1, alone) * 1.05
+
+
+def test_what_is_done_and_unchanged_is_not_done_again(dives, tmp_path, monkeypatch):
+    place, out = tmp_path / "dives", tmp_path / "out"
+    shutil.copytree(dives, place)
+    done: list[str] = []
+
+    def counted(task, real=running.entry_of):
+        done.append(task.recording.inside)
+        return real(task)
+
+    monkeypatch.setattr(running, "entry_of", counted)
+
+    def again(**options) -> list[str]:
+        done.clear()
+        result = dc.fleet(place, out, jobs=1, **options)
+        assert result.calibrated == len(done) and result.unchanged == 5 - len(done)
+        return sorted(done)
+
+    assert len(again()) == 5
+    before = contents(out)
+    assert again() == [] and contents(out) == before
+    os.utime(place / "auv1" / "dive0" / "dive0.mcap", (1.0, 1.0))
+    assert again() == ["auv1/dive0"] and contents(out).keys() == before.keys()
+    assert len(again(min_speed=0.3)) == 5
+    next((out / "rows").glob("dive2*")).write_bytes(b"cut off")
+    assert again(min_speed=0.3) == ["auv1/dive2"]
+    assert again(min_speed=0.3, vehicle_from="(auv)") == [] and set(table(out).vehicle) == {"auv"}
+
+
+def test_what_failed_by_the_machine_is_tried_again(dives, tmp_path, monkeypatch):
+    def full(task):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("dvl_calib_ros.fleet.one.open_recording", lambda *_: full(None))
+    result = dc.fleet(dives / "auv1", tmp_path / "out", jobs=1)
+    assert [each.why for each in result.persons] == ["OSError: [Errno 28] No space left on device"]
+    monkeypatch.undo()
+    result = dc.fleet(dives / "auv1", tmp_path / "out", jobs=1)
+    assert result.calibrated == 3 and result.persons == ()
+
+
+def test_the_same_data_in_two_places_is_used_once(dives, tmp_path):
+    for name in ("a", "b"):
+        shutil.copytree(dives / "auv1" / "dive0", tmp_path / "dives" / "auv1" / name)
+    result = dc.fleet(tmp_path / "dives", tmp_path / "out", jobs=1)
+    assert [(each.code, each.recordings) for each in result.persons] == [
+        ("SAME_DATA", (str(tmp_path / "dives" / "auv1" / "b"),))
+    ]
+    assert result.recordings == 2 and len(result.vehicles[0].days) == 1
+
+
+def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys):
+    fsspec = pytest.importorskip("fsspec")
+    store = fsspec.filesystem("memory")
+    store.put(str(dives), "/bucket/dives", recursive=True)
+    try:
+        error = fail(capsys, "fleet", "memory://bucket/dives", "--out", tmp_path / "out")
+        assert "read it with --jobs 1" in error
+        dc.fleet("memory://bucket/dives", tmp_path / "out", jobs=1)
+        again = dc.fleet("memory://bucket/dives", tmp_path / "out", jobs=1)
+    finally:
+        store.rm("/bucket", recursive=True)
+    assert (again.calibrated, again.unchanged) == (0, 5)
+    one, other = (each.drop(columns="recording") for each in (table(tmp_path / "out"), table(made[1])))
+    order = ["vehicle", "first", "parameter"]
+    one, other = (each.sort_values(order).reset_index(drop=True) for each in (one, other))
+    same = (one.drop(columns=["codes", "error"]) == other.drop(columns=["codes", "error"])) | (
+        one.isna() & other.isna()
+    )
+    assert same.drop(columns=["codes", "error"]).all().all()
+    assert "memory:///bucket/dives/auv2/no.mcap: " in "".join(one.error.dropna())
+
+
+def test_duckdb_and_polars_read_the_catalogue_as_one_table(made):
+    _, out = made
+    rows = table(out)
+    files = f"{out}/rows/*.parquet"
+    asked = f"SELECT vehicle, count(DISTINCT recording) FROM '{files}' WHERE parameter = 'yaw' GROUP BY 1 ORDER BY 1"
+    expected = [("auv1", 3), ("auv2", 1)]
+    if find_spec("duckdb") is not None:
+        import duckdb
+
+        assert duckdb.sql(asked).fetchall() == expected
+    if find_spec("polars") is not None:
+        import polars
+
+        frame = polars.read_parquet(files)
+        assert frame.height == len(rows) and frame["recording"].n_unique() == 5
+    assert rows[rows.parameter == "yaw"].groupby("vehicle").recording.nunique().to_dict() == dict(expected)
+
+
+def test_the_command_prints_the_answer_and_who_needs_a_person(dives, tmp_path, monkeypatch, capsys):
+    drawn(monkeypatch)  # they are looked at elsewhere
+    said, _ = succeed(capsys, "fleet", dives / "auv1", dives / "auv2", "--out", tmp_path / "out", "--jobs", "1")
+    assert said.startswith("not compared") or said.startswith("moved")
+    assert "1 recording of 5 needs a person" in said and "no.mcap" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nowhere", "--out", "out"), "nowhere: no such folder"),
+        (("file", "--out", "out"), "no recording"),
+        ((".", "--out", "out", "--jobs", "-1"), "--jobs: -1 is negative"),
+        (("recorded", "--out", "file/out"), "file/out"),
+        ((".", "--out", "out", "--vehicle-from", "("), "--vehicle-from"),
+    ],
+)
+def test_bad_usage_is_refused_in_one_line(arguments, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("recorded").mkdir()
+    for file in ("file", "recorded/one.mcap"):
+        Path(file).write_text("a file\n")
+    assert said in fail(capsys, "fleet", *arguments)
+
+
+# ------------------------------------------------------------------ workers that die
+
+
+def test_what_kills_its_worker_costs_itself_alone():
+    """A worker that dies with one item, as by a recording that takes all memory."""
+    items = ["1", "2", "__import__('os').kill(__import__('os').getpid(), 9)", "4", "5", "6"]
+    outcomes = dict(outcomes_as_done(eval, items, Workers(jobs=2)))
+    assert isinstance(outcomes.pop(2), Lost)
+    assert outcomes == {0: 1, 1: 2, 3: 4, 4: 5, 5: 6}
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
+    """SIGKILL at forty moments, each run going on with the one before; no row is lost, none is there twice."""
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 60), tmp_path / "out"
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "fleet", str(place), "--out", str(out), "--jobs", "2"]
+    rng, seen = np.random.default_rng(4), 0
+    for _ in range(40):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(rng.uniform(0.5, 6.0))
+        ended = process.poll() is not None
+        process.kill()
+        process.wait()
+        if (out / "rows").exists():
+            whole = [parquet.read_table(path).num_rows for path in (out / "rows").glob("*.parquet")]
+            assert all(rows > 1 for rows in whole) and len(whole) >= seen
+            seen = len(whole)
+        if ended and seen == 60:
+            break
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    rows = table(out)
+    assert rows.recording.nunique() == 60 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.groupby("recording").size().nunique() == 1
+    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 60
+
+
+@pytest.mark.slow
+def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 30), tmp_path / "out"
+    (place / "auv0" / "no.mcap").write_text("no bag")
+    killed: list[int] = []
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, processes=True) as cluster,
+        distributed.Client(cluster, set_as_default=False) as watcher,
+    ):
+
+        def kill(share: float) -> None:
+            if len(killed) < 3 and share > 0.2 * (1 + len(killed)):
+                pids = watcher.run(os.getpid)
+                if pids:
+                    killed.append(next(iter(pids.values())))
+                    os.kill(killed[-1], signal.SIGKILL)
+
+        workers = Workers(dask=cluster.scheduler_address)
+        result = running.run_fleet([str(place)], out, dc.Parameters(), running.Given(), workers, None, kill)
+    assert len(killed) == 3 and result.calibrated == 31
+    rows = table(out)
+    assert rows.recording.nunique() == 31 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.error.notna().sum() == 1
+
+
+@pytest.mark.slow
+def test_a_thousand_recordings_take_no_more_memory_than_a_hundred(dives, tmp_path):
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 1000), tmp_path / "out"
+    script = (
+        "import resource, json, sys, time; from dvl_calib_ros.cli.main import main; start = time.time(); "
+        "code = main(['fleet', *sys.argv[1:]]); u = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, "
+        "resource.RUSAGE_CHILDREN)]; print(json.dumps([code, u[0].ru_maxrss, u[1].ru_maxrss]))"
+    )
+    largest = {}
+    for name, below in (("100", place / "auv0"), ("1000", place)):
+        done = subprocess.run(
+            [sys.executable, "-c", script, str(below), "--out", str(out.with_name(name))],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        code, *largest[name] = json.loads(done.stdout.splitlines()[-1])
+        assert code == 0
+    assert table(out.with_name("1000")).recording.nunique() == 1000
+    assert max(largest["1000"]) < 1.3 * max(largest["100"])
