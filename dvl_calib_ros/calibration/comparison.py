@@ -23,16 +23,19 @@ from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from .chi_square import chi2_sf
 from .extrinsics import (
+    GROUPS,
     LEVER_ARM,
+    MOUNTING,
     N_COMPONENTS,
+    ONLY_CLOCK,
+    ONLY_SCALE,
     SCALE,
     TIME_OFFSET,
     TURN,
     Extrinsics,
     rotation_of,
-    turn_between,
 )
-from .frames import Array
+from .frames import Array, rotation_vector
 
 # A difference that chance brings more seldom than this is none of chance, over all that is looked at together.
 CHANCE = 0.01
@@ -40,7 +43,6 @@ CHANCE = 0.01
 MOVED, SUSPICIOUS = chi2_sf(16.0, 1), chi2_sf(4.0, 1)
 
 _ALL = np.arange(N_COMPONENTS)
-MOUNTING, ONLY_SCALE, ONLY_CLOCK = _ALL[: LEVER_ARM.stop], _ALL[[SCALE]], _ALL[[TIME_OFFSET]]
 
 
 class ChiSquare(NamedTuple):
@@ -73,7 +75,7 @@ class Difference:
     @staticmethod
     def between(first: Extrinsics, second: Extrinsics) -> Difference:
         """What takes the first to the second."""
-        value = _values(second, first) - _values(first, first)
+        (value,) = _values([second], first) - _values([first], first)
         compared = first.shown & second.shown
         covariance = np.where(np.outer(compared, compared), first.covariance + second.covariance, 0.0)
         return Difference(first, second, np.where(compared, value, np.nan), covariance, compared)
@@ -231,15 +233,10 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     base = several[0]
     shown = np.any([each.shown for each in several], axis=0)
     covariance, found = np.zeros((N_COMPONENTS, N_COMPONENTS)), np.zeros(N_COMPONENTS)
-    values = [_values(each, base) for each in several]
-    for group in (MOUNTING, ONLY_SCALE, ONLY_CLOCK):
-        information, vector = np.zeros((N_COMPONENTS, N_COMPONENTS)), np.zeros(N_COMPONENTS)
-        for each, own_values in zip(several, values, strict=True):
-            index = group[each.shown[group]]
-            at = np.ix_(index, index)
-            own = np.linalg.inv(each.covariance[at])
-            information[at] += own
-            vector[index] += own @ own_values[index]
+    values = _values(several, base)
+    each_information = np.array([each.information for each in several])
+    information, vector = each_information.sum(axis=0), np.einsum("nij,nj->i", each_information, values)
+    for group in GROUPS:
         index = group[shown[group]]
         at = np.ix_(index, index)
         covariance[at] = np.linalg.inv(information[at])
@@ -276,10 +273,13 @@ class _Together:
         return self._known[key]
 
 
-def _values(each: Extrinsics, base: Extrinsics) -> Array:
-    """(8,) components, the turn being that from the mounting of `base`."""
-    turn = turn_between(base.rotation_body_from_dvl, each.rotation_body_from_dvl)
-    return np.array([*turn, *each.lever_arm, each.scale, each.time_offset])
+def _values(several: Sequence[Extrinsics], base: Extrinsics) -> Array:
+    """(N, 8) components, the turn being that from the mounting of `base`."""
+    values = np.array([each.components for each in several])
+    x, y, z, w = base.components[:4].tolist()
+    # quaternions times the conjugate of that of base
+    back = np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]])
+    return np.concatenate([rotation_vector(values[:, :4] @ back.T), values[:, 4:]], axis=1)
 
 
 def _changes(

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .comparison import CHANCE, MOUNTING, ONLY_CLOCK, ONLY_SCALE, Change, Comparison, Difference
-from .extrinsics import COMPONENTS, LEVER_ARM, SCALE, TIME_OFFSET, TURN
+from .comparison import CHANCE, Change, Comparison, Difference
+from .extrinsics import COMPONENTS, LEVER_ARM, MOUNTING, ONLY_CLOCK, ONLY_SCALE, SCALE, TIME_OFFSET, TURN
 from .frames import rpy_from_rotation
 
 # An axis that takes more than this share of a turn is the one that it is about.

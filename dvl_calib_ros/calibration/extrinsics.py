@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ COMPONENTS = (
 )  # fmt: skip
 N_COMPONENTS = len(COMPONENTS)
 TURN, LEVER_ARM, SCALE, TIME_OFFSET = slice(0, 3), slice(3, 6), 6, 7
+# What differences are told of, each by its marginal covariance: mounting, scale, delay
+MOUNTING, ONLY_SCALE, ONLY_CLOCK = GROUPS = np.arange(SCALE), np.array([SCALE]), np.array([TIME_OFFSET])
 # For derivatives by differences: of angles of some degrees exact to nine digits
 _STEP = 1e-6
 
@@ -73,6 +76,21 @@ class Extrinsics:
     shown: NDArray[np.bool_]
     used: int
     remarks: tuple[str, ...] = field(default=())
+
+    @cached_property
+    def information(self) -> Array:
+        """(8, 8) inverse of the covariance of what was shown: of mounting, scale and delay, each for itself."""
+        found = np.zeros((N_COMPONENTS, N_COMPONENTS))
+        for group in GROUPS:
+            at = np.ix_(group[self.shown[group]], group[self.shown[group]])
+            found[at] = np.linalg.inv(self.covariance[at])
+        return found
+
+    @cached_property
+    def components(self) -> Array:
+        """(9,) quaternion of the mounting (x, y, z, w), lever arm, scale and delay."""
+        quaternion = quaternion_from_rotation(self.rotation_body_from_dvl)
+        return np.array([*quaternion, *self.lever_arm, self.scale, self.time_offset])
 
     @property
     def std(self) -> Array:

@@ -115,8 +115,8 @@ _Files = tuple[str, dict[str, list[StoredFile]]]
 def _local_files(place: str, unread: list[str]) -> _Files:
     root = os.path.abspath(place.removeprefix("file://"))
     if os.path.isfile(root):
-        own = [_local_file(root)] if _is_of_a_recording(os.path.basename(root)) else []
-        return os.path.dirname(root), {os.path.dirname(root): own}
+        folder, name = os.path.split(root)
+        return folder, {folder: [_local_file(root)] if _is_of_a_recording(name) else []}
     if not os.path.isdir(root):
         raise InputError(f"{place}: no such folder or file; name where recordings are")
     files: dict[str, list[StoredFile]] = {}

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import MOUNTING, Comparison, Difference
+from ..calibration.comparison import Comparison, Difference
 from ..calibration.comparison_words import date, reasons, remarks
-from ..calibration.extrinsics import Extrinsics
+from ..calibration.extrinsics import MOUNTING, Extrinsics
 from ..calibration.frames import Array, rpy_from_rotation
 from .document import Answer, Document, Section, Sentence, Table, Where, figures, with_std
 

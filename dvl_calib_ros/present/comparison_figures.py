@@ -78,7 +78,8 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
         label = "changed" if index == 0 else None
         axes.axvline(sum(ends) / 2.0, color=_MOVED, linewidth=1.2, linestyle="--", label=label)
     if dated:
-        locator = AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
+        # with fewer it finds no interval that fits some spans, and warns
+        locator = AutoDateLocator(maxticks=11)  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_locator(locator)
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     else:
