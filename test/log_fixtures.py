@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 # 2021-11-29 12:31:11 UTC
@@ -61,7 +62,8 @@ def dataflash(path: Path) -> Path:
     return path
 
 
-def pd0(i: int, heading: int, pitch: int, roll: int) -> bytes:
+def pd0(i: int, heading: int, pitch: int, roll: int, nmea: Sequence[bytes] = ()) -> bytes:
+    """An ensemble of each 0.1 s. nmea: what `general_nmea` gives."""
     fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
     fixed[25] = 2 << 3
     struct.pack_into("<H", variable, 0, 0x0080)
@@ -69,14 +71,28 @@ def pd0(i: int, heading: int, pitch: int, roll: int) -> bytes:
     struct.pack_into("<H2h", variable, 18, heading, pitch, roll)
     struct.pack_into("<H", bottom, 0, 0x0600)
     struct.pack_into("<4h", bottom, 24, 10, -1500, 0, 0)
-    offsets = [12, 12 + 59, 12 + 59 + 65]
-    body = b"\x7f\x7f" + struct.pack("<HBB3H", 12 + 59 + 65 + 81, 0, 3, *offsets) + bytes(fixed + variable + bottom)
+    parts = [bytes(fixed), bytes(variable), bytes(bottom), *nmea]
+    offsets, at = [], 6 + 2 * len(parts)
+    for part in parts:
+        offsets.append(at)
+        at += len(part)
+    body = b"\x7f\x7f" + struct.pack(f"<HBB{len(parts)}H", at, 0, len(parts), *offsets) + b"".join(parts)
     return body + struct.pack("<H", sum(body) & 0xFFFF)
+
+
+def general_nmea(specific: int, body: bytes, delta: float) -> bytes:
+    """Data of ID 2022h, by the tables of bytes in RDI's guides."""
+    return struct.pack("<HHHd", 0x2022, specific, len(body), delta) + body
+
+
+def sentence(text: str) -> bytes:
+    """NMEA with its checksum, as received."""
+    checksum = 0
+    for character in text:
+        checksum ^= ord(character)
+    return f"${text}*{checksum:02X}\r\n".encode()
 
 
 def rmc(second: float, knots: str, course: str, status: str = "A") -> str:
     text = f"GNRMC,1231{second:05.2f},{status},5321.68,N,00630.34,W,{knots},{course},291121,,,A"
-    checksum = 0
-    for character in text:
-        checksum ^= ord(character)
-    return f"${text}*{checksum:02X}"
+    return sentence(text).decode().strip()

@@ -85,6 +85,15 @@ def rpy_from_rotation(rotation: ArrayLike) -> Array:
     return np.array([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
 
 
+def over_ground(speed: ArrayLike, course: ArrayLike) -> Array:
+    """East, north, up (..., 3) m/s of a speed (...) and a course (...) rad, from true north, clockwise.
+
+    Up is exactly 0, which marks an axis as not measured.
+    """
+    speed, course = np.asarray(speed, dtype=float), np.asarray(course, dtype=float)
+    return np.stack([speed * np.sin(course), speed * np.cos(course), np.zeros_like(course)], axis=-1)
+
+
 def whole_degrees(rotation: Array) -> tuple[float, float, float]:
     """Roll, pitch, yaw (rad) of a rotation (3, 3), to whole degrees."""
     roll, pitch, yaw = (np.radians(np.round(np.degrees(rpy_from_rotation(rotation)))) + 0.0).tolist()

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array
+from ..calibration.frames import FLU_FROM_FRD, Array, over_ground
 from ..calibration.samples import DvlSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from .attitudes import imu_samples
@@ -118,8 +118,8 @@ class _Read:
         if status < _FIX or not math.isfinite(speed + course_deg + down):
             self.left_out["without a fix"] += 1
             return
-        course = math.radians(course_deg)
-        self.fixes.append((stamp_ns, [speed * math.cos(course), speed * math.sin(course), down]))
+        east, north, _ = over_ground(speed, math.radians(course_deg)).tolist()
+        self.fixes.append((stamp_ns, [north, east, down]))
 
     def att(self, stamp_ns: int, m: Any) -> None:
         self.turned.append((stamp_ns, [math.radians(each) for each in (m.Roll, m.Pitch, m.Yaw)]))

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.frames import Array, over_ground
 from ..calibration.samples import ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from .attitudes import imu_samples
+from .nmea import KNOT
 from .trajectories import cells, numbers_of, stamps_ns
 
-KNOT = 1852.0 / 3600.0
 # Units that a column's name may hold, with what takes them to SI
 _UNITS = {"deg": math.pi / 180.0, "rad": 1.0, "mps": 1.0, "m/s": 1.0, "knots": KNOT, "kn": KNOT, "km/h": 1.0 / 3.6}
 
@@ -35,12 +35,11 @@ def names_columns(path: Path, *wanted: str) -> bool:
 def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list[ReferenceSample]:
     """Speed m/s and course (from true north, clockwise) as velocities in ENU without a vertical. Raises InputError."""
     time, values = _named(path, ("speed", "course"), notes)
-    speed, course = values.T
-    east, north = speed * np.sin(course), speed * np.cos(course)
+    velocities = over_ground(*values.T).tolist()
     covariance = np.eye(3) * std**2 if std else None
     return [
-        ReferenceSample(at, (x, y, 0.0), covariance, VelocityFrame.ENU)
-        for at, x, y in zip(stamps_ns(path, time, start_ns), east.tolist(), north.tolist(), strict=True)
+        ReferenceSample(at, (x, y, z), covariance, VelocityFrame.ENU)
+        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), velocities, strict=True)
     ]
 
 

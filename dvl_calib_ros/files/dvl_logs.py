@@ -4,9 +4,9 @@ Those of ArduPilot, which hold DVL, GNSS and attitude of one vehicle, are in `ar
 
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
-PD0 in instrument or ship axes (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is
-turned. Instrument axes are taken for ship's, as with beam 3 forward; a replay finds a DVL that is mounted otherwise.
-The attitude, where there is no other, is that of its own sensors.
+PD0 (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is turned. Instrument axes are
+taken for ship's, as with beam 3 forward; a replay finds a DVL that is mounted otherwise. Beams are resolved, and what
+the instrument turned into earth axes is turned back. The attitude, where there is no other, is that of its own sensors.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ..calibration.frames import FLU_FROM_FRD, Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from ..errors import InputError
 from .attitudes import imu_samples
+from .pd0_nmea import GENERAL_NMEA, Nmea
 
 PD0_START = b"\x7f\x7f"
 _DATAFLASH_START, _MAVLINK_STARTS = b"\xa3\x95", (b"\xfe", b"\xfd")
@@ -33,6 +34,8 @@ _DATAFLASH_START, _MAVLINK_STARTS = b"\xa3\x95", (b"\xfe", b"\xfd")
 _SNIFFED = 65536
 _FIXED_LEADER, _VARIABLE_LEADER, _BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
 _AXES = ("beam", "instrument", "ship", "earth")
+# Of the beams with the vertical, degrees, by the fixed leader's bits; of others it is said elsewhere in it
+_BEAM_ANGLES = {0: 15, 1: 20, 2: 30}
 # A velocity of a beam or axis that could not be measured, mm/s
 _BAD_VELOCITY = -32768
 # forward-left-up from RDI's starboard, forward, up
@@ -72,13 +75,14 @@ def _is_ardupilot_log(path: Path, start: bytes) -> bool:
 
 def read_dvl_log(path: Path) -> DvlLog:
     """Read a log of either kind. Raises InputError for what is none, or holds no velocity that can be used."""
-    content = path.read_bytes()
-    if _is_ardupilot_log(path, content):
+    with path.open("rb") as file:
+        start = file.read(_SNIFFED)
+    if _is_ardupilot_log(path, start):
         from .ardupilot_logs import read_ardupilot_log  # which gives this module's log
 
         log = read_ardupilot_log(path)
     else:
-        log = _read_json(path, content) if b'"vx"' in content[:_SNIFFED] else _read_pd0(path, content)
+        log = (_read_json if b'"vx"' in start else _read_pd0)(path, path.read_bytes())
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
         raise InputError(f"{path}: no velocity that can be used ({why})")
@@ -148,8 +152,8 @@ def _next_ensemble(content: bytes, start: int) -> tuple[int, int] | None:
     return None
 
 
-def _ensembles(content: bytes) -> Iterator[dict[int, bytes]]:
-    """Data of each whole ensemble, by the data's ID."""
+def _ensembles(content: bytes) -> Iterator[list[tuple[int, bytes]]]:
+    """ID and data of all that is in each whole ensemble."""
     start = 0
     while (found := _next_ensemble(content, start)) is not None:
         at, start = found
@@ -158,54 +162,118 @@ def _ensembles(content: bytes) -> Iterator[dict[int, bytes]]:
         if 6 + 2 * n_types > len(body):
             continue
         offsets = struct.unpack_from(f"<{n_types}H", body, 6)
-        yield {struct.unpack_from("<H", body, each)[0]: body[each:] for each in offsets if each + 2 <= len(body)}
+        yield [(struct.unpack_from("<H", body, each)[0], body[each:]) for each in offsets if each + 2 <= len(body)]
 
 
 def _read_pd0(path: Path, content: bytes) -> DvlLog:
     samples: list[DvlSample] = []
     attitudes: dict[int, tuple[float, float, float]] = {}
     left_out: Counter[str] = Counter()
-    for data in _ensembles(content):
+    nmea = Nmea()
+    for each in _ensembles(content):
+        data = dict(each)
         try:
-            sample = _pd0_sample(path, data, left_out)
-            if sample is not None:
-                samples.append(sample)
-                attitudes[sample.stamp_ns] = _pd0_attitude(data)
-        except (struct.error, IndexError, KeyError, ValueError):
+            stamp_ns = _pd0_stamp(data)
+            for identity, message in each:
+                if identity == GENERAL_NMEA:
+                    nmea.take(stamp_ns, message)
+            sample = _pd0_sample(path, stamp_ns, data, left_out)
+        except (struct.error, IndexError, KeyError, ValueError, ZeroDivisionError):
             left_out["damaged"] += 1
-    rpy = np.array([attitudes[at] for at in sorted(attitudes)]).reshape(-1, 3)
+            continue
+        attitude = _pd0_attitude(data)
+        if attitude is not None:
+            attitudes[stamp_ns] = attitude
+        if sample is not None:
+            samples.append(sample)
+    stamps, rpy, notes = _pd0_attitudes(path, attitudes, nmea)
+    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu_samples(stamps, rpy), notes)
+
+
+def _pd0_attitudes(
+    path: Path, attitudes: dict[int, tuple[float, float, float]], nmea: Nmea
+) -> tuple[list[int], Array, tuple[str, ...]]:
+    """Stamps, roll, pitch, heading (N, 3) rad, and where they come from."""
+    own = sorted(attitudes)
+    rpy = np.array([attitudes[at] for at in own]).reshape(-1, 3)
+    stamps, headings = nmea.headings()
+    if stamps and own:
+        at = np.array(stamps, dtype=np.int64) - own[0]
+        tilts = [np.interp(at, np.array(own, dtype=np.int64) - own[0], rpy[:, place]) for place in (0, 1)]
+        note = f"{path}: the heading is that of its HDT sentences, pitch and roll are the DVL's own"
+        return stamps, np.column_stack([*tilts, headings]), (note,)
     if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: what was typed in, or 0
-        return DvlLog(samples, left_out)
+        return [], rpy[:0], ()
     note = (
         f"{path}: heading, pitch and roll are those of the DVL's own sensors, the heading magnetic but for what "
         "was set (EB); give --attitude for another's"
     )
-    return DvlLog(samples, left_out, attitudes=imu_samples(sorted(attitudes), rpy), notes=(note,))
+    return own, rpy, (note,)
 
 
-def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float]:
-    """Roll, pitch, heading, rad. Pitch of a sensor that tilts with the DVL: tan P = tan T1 · cos T2 (RDI, "ADCP
-    Coordinate Transformation", 2008, eq. 19)."""
-    heading, tilt_1, tilt_2 = struct.unpack_from("<H2h", data[_VARIABLE_LEADER], 18)
+def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:
+    """Roll, pitch, heading, rad; None where the ensemble ends before. Pitch of a sensor that tilts with the DVL:
+    tan P = tan T1 · cos T2 (RDI, "ADCP Coordinate Transformation", 2008, eq. 19)."""
+    try:
+        heading, tilt_1, tilt_2 = struct.unpack_from("<H2h", data[_VARIABLE_LEADER], 18)
+    except struct.error:
+        return None
     roll = math.radians(0.01 * tilt_2)
     pitch = math.atan(math.tan(math.radians(0.01 * tilt_1)) * math.cos(roll))
     return roll, pitch, math.radians(0.01 * heading)
 
 
-def _pd0_sample(path: Path, data: dict[int, bytes], left_out: Counter[str]) -> DvlSample | None:
+def _pd0_stamp(data: dict[int, bytes]) -> int:
+    year, month, day, hour, minute, second, hundredths = data[_VARIABLE_LEADER][4:11]
+    # RDI's year has two digits; no DVL of before 2000 writes these
+    at = datetime(2000 + year, month, day, hour, minute, second, tzinfo=timezone.utc)
+    return int(at.timestamp()) * 1_000_000_000 + hundredths * 10_000_000
+
+
+def _pd0_sample(path: Path, stamp_ns: int, data: dict[int, bytes], left_out: Counter[str]) -> DvlSample | None:
     if _BOTTOM_TRACK not in data:
         left_out["without bottom track"] += 1
         return None
     axes = _AXES[data[_FIXED_LEADER][25] >> 3 & 3]
-    if axes not in ("instrument", "ship"):
-        raise InputError(f"{path}: velocities are in {axes} axes; set the DVL to instrument or ship axes (EX command)")
-    millimetres = struct.unpack_from("<3h", data[_BOTTOM_TRACK], 24)
-    if _BAD_VELOCITY in millimetres:
+    millimetres = struct.unpack_from("<4h", data[_BOTTOM_TRACK], 24)
+    if _BAD_VELOCITY in (millimetres if axes == "beam" else millimetres[:3]):
         left_out["without bottom lock"] += 1
         return None
-    year, month, day, hour, minute, second, hundredths = data[_VARIABLE_LEADER][4:11]
-    # RDI's year has two digits; no DVL of before 2000 writes these
-    at = datetime(2000 + year, month, day, hour, minute, second, tzinfo=timezone.utc)
-    stamp_ns = int(at.timestamp()) * 1_000_000_000 + hundredths * 10_000_000
-    x, y, z = (-0.001 * _FLU_FROM_RDI @ np.array(millimetres, dtype=float) + 0.0).tolist()
+    measured = np.array(millimetres, dtype=float)
+    if axes == "beam":
+        instrument = _instrument_from_beams(data[_FIXED_LEADER]) @ measured
+    elif axes == "earth":
+        attitude = _pd0_attitude(data)
+        if attitude is None:
+            left_out["in earth axes without a heading"] += 1
+            return None
+        instrument = _earth_from_ship(*attitude, data[_FIXED_LEADER]).T @ measured[:3]
+    else:
+        instrument = measured[:3]
+    x, y, z = (-0.001 * _FLU_FROM_RDI @ instrument + 0.0).tolist()
     return DvlSample(stamp_ns, (x, y, z), None)
+
+
+def _instrument_from_beams(fixed: bytes) -> Array:
+    """(3, 4), of four beams 90° apart (RDI, "ADCP Coordinate Transformation", 2008, eq. 2 to 4)."""
+    angle = math.radians(_BEAM_ANGLES.get(fixed[5] & 3, fixed[58] if len(fixed) > 58 else 0))
+    convex = 1.0 if fixed[4] & 8 else -1.0
+    a, b = convex / (2.0 * math.sin(angle)), 1.0 / (4.0 * math.cos(angle))
+    return np.array([[a, -a, 0.0, 0.0], [0.0, 0.0, -a, a], [b, b, b, b]])
+
+
+def _earth_from_ship(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
+    """(3, 3), as the instrument turned its velocities by its heading, and by its tilts where it was set to (the same,
+    eq. 18), which its transpose undoes whatever the heading is worth."""
+    if not fixed[25] & 4:
+        roll = pitch = 0.0
+    sh, ch, sp, cp, sr, cr = (
+        math.sin(heading), math.cos(heading), math.sin(pitch), math.cos(pitch), math.sin(roll), math.cos(roll),
+    )  # fmt: skip
+    return np.array(
+        [
+            [ch * cr + sh * sp * sr, sh * cp, ch * sr - sh * sp * cr],
+            [-sh * cr + ch * sp * sr, ch * cp, -sh * sr - ch * sp * cr],
+            [-cp * sr, sp, cp * cr],
+        ]
+    )

@@ -12,14 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ..calibration.frames import over_ground
 from ..calibration.samples import ReferenceSample, VelocityFrame
 from ..errors import InputError
-from .course_and_heading import KNOT
 
 _RMC = re.compile(rb"\$(\w{2}RMC,[^*\r\n]*)\*([0-9A-Fa-f]{2})")
 _SNIFFED = 65536
+KNOT = 1852.0 / 3600.0
 # Slower than this, m/s, a receiver gives no course, and none matters.
-_STANDING = 0.05
+STANDING = 0.05
 
 
 def is_nmea(path: Path) -> bool:
@@ -42,13 +43,13 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
     found: dict[int, ReferenceSample] = {}
     damaged = without = 0
     for text, checksum in _RMC.findall(path.read_bytes()):
-        if _xor(text) != int(checksum, 16):
+        if xor(text) != int(checksum, 16):
             damaged += 1
             continue
         try:
             fields = text.decode("ascii").split(",")
             speed = float(fields[7]) * KNOT
-            course = math.radians(float(fields[8])) if fields[8] or speed > _STANDING else 0.0
+            course = math.radians(float(fields[8])) if fields[8] or speed > STANDING else 0.0
             at = datetime.strptime(fields[9] + fields[1].partition(".")[0], "%d%m%y%H%M%S").replace(tzinfo=timezone.utc)
             fraction = float("0." + (fields[1].partition(".")[2] or "0"))
             if fields[2] != "A" or not 0.0 <= speed < 100.0:
@@ -57,8 +58,8 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
             without += 1
             continue
         stamp_ns = int(at.timestamp()) * 1_000_000_000 + round(fraction * 1e9)
-        velocity = speed * math.sin(course), speed * math.cos(course), 0.0
-        found[stamp_ns] = ReferenceSample(stamp_ns, velocity, covariance, VelocityFrame.ENU)
+        east, north, up = over_ground(speed, course).tolist()
+        found[stamp_ns] = ReferenceSample(stamp_ns, (east, north, up), covariance, VelocityFrame.ENU)
     if not found:
         raise InputError(f"{path}: no RMC sentence with a fix, time, date, speed and course in it")
     for count, why in ((damaged, "have a wrong checksum"), (without, "have no fix, time, speed or course")):
@@ -67,7 +68,8 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
     return [found[at] for at in sorted(found)]
 
 
-def _xor(text: bytes) -> int:
+def xor(text: bytes) -> int:
+    """A sentence's checksum: of all between $ and *."""
     value = 0
     for byte in text:
         value ^= byte

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.dvl_logs import is_dvl_log, read_dvl_log
 
 START_US = 1_638_191_471_563_017
@@ -38,19 +38,33 @@ def water_linked(path: Path, *lines: str) -> Path:
     return path
 
 
-def ensemble(millimetres: Sequence[int], hundredths: int, axes: int = 2, checksum: int = 0) -> bytes:
+def ensemble(
+    millimetres: Sequence[int],
+    hundredths: int,
+    axes: int = 2,
+    checksum: int = 0,
+    *,
+    configuration: tuple[int, int] = (0, 0),
+    flags: int = 0,
+    attitude: tuple[int, int, int] = (0, 0, 0),
+    length: int = 65,
+) -> bytes:
     """A PD0 ensemble with fixed leader, variable leader and bottom track, by the format's table of bytes."""
     fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
-    fixed[25] = axes << 3
+    fixed[4:6] = bytes(configuration)
+    fixed[25] = axes << 3 | flags
     struct.pack_into("<H", variable, 0, 0x0080)
     variable[4:11] = bytes([25, 11, 21, 10, 30, 15, hundredths])
+    struct.pack_into("<H2h", variable, 18, *attitude)
+    variable = variable[:length]
     struct.pack_into("<H", bottom, 0, 0x0600)
-    struct.pack_into("<4h", bottom, 24, *millimetres, 0)
+    struct.pack_into(f"<{len(millimetres)}h", bottom, 24, *millimetres)
+    # bottom track first, so that what is cut is at the end
     offsets, at = [], 6 + 2 * 3
-    for part in (fixed, variable, bottom):
+    for part in (fixed, bottom, variable):
         offsets.append(at)
         at += len(part)
-    body = b"\x7f\x7f" + struct.pack("<HBB3H", at, 0, 3, *offsets) + bytes(fixed + variable + bottom)
+    body = b"\x7f\x7f" + struct.pack("<HBB3H", at, 0, 3, *offsets) + bytes(fixed + bottom + variable)
     return body + struct.pack("<H", (sum(body) + checksum) & 0xFFFF)
 
 
@@ -99,12 +113,34 @@ def test_pd0_ensembles_with_a_wrong_checksum_or_without_lock_give_no_velocity(tm
     assert log.left_out == {"without bottom lock": 1}
 
 
-@pytest.mark.parametrize(("axes", "name"), [(0, "beam"), (3, "earth")])
-def test_pd0_in_axes_that_cannot_be_mounted_is_refused_with_what_to_set(tmp_path, axes, name):
-    path = tmp_path / "dive.pd0"
-    path.write_bytes(ensemble((0, -1000, 0), 1, axes=axes))
-    with pytest.raises(InputError, match=f"{name} axes; set the DVL to instrument or ship"):
-        read_dvl_log(path)
+def test_pd0_of_beams_is_resolved_by_their_angle(tmp_path):
+    """Beams of 20° to starboard, port, astern and ahead, as RDI's booklet numbers their velocities."""
+    out, up = np.sin(np.radians(20.0)), np.cos(np.radians(20.0))
+    beams = np.array([[out, 0.0, up], [-out, 0.0, up], [0.0, -out, up], [0.0, out, up]])
+    radial = np.round(beams @ [200.0, -1500.0, 30.0]).astype(int)
+    (tmp_path / "dive.pd0").write_bytes(ensemble(radial, 25, axes=0, configuration=(8, 1)))
+    (sample,) = read_dvl_log(tmp_path / "dive.pd0").samples
+    np.testing.assert_allclose(sample.velocity, (1.5, 0.2, -0.03), atol=3e-3)
+    (tmp_path / "dive.pd0").write_bytes(ensemble((*radial[:3], -32768), 25, axes=0) + ensemble(radial, 26, axes=2))
+    assert read_dvl_log(tmp_path / "dive.pd0").left_out == {"without bottom lock": 1}
+
+
+@pytest.mark.parametrize("tilts_used", [0, 4])
+def test_pd0_in_earth_axes_is_turned_back_as_the_instrument_turned_it(tmp_path, tilts_used):
+    heading, tilt, roll = 123.45, 8.0, -5.0
+    pitch = np.degrees(np.arctan(np.tan(np.radians(tilt)) * np.cos(np.radians(roll)))) if tilts_used else 0.0
+    turn = Rotation.from_euler("ZXY", [-heading, pitch, roll if tilts_used else 0.0], degrees=True)
+    earth = np.round(turn.apply([200.0, -1500.0, 30.0])).astype(int)
+    attitude = (round(100 * heading), round(100 * tilt), round(100 * roll))
+    (tmp_path / "dive.pd0").write_bytes(ensemble((*earth, 0), 25, axes=3, flags=tilts_used, attitude=attitude))
+    (sample,) = read_dvl_log(tmp_path / "dive.pd0").samples
+    np.testing.assert_allclose(sample.velocity, (1.5, 0.2, -0.03), atol=2e-3)
+
+
+def test_an_ensemble_that_ends_before_its_heading_is_a_velocity_and_no_damage(tmp_path):
+    (tmp_path / "dive.pd0").write_bytes(ensemble((0, -1000, 0), 1, length=16) + ensemble((0, -1000, 0), 2))
+    log = read_dvl_log(tmp_path / "dive.pd0")
+    assert len(log.samples) == 2 and not log.left_out
 
 
 @pytest.mark.parametrize("content", [b"", b"time,vx\n0,1\n", b"\x7f\x7f\x00\x00", bytes(range(256)) * 40])

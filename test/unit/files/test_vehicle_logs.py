@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import struct
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from log_fixtures import START_S, dataflash, pd0, rmc, telemetry
+from log_fixtures import START_S, dataflash, general_nmea, pd0, rmc, sentence, telemetry
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.frames import rotation_from_quaternion
@@ -69,6 +72,74 @@ def test_the_attitude_in_pd0_is_written_and_said_to_be_the_dvls_own(tmp_path, ca
     succeed(capsys, "import", path, "-o", tmp_path / "bag")
     path.write_bytes(b"".join(pd0(i, 0, 0, 0) for i in range(20)))
     assert not read_dvl_log(path).attitudes  # without a sensor
+
+
+def winriver(path: Path, kinds: Sequence[str], sign: float = -1.0) -> Path:
+    """Ensembles of 0.1 s with a receiver's 4 Hz: 2 m/s to the east, later north, and a heading of 45° and on.
+
+    sign: a sentence's time is that of its ensemble and so many times the difference.
+    """
+    messages: dict[int, list[bytes]] = {}
+    for n in range(80):
+        at = 0.25 * n + 0.013
+        i = math.ceil(10.0 * at - 1e-9)
+        delta = sign * (at - 0.1 * i)
+        course, knots = (90.0, 2.0 / KNOT) if n < 40 else (0.0, 2.0 / KNOT)
+        metres = min(at, 10.0) * 2.0, max(at - 10.0, 0.0) * 2.0
+        latitude, longitude = 53.0 + metres[1] / 111_300.0, 6.0 + metres[0] / 67_130.0
+        minutes = 60.0 * (latitude - 53.0), 60.0 * (longitude - 6.0)
+        known = {
+            "204": sentence(f"GPGGA,103015.0,53{minutes[0]:09.6f},N,006{minutes[1]:09.6f},E,4,9,0.9,1,M,1,M,,"),
+            "104": b"$GPGGA\0" + struct.pack("<10sdcdcB", b"103015.0", latitude, b"N", longitude, b"E", 4) + bytes(22),
+            "205": sentence(f"GPVTG,{course},T,,M,{knots:.5f},N,{1.852 * knots:.3f},K,D"),
+            "105": b"$GPVTG\0" + struct.pack("<fcfcfcfc", course, b"T", 0.0, b"M", knots, b"N", 1.852 * knots, b"K"),
+            "101": b"$GPVTG".ljust(10, b"\0") + struct.pack("<fcfcf", course, b"T", 0.0, b"M", knots) + b"N",
+            "207": sentence(f"HEHDT,{45.0 + 0.5 * n:.2f},T"),
+            "107": b"$HEHDT\0" + struct.pack("<dc", 45.0 + 0.5 * n, b"T"),
+        }
+        messages.setdefault(i, []).extend(general_nmea(int(kind), known[kind], delta) for kind in kinds)
+    path.write_bytes(b"".join(pd0(i, 1000 + i, 200, -300, messages.get(i, ())) for i in range(205)))
+    return path
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("kinds", [("204", "205", "207"), ("104", "105", "107"), ("101",), ("204",), ("104",)])
+def test_the_nmea_in_pd0_is_reference_and_heading(kinds, sign, tmp_path):
+    log = read_dvl_log(winriver(tmp_path / "dive.PD0", kinds, sign))
+    assert len(log.samples) == 205 and not log.left_out
+    start_ns = log.samples[0].stamp_ns
+    seconds = np.array([each.stamp_ns - start_ns for each in log.references]) * 1e-9
+    velocities = np.array([each.velocity for each in log.references])
+    steady = np.abs(seconds - 10.0) > 0.8
+    expected = np.where((seconds < 10.0)[:, None], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0])
+    np.testing.assert_allclose(velocities[steady], expected[steady], atol=0.02)
+    assert len(seconds) >= 75 and np.ptp(np.diff(seconds)) < 1e-6  # as evenly as they came
+    if "VTG" not in kinds and kinds[0][-1] == "5":
+        np.testing.assert_allclose(seconds[0], 0.013, atol=1e-6)
+    headings = [rotation_from_quaternion(each.orientation) for each in log.attitudes]
+    north = [90.0 - math.degrees(math.atan2(each[1, 0], each[0, 0])) for each in headings]
+    if "207" in kinds or "107" in kinds:
+        np.testing.assert_allclose(north, 45.0 + 0.5 * np.arange(80), atol=0.02)
+        assert math.degrees(math.asin(headings[9][2, 0])) == pytest.approx(2.0, abs=0.01)
+        assert "HDT" in log.notes[0]
+    else:
+        assert len(north) == 205 and "DVL's own sensors" in log.notes[0]
+
+
+def test_nmea_in_pd0_that_says_nothing_is_left_out_and_the_velocity_kept(tmp_path):
+    spoilt = [
+        general_nmea(205, sentence("GPVTG,,T,,M,9.0,N,,K,N"), 0.0),
+        general_nmea(205, sentence("GPVTG,90.0,T,,M,2.0,N,,K,D").replace(b"90", b"80"), 0.0),
+        general_nmea(204, sentence("GPGGA,103015.0,,,,,0,0,,,M,,M,,"), 0.0),
+        general_nmea(105, b"$GPVTG\0" + bytes(3), 0.0),
+        general_nmea(107, b"$HEHDT\0" + struct.pack("<d", math.nan), 0.0),
+        general_nmea(205, sentence("GPVTG,90.0,T,,M,2.0,N,,K,D"), 1e9),
+    ]
+    other = general_nmea(206, sentence("SDDBT,9.0,f,3.0,M,1.0,F"), 0.0)
+    (tmp_path / "dive.PD0").write_bytes(b"".join(pd0(i, 100 * i, 0, 0, [*spoilt, other]) for i in range(5)))
+    log = read_dvl_log(tmp_path / "dive.PD0")
+    assert len(log.samples) == 5 and not log.references
+    assert log.left_out == {"with NMEA that is damaged or empty": 5 * len(spoilt)}
 
 
 def test_rmc_sentences_are_horizontal_velocities_at_utc(tmp_path):

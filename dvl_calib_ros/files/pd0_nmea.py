@@ -1,0 +1,148 @@
+"""What WinRiver II and RDI's own receivers put into PD0 ensembles of NMEA: VTG, GGA and HDT, data ID 2022h.
+
+Text: "RiverPro and RioPro ADCP Guide" (Teledyne RDI, 2017), table 42; binary: "WinRiver II User's Guide", General NMEA
+Data Format. A sentence's time is that of its ensemble and how long before or after it was received. Which of the two
+the difference means is not said: the one by which sentences come more evenly.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..calibration.frames import Array, over_ground
+from ..calibration.samples import ReferenceSample, VelocityFrame
+from ..messages.fixes import FixDifference
+from .nmea import KNOT, STANDING, xor
+
+GENERAL_NMEA = 0x2022
+_HEAD = struct.Struct("<HHHd")  # data ID, specific ID, size of the message, difference of time
+_GGA, _VTG, _HDT = "GGA", "VTG", "HDT"
+_KINDS = {
+    4: _GGA, 5: _VTG, 100: _GGA, 101: _VTG, 103: _HDT, 104: _GGA, 105: _VTG, 107: _HDT, 204: _GGA, 205: _VTG, 207: _HDT
+}  # fmt: skip
+# Of binary messages: what follows a header of 10 characters (IDs below 104) or 7
+_BINARY = {_GGA: struct.Struct("<10sdcdcB"), _VTG: struct.Struct("<fcfcf"), _HDT: struct.Struct("<d")}
+_SENTENCE = re.compile(rb"\$\w{2}(GGA|VTG|HDT),([^*\r\n\0]*)(?:\*([0-9A-Fa-f]{2}))?")
+
+
+class Nmea:
+    """The NMEA of a file so far. left_out: sentences that gave nothing, by reason."""
+
+    def __init__(self) -> None:
+        self.left_out: Counter[str] = Counter()
+        self._found: dict[str, list[tuple[int, float, list[float]]]] = defaultdict(list)
+
+    def take(self, stamp_ns: int, data: bytes) -> None:
+        """One message of an ensemble of this time."""
+        try:
+            _, specific, size, delta = _HEAD.unpack_from(data)
+            kind = _KINDS.get(specific)
+            if kind is None:
+                return
+            values = _values(kind, specific, data[_HEAD.size : _HEAD.size + size])
+        except (struct.error, ValueError, IndexError):
+            self.left_out["with NMEA that is damaged or empty"] += 1
+            return
+        if abs(delta) < 3600.0 and np.isfinite(values).all():
+            self._found[kind].append((stamp_ns, delta, values))
+        else:
+            self.left_out["with NMEA that is damaged or empty"] += 1
+
+    def references(self) -> list[ReferenceSample]:
+        """Horizontal velocities: of VTG, else of the differences of GGA's positions."""
+        if self._found[_VTG]:
+            stamps, values = self._in_order(_VTG)
+            velocities = over_ground(values[:, 0], values[:, 1])
+        else:
+            stamps, velocities = _differences(*self._in_order(_GGA))
+        return [
+            ReferenceSample(at, (east, north, 0.0), None, VelocityFrame.ENU)
+            for at, (east, north, _) in zip(stamps, velocities.tolist(), strict=True)
+        ]
+
+    def headings(self) -> tuple[list[int], Array]:
+        """Stamps and headings (N,) rad, from true north, clockwise."""
+        stamps, values = self._in_order(_HDT)
+        return stamps, values[:, 0]
+
+    def _in_order(self, kind: str) -> tuple[list[int], Array]:
+        own = self._found[kind]
+        if not own:
+            return [], np.zeros((0, 2))
+        at = np.array([stamp_ns for stamp_ns, _, _ in own])
+        delta_ns = np.array([round(1e9 * delta) for _, delta, _ in own])
+        stamps = min((at - delta_ns, at + delta_ns), key=_unevenness)
+        stamps, index = np.unique(stamps, return_index=True)
+        return stamps.tolist(), np.array([own[i][2] for i in index])
+
+
+def _unevenness(stamps: np.ndarray) -> float:
+    steps = np.diff(np.sort(stamps))
+    return float(np.abs(steps - np.median(steps)).mean()) if len(steps) else 0.0
+
+
+def _values(kind: str, specific: int, body: bytes) -> list[float]:
+    """Speed m/s, course rad of VTG; latitude, longitude (degrees) of GGA; heading rad of HDT. Raises ValueError."""
+    text = body.rstrip(b"\0\r\n ")
+    sentence = _SENTENCE.match(text) if text.isascii() and b"\0" not in text else None
+    if sentence is not None:
+        return _of_text(kind, sentence)
+    header = 10 if 100 <= specific < 104 else 7
+    told = _BINARY[kind].unpack_from(body, header)
+    if kind == _VTG:
+        course, _, _, _, knots = told
+        return _over_ground(course, knots)
+    if kind == _HDT:
+        return [math.radians(told[0])]
+    _, latitude, south, longitude, west, quality = told
+    return _position(latitude, south, longitude, west, quality)
+
+
+def _of_text(kind: str, sentence: re.Match[bytes]) -> list[float]:
+    name, text, checksum = sentence.groups()
+    fields = text.decode("ascii").split(",")
+    whole = sentence[0][1:].partition(b"*")[0]
+    if name.decode() != kind or (checksum is not None and xor(whole) != int(checksum, 16)):
+        raise ValueError
+    if kind == _HDT:
+        return [math.radians(float(fields[0]))]
+    if kind == _VTG:
+        knots = float(fields[4])
+        return _over_ground(float(fields[0]) if fields[0] or knots * KNOT > STANDING else 0.0, knots)
+    latitude, longitude = (_degrees(fields[place]) for place in (1, 3))
+    return _position(latitude, fields[2].encode(), longitude, fields[4].encode(), int(fields[5]))
+
+
+def _degrees(text: str) -> float:
+    """NMEA's degrees and minutes (dddmm.mm) as degrees."""
+    whole, minutes = divmod(float(text), 100.0)
+    return whole + minutes / 60.0
+
+
+def _over_ground(course_deg: float, knots: float) -> list[float]:
+    if not (0.0 <= knots * KNOT < 100.0 and 0.0 <= course_deg <= 360.0):
+        raise ValueError
+    return [knots * KNOT, math.radians(course_deg)]
+
+
+def _position(latitude: float, south: bytes, longitude: float, west: bytes, quality: int) -> list[float]:
+    if not quality or abs(latitude) > 90.0 or abs(longitude) > 180.0:
+        raise ValueError
+    return [-latitude if south == b"S" else latitude, -longitude if west == b"W" else longitude]
+
+
+def _differences(stamps: Sequence[int], positions: Array) -> tuple[list[int], Array]:
+    """Velocities of the differences of positions (N, 2): stamps, (M, 3)."""
+    difference = FixDifference()
+    each = (
+        difference(at, latitude, longitude, 0.0, None)
+        for at, (latitude, longitude) in zip(stamps, positions.tolist(), strict=True)
+    )
+    found = [one for one in each if one is not None]
+    return [one.stamp_ns for one in found], np.array([one.velocity for one in found]).reshape(-1, 3)
