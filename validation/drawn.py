@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -63,7 +64,12 @@ class Judge:
                 return {**truth, "seed": seed, "verdict": "none", "said": said.strip().splitlines()[-1:]}
             document = yaml.safe_load(saved.read_text())
         mounting, verification = document["mounting"], document["verification"]
-        std = rpy_std_deg(mounting["corrected_rpy"], np.array(mounting["pose_covariance"])[3:, 3:]).tolist()
+        rpy, turned = mounting["corrected_rpy"], np.array(mounting["pose_covariance"])[3:, 3:]
+        std = rpy_std_deg(rpy, turned).tolist()
+        # what another day adds is none of this recording's, whose truth is one
+        of_days = (np.array(document["covariance"]) - np.array(document["covariance_of_recording"]))[:3, :3]
+        body_from_dvl = Rotation.from_euler("xyz", rpy).as_matrix()
+        own_std = rpy_std_deg(rpy, turned - body_from_dvl @ of_days @ body_from_dvl.T).tolist()
         off = [
             math.remainder(found - true, 360.0)
             for found, true in zip(np.degrees(mounting["corrected_rpy"]), truth["rpy_deg"], strict=True)
@@ -75,7 +81,7 @@ class Judge:
             **truth, "seed": seed, "verdict": verification["verdict"], "reason": verification["reasons"][0],
             "asked": truth["misalignment_deg"] >= ASKED_FROM_DEG
             and any(each.startswith(ASKED) for each in verification["reasons"]),
-            "model": document["model"], "off_deg": off, "std_deg": std,
+            "model": document["model"], "off_deg": off, "std_deg": std, "own_std_deg": own_std,
         }  # fmt: skip
 
     def is_wrong(self, result: Result) -> bool:
@@ -91,6 +97,7 @@ class Judge:
         wrong = [each for each in usable if self.is_wrong(each)]
         right = [each for each in results if each["verdict"] == "reject" and not self.is_wrong(each)]
         rejected = [each for each in right if not each["asked"]]
+        own = [each for each in usable if "own_std_deg" in each]
         lines = [
             f"usable and wrong: {share(len(wrong), len(usable))}",
             f"rejected though right: {share(len(rejected), len(results))}; {len(right) - len(rejected)} more as asked: "
@@ -101,6 +108,8 @@ class Judge:
                 if math.isfinite(self.least[i])
                 for of in [[(e["off_deg"][i], e["std_deg"][i]) for e in usable if i < len(e["off_deg"])]]
             ),
+            "yaw within 2 sigma of this recording alone: "
+            + share(sum(abs(each["off_deg"][2]) <= 2.0 * each["own_std_deg"][2] for each in own), len(own)),
             f"verdicts: {dict(Counter(each['verdict'] for each in results))}",
         ]
         for title, misses in (("wrong", wrong), ("rejected", rejected)):

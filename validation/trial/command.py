@@ -14,10 +14,10 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.present.document import Table as Shown
 from dvl_calib_ros.present.terminal import rich_table
 
-from .motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
+from .motion import BOAT, HELD_OUT_KINDS, RECORDED, TUNING_KINDS
 from .pairs_run import by_row, figures, misses, run_pairs, score_pair
 from .plan import KINDS, Case, Family, plan
-from .recorded import NO_RECORDINGS, has_ins, recordings_folder
+from .recorded import NO_RECORDINGS, has_boat, has_ins, recordings_folder
 from .run import Trial
 from .scored import join
 from .tables import score
@@ -79,6 +79,8 @@ def _run(arguments: argparse.Namespace) -> None:
         errors.print(f"[yellow]note:[/] {NO_RECORDINGS}")
     cases = plan(kinds, [Family(name) for name in arguments.family or FAMILIES])
     cases = [case for case in cases if case.category.value in (arguments.category or CATEGORIES)]
+    if not has_boat(recordings_folder()):
+        cases = [case for case in cases if case.kind != BOAT]
     if arguments.case:
         cases = _chosen(cases, arguments.case)
     elif not arguments.full:

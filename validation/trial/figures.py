@@ -17,7 +17,7 @@ from .plan import Family
 from .scored import Scored
 from .truth import Category
 
-AT_SEA = (Family.HALF_REAL, Family.HORIZONTAL, Family.SEVERAL)
+AT_SEA = (Family.HALF_REAL, Family.HORIZONTAL, Family.SEVERAL, Family.DISPLACED)
 # The error with what was said compensated may be so much larger than the possible one
 CLOSE_TO_POSSIBLE = 1.1
 # So far may the error that is said be from the true one: it is measured with one draw of the noise

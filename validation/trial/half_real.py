@@ -11,13 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from .motion import BOAT
 from .plan import Case, Family
-from .recorded import WITH_INS, WITHOUT_INS, recorded
+from .recorded import BY_BOAT, WITH_INS, WITHOUT_INS, by_boat, recorded
 from .simulated import Known, known_of_unknown, vehicle
 from .sizes import as_at_sea, direction, either, log_uniform, oddity, sized
 from .strength import OF_THE_DAY, Scene, Yardstick
 from .truth import Category
-from .vehicle import Values, of_one_recording
+from .vehicle import Faults, Values, of_one_recording
 
 # Every fault is at least so strong beside the others, and so far from every rival: wrong by chance in 1 of 700
 MIN_Q, MIN_DISTANCE = 12.0, 6.0
@@ -33,7 +34,9 @@ SMOOTHINGS = {True: (0.0, 0.7, 1.0), False: (0.7, 1.0, 1.5)}
 
 
 def scene(case: Case, rng: np.random.Generator) -> Scene:
-    """Draw motion, vehicle and instruments, with all axes."""
+    """Draw motion, vehicle and instruments; with all axes but of a DVL that is far from the reference."""
+    if case.family is Family.DISPLACED:
+        return _displaced_scene(case, rng)
     n = int(rng.integers(2, 5)) if case.family is Family.SEVERAL else 1
     one_hz, same_instants = rng.uniform() < ONE_HZ_SHARE, rng.uniform() < 0.5
     rate = 1.0 if one_hz else 5.0
@@ -54,6 +57,23 @@ def scene(case: Case, rng: np.random.Generator) -> Scene:
         vertical=str(rng.choice(HORIZONTAL)) if rng.uniform() < HORIZONTAL_SHARE and n > 1 else "",
         days=n > 1,
         sources=sources,
+    )
+
+
+def _displaced_scene(case: Case, rng: np.random.Generator) -> Scene:
+    motion = by_boat(str(rng.choice(BY_BOAT))) if case.kind == BOAT else recorded(*_sources(1, rng)[0])
+    dvl_rate, gnss_rate = (float(rng.choice([1.0, 2.0, 5.0, 10.0])) for _ in range(2))
+    return Scene(
+        motions=(motion,),
+        vehicle=vehicle(rng),
+        dvl_rate=dvl_rate,
+        gnss_rate=gnss_rate,
+        beam_std=log_uniform(rng, 0.002, 0.01),
+        gnss_std=log_uniform(rng, 0.005, 0.03),
+        in_body=False,
+        gnss_phase_s=float(rng.uniform(0.0, 1.0 / gnss_rate)),
+        imu_rate=float(rng.choice([5.0, 20.0])),
+        vertical=str(rng.choice(HORIZONTAL)),
     )
 
 
@@ -82,6 +102,8 @@ def faults(case: Case, drawn: Scene, rng: np.random.Generator) -> Known | None:
     if case.category is Category.UNKNOWN:
         return _unknown(case, drawn, rng)
     several = case.family is Family.SEVERAL
+    if case.family is Family.DISPLACED:
+        return _apart(Yardstick(drawn), _displaced(case, drawn, rng))
     horizontal = Yardstick(drawn if drawn.vertical or several else replace(drawn, vertical=HORIZONTAL[0]))
     drawn_faults: dict[str, Values] = {}
     for name, is_small in _several_names(case, rng) if several else _names(case, rng):
@@ -92,9 +114,14 @@ def faults(case: Case, drawn: Scene, rng: np.random.Generator) -> Known | None:
             drawn_faults[name] = sized(horizontal, name, q, small, {k: v for k, v in drawn_faults.items() if k != name})
         if not drawn_faults[name]:
             return None
-    if any(horizontal.q_beside(name, drawn_faults) < MIN_Q for name in drawn_faults):
+    return _apart(horizontal, drawn_faults)
+
+
+def _apart(yardstick: Yardstick, drawn_faults: Faults) -> Known | None:
+    """The faults, and how far each is from all others; None where the data could not tell."""
+    if any(yardstick.q_beside(name, drawn_faults) < MIN_Q for name in drawn_faults):
         return None
-    apart = horizontal.apart(drawn_faults)
+    apart = yardstick.apart(drawn_faults)
     nearest: dict[str, float] = {}
     for each in apart.values():
         for rival, left in each.distances.items():
@@ -116,6 +143,23 @@ def _names(case: Case, rng: np.random.Generator) -> list[tuple[str, bool]]:
     if case.category is Category.PAIR:
         return [(names[int(rng.integers(2))], False), third]
     return [*((name, False) for name in names), third]
+
+
+def _displaced(case: Case, drawn: Scene, rng: np.random.Generator) -> Faults:
+    """A long lever arm, and what the name of the case says is beside it."""
+    beside, far = case.name.split("+"), rng.normal(size=3) * [1.0, 0.5, 0.3]
+    far *= rng.uniform(0.5, 3.5) / np.linalg.norm(far)
+    drawn_faults: dict[str, Values] = {"lever_arm": dict(zip(("x_m", "y_m", "z_m"), far.tolist(), strict=True))}
+    if "lag" in beside:
+        drawn_faults["reference_lag"] = {"time_constant_s": float(rng.uniform(0.3, 1.5))}
+    if "late" in beside:
+        drawn_faults[str(rng.choice(OFFSETS[:2]))] = {"seconds": either(rng, 0.2, 2.0)}
+    if "leap" in beside or "leaps" in beside:
+        seconds = drawn.motions[0].seconds
+        leap = {"seconds": either(rng, 0.3, 2.0), "at_s": float(rng.uniform(0.25, 0.45)) * seconds}
+        again = {"again_seconds": either(rng, 0.3, 2.0), "again_at_s": float(rng.uniform(0.55, 0.75)) * seconds}
+        drawn_faults["time_offset_jump"] = {**leap, **(again if "leaps" in beside else {})}
+    return drawn_faults
 
 
 def _several_names(case: Case, rng: np.random.Generator) -> list[tuple[str, bool]]:

@@ -197,8 +197,8 @@ ROUNDS: Mapping[str, Round] = {
     "straight": _straight,
     "one_speed_box": _one_speed_box,
 }
-# Real motion
-RECORDED = "snapir"
+# Real motion: of an AUV in the sea, and of a boat on a lake
+RECORDED, BOAT = "snapir", "caputh"
 # What the diagnosis may be tuned on, and what is kept from that
 TUNING_KINDS = ("box", "lawnmower", "figure8", "zigzag")
 HELD_OUT_KINDS = ("free", "spiral", RECORDED)

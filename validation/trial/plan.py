@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from .motion import HELD_OUT_KINDS, RECORDED, TUNING_KINDS
+from .motion import BOAT, HELD_OUT_KINDS, RECORDED, TUNING_KINDS
 from .truth import Category
 from .vehicle import ODDITIES, of_one_recording
 
@@ -22,6 +23,9 @@ STRAIGHT, ONE_SPEED_BOX = "straight", "one_speed_box"
 HIDDEN = ("velocity_bias", "quadratic_scale", "mount_flexure", "water_lock", "heading_error", "lever_arm")
 ALIKE = ("lever_arm", "sideslip")
 KINDS = (*TUNING_KINDS, *HELD_OUT_KINDS)
+# What a DVL far from the reference has beside its lever arm, in all combinations: a reference that lags, stamps of one
+# of both that are late, stamps that leap once or twice
+BESIDE_THE_ARM = ("lag", "late", "leap", "leaps")
 # Seen by the vertical alone, or not at all in how the sea trials move
 NOT_AT_SEA = ("slow_heave", "roll_rate_surge")
 # Keyed apart from the seed of a trial: a longer trial with the same seed has the shorter one in it
@@ -33,13 +37,15 @@ class Family(str, Enum):
 
     simulated: manoeuvres of a simulated body, faults of a strength wanted. half_real: motion recorded at sea, faults as
     large as at sea. horizontal: the same, with a reference that does not measure the vertical. several: several
-    recordings at sea of one vehicle, each on a day with time offsets of its own.
+    recordings at sea of one vehicle, each on a day with time offsets of its own. displaced: real motion, of the boat as
+    well, a DVL up to 3.5 m from a horizontal reference, with lags, delays and leaps, at 1 to 10 Hz.
     """
 
     SIMULATED = "simulated"
     HALF_REAL = "half_real"
     HORIZONTAL = "horizontal"
     SEVERAL = "several"
+    DISPLACED = "displaced"
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,7 @@ def plan(kinds: Sequence[str] = KINDS, families: Sequence[Family] = tuple(Family
 
     Families take turns as long as they have cases; what is at sea goes with the kind `RECORDED`.
     """
-    wanted = {*kinds, STRAIGHT, ONE_SPEED_BOX}
+    wanted = {*kinds, STRAIGHT, ONE_SPEED_BOX, *([BOAT] if RECORDED in kinds else [])}
     half_real = _mixed(
         _nulls_at_sea(), _hard_nulls_at_sea(), _singles_at_sea(), _several_faults_at_sea(), _unknowns_at_sea()
     )
@@ -101,6 +107,7 @@ def plan(kinds: Sequence[str] = KINDS, families: Sequence[Family] = tuple(Family
         Family.HALF_REAL: half_real,
         Family.HORIZONTAL: [replace(case, family=Family.HORIZONTAL) for case in half_real],
         Family.SEVERAL: _mixed(*_groups()),
+        Family.DISPLACED: _mixed(_displaced(RECORDED, 8), _displaced(BOAT, 8), _displaced_nulls()),
     }  # fmt: skip
     turns = [
         (turn, list(Family).index(family), case)
@@ -195,6 +202,30 @@ def _several_faults_at_sea() -> list[Case]:
 def _unknowns_at_sea() -> list[Case]:
     names = [name for name in ODDITIES if name not in NOT_AT_SEA]
     return [case for name in names for q in UNKNOWN_STRENGTHS for case in _at_sea(Category.UNKNOWN, 4, name, q)]
+
+
+def _displaced(kind: str, n: int) -> list[Case]:
+    """n cases of each combination of what is beside the arm; a clock leaps once or twice, not both."""
+    category = {0: Category.SINGLE, 1: Category.PAIR}
+    combinations = [
+        names
+        for size in range(len(BESIDE_THE_ARM))
+        for names in itertools.combinations(BESIDE_THE_ARM, size)
+        if not {"leap", "leaps"} <= {*names}
+    ]
+    return [
+        Case(category.get(len(names), Category.TRIPLE), kind, "+".join(names), number=number, family=Family.DISPLACED)
+        for names in combinations
+        for number in range(n)
+    ]
+
+
+def _displaced_nulls() -> list[Case]:
+    return [
+        Case(Category.NULL, kind, number=number, family=Family.DISPLACED)
+        for kind in (RECORDED, BOAT)
+        for number in range(10)
+    ]
 
 
 def _groups() -> list[list[Case]]:

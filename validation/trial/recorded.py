@@ -19,12 +19,14 @@ from dvl_calib_ros.errors import InputError
 
 from .motion import MARGIN_S, RATE_HZ, Floats, Motion, attitude, sampled_motion
 
-DVL_FOLDER, INS_FOLDER = "snapir", "snapir_ins"
+DVL_FOLDER, INS_FOLDER, BOAT_FOLDER = "snapir", "snapir_ins", "caputh"
 # T11 and T13 hardly turn
 RECORDINGS = tuple(f"T{number:02d}" for number in range(1, 11))
 # Velocity by the inertial system, whose noise is small; of the others there is that by the DVL only
 WITH_INS = ("T01", "T03", "T05", "T09")
 WITHOUT_INS = ("T02", "T04", "T06", "T07", "T08", "T10", "T12")
+# A boat that goes at one speed, at 1 Hz as well; a third one is too short
+BY_BOAT = ("20250117163514", "20250117164453")
 # Recorded at 1 Hz: what changes faster than this is noise of the recording as much as motion
 SMOOTHING_S = 1.5
 NO_RECORDINGS = "no recorded sea trials; name the folder that has data/snapir and data/snapir_ins in DVL_CALIB_SHARED"
@@ -42,6 +44,11 @@ def recordings_folder() -> Path | None:
     else:
         folder = Path(__file__).resolve().parents[3] / "shared" / "data"
     return folder if (folder / DVL_FOLDER / "T01_attitude.csv").is_file() else None
+
+
+def has_boat(folder: Path | None) -> bool:
+    """Whether the recordings of the boat are there, too."""
+    return folder is not None and (folder / BOAT_FOLDER / f"{BY_BOAT[0]}_dvl.csv").is_file()
 
 
 def has_ins(folder: Path | None) -> bool:
@@ -68,9 +75,31 @@ def recorded(name: str, smoothing_s: float = SMOOTHING_S, by_ins: bool = False) 
                          smoothing_s)  # fmt: skip
     start = max(seconds[0], at[0]) + MARGIN_S
     length = float(min(seconds[-1], at[-1]) - MARGIN_S - start)
+    return _motion(angles, velocities, start, length, in_body=not by_ins)
+
+
+@cache
+def by_boat(name: str, smoothing_s: float = SMOOTHING_S) -> Motion:
+    """The motion of a run of the boat, less MARGIN_S at both ends. Raises InputError where it is not there.
+
+    Its compass is taken for the truth: what moves is real, where it points need not be.
+    """
+    folder = recordings_folder()
+    if folder is None or not has_boat(folder):
+        raise InputError(NO_RECORDINGS)
+    seconds, angles_deg = _columns(folder / BOAT_FOLDER / f"{name}_attitude.csv")
+    at, velocity = _columns(folder / BOAT_FOLDER / f"{name}_dvl.csv")
+    yaw, pitch, roll = np.unwrap(np.radians(angles_deg), axis=0).T
+    start = max(seconds[0], at[0]) + MARGIN_S
+    length = float(min(seconds[-1], at[-1]) - MARGIN_S - start)
+    angles = _spline(seconds, np.column_stack([np.pi / 2 - yaw, -pitch, roll]), smoothing_s)
+    return _motion(angles, _spline(at, velocity, smoothing_s), start, length, in_body=True)
+
+
+def _motion(angles: CubicSpline, velocities: CubicSpline, start: float, length: float, in_body: bool) -> Motion:
     time = np.arange(-MARGIN_S, length + MARGIN_S, 1.0 / RATE_HZ)
     euler, moving = angles(time + start), velocities(time + start)
-    return sampled_motion(length, time, moving if by_ins else attitude(euler).apply(moving), euler)
+    return sampled_motion(length, time, attitude(euler).apply(moving) if in_body else moving, euler)
 
 
 def _spline(seconds: Floats, columns: Floats, smoothing_s: float) -> CubicSpline:

@@ -11,7 +11,7 @@ MAX_STEPS = 8
 ALWAYS_S = 1e6
 TOLERANCE = 0.005  # of q
 # Parameters that say when, which no strength scales
-TIMES = frozenset({"from_s", "to_s", "at_s", "from_recording"})
+TIMES = frozenset({"from_s", "to_s", "at_s", "from_recording", "again_at_s"})
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

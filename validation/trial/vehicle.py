@@ -210,6 +210,7 @@ def dvl_stamps(times: Floats, faults: Faults) -> Floats:
     late = np.full(len(times), faults.get("dvl_time_offset", {}).get("seconds", 0.0))
     if jump := faults.get("time_offset_jump"):
         late += jump["seconds"] * (since >= jump["at_s"])
+        late += jump.get("again_seconds", 0.0) * (since >= jump.get("again_at_s", 0.0))
     gain = faults.get("clock_drift", {}).get("seconds_per_hour", 0.0) / HOUR_S  # per hour of its own
     return np.asarray(times + late + gain / (1.0 - gain) * since)
 
