@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..calibration.frames import Array
+from ..calibration.samples import Index
 from ..effects.base import Effect
 from .composed import Values
 from .fitting import Fit, Fitter
@@ -15,6 +16,8 @@ from .registered import FirstGuess
 from .settings import SETTINGS
 
 ARM = "lever_arm"
+# A part of the arm is a clock's as well if, with clocks free, it is known so many times worse, and not to so many σ.
+WORSE, SHOWN = 2.0, 2.0
 CLOCKS = ("dvl_time_offset", "reference_time_offset")
 
 
@@ -61,6 +64,32 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
         return fit
     found = fitter.fit_kept(fit.hypothesis.with_effects(wanted, len(guesses), start), fit.noise)
     return found if found.deviance < fit.deviance + SETTINGS.indistinguishable else fit
+
+
+def with_clocks(
+    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], block: Index
+) -> Fit:
+    """The fit with both clocks beside the lever arm that it has, if a part of that is as likely theirs; else the fit.
+
+    block: (M,), of each bin, by which σ is found.
+
+    A boat at 0.87 m/s whose DVL sits 0.3 m astern and one whose compass is 0.35 s late look alike, but where it slows
+    down; and what turns make of the instruments there, a model that has no clocks calls the arm's.
+    """
+    present = [effect.name for effect in fit.effects]
+    clocks = [effects[name] for name in CLOCKS if name in effects and name not in present]
+    if ARM not in present or not clocks or not is_open(guesses):
+        return fit
+    joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], len(fit.seen), {}), fit.noise)
+    (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
+    was_shown, is_shown = np.abs(own) > SHOWN * own_std, np.abs(free) > SHOWN * free_std
+    return joint if bool((was_shown & ~is_shown & (free_std > WORSE * own_std)).any()) else fit
+
+
+def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
+    """The parameters (p,) of the lever arm and their σ (p,), as blocks scatter."""
+    at = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == ARM]
+    return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
 
 
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..effects.base import Effect
-from .clock_or_arm import ARM, is_open, with_arm
+from .clock_or_arm import ARM, is_open, with_arm, with_clocks
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
@@ -32,7 +32,10 @@ from .settings import SETTINGS
 from .shown import shown_parts
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
-START = ("lever_arm", "dvl_time_offset", "reference_time_offset")
+START = (ARM, "dvl_time_offset", "reference_time_offset")
+ARM_PARAMETERS = "x_m", "y_m", "z_m"
+# A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
+GUESSED_STD_M = 0.2
 # Parts of the run at whose ends effects that come and go are tried to begin or end, and how many of these are kept
 WINDOW_STEPS, KEPT_VARIANTS = 10, 2
 # Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
@@ -98,8 +101,18 @@ def started(
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
     effects = shown_parts(effects, problem)
     lever = np.median([guess.lever_arm for guess in guesses], axis=0)
+    arm = {name: float(value) for name, value in zip(ARM_PARAMETERS, lever, strict=True)}
+    if ARM in effects:
+        shown_of_arm = {spec.name for spec in effects[ARM].parameters}
+        stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
+        std = np.min(stds, axis=0) if stds else np.full(3, np.inf)
+        # what is not shown stays as it is guessed: a height of 5 m for one of 1 turns the rest of the arm
+        arm = {
+            name: value if name in shown_of_arm or own < GUESSED_STD_M else 0.0
+            for (name, value), own in zip(arm.items(), std.tolist(), strict=True)
+        }
     found: dict[str, tuple[Values, ...]] = {
-        "lever_arm": ({"x_m": float(lever[0]), "y_m": float(lever[1]), "z_m": float(lever[2])},) * len(guesses),
+        ARM: (arm,) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
         "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
     }
@@ -143,11 +156,13 @@ def select(
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
     fitter, fit = _about(fitter, fit, every)
-    fit = with_arm(fitter, fit, guesses, effects)
+    told = with_arm(fitter, fit, guesses, effects)
+    fit = with_clocks(fitter, told, guesses, effects, blocks_of(fitter.problem))
+    added = [effect.name for effect in fit.effects if effect not in told.effects]
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects))
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), added)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_either_clock(each) for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
@@ -453,12 +468,17 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         weak = [
             (rest.deviance, rest)
             for effect, rest in rests
-            if _log_p(fit, rest, effect) > threshold or rest.deviance - fit.deviance < SETTINGS.ghost_share * explained
+            if _log_p(fit, rest, effect) > threshold or _is_ghost(rest.deviance - fit.deviance, explained, fit.deviance)
         ]
         if not weak:
             return fit
         fit = min(weak, key=lambda each: each[0])[1]
     return fit
+
+
+def _is_ghost(drop: float, explained: float, left: float) -> bool:
+    """Whether an effect adds next to nothing to what all of them explain, and to the noise that is left."""
+    return drop < SETTINGS.ghost_share * explained and drop < SETTINGS.ghost_of_noise * left
 
 
 def _borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
@@ -526,8 +546,10 @@ def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapp
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
-def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int) -> list[Selected]:
-    """Lever arm and clock as one where each would do without the other."""
+def _clock_or_arm(
+    fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int, added: Sequence[str]
+) -> list[Selected]:
+    """Lever arm and clock as one where each would do without the other. added: clocks as of `with_clocks`."""
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
     def is_shown(each: Selected) -> bool:
@@ -537,15 +559,19 @@ def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects:
     arm, clocks = own.get(ARM), [own[name] for name in CLOCKS[:2] if name in own]
     if arm is None or not clocks:
         return selected
-    clock = min(clocks, key=lambda each: each.log_p)
-    if is_shown(arm) and is_shown(clock):
-        return selected
-    one, other = (arm, clock) if is_shown(arm) else (clock, arm)
-    rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
+    if not added:
+        clock = min(clocks, key=lambda each: each.log_p)
+        if is_shown(arm) and is_shown(clock):
+            return selected
+        one, others = (arm, [clock]) if is_shown(arm) else (clock, [arm])
+    else:
+        one, others = arm, [own[name] for name in added]
+    rest = [effect for effect in fit.effects if effect not in [each.effect for each in (one, *others)]]
     without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
     log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
-    equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
-    return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
+    equivalent = dict.fromkeys([*(each.effect.name for each in others), *one.equivalent])
+    kept = [each for each in selected if each not in (one, *others)]
+    return [Selected(one.effect, log_p, tuple(equivalent)), *kept]
 
 
 def _either_clock(selected: Selected) -> Selected:

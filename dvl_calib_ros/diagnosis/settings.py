@@ -21,7 +21,8 @@ class DiagnosisSettings:
 
     Finding: level: family-wise, of the claim that
     there is an effect. max_effects: named at most. ghost_share: of what is explained already that a further effect
-    must add; less is what the inexactness of a strong one leaves. indistinguishable: deviance within which two
+    must add; less is what the inexactness of a strong one leaves, unless it is more than ghost_of_noise of the noise's
+    deviance: without it that would be an error that nothing explains. indistinguishable: deviance within which two
     explanations are one answer: with truth j and a rival that looks better by d, the odds are those of a normal
     variable beyond √d. robust_level: p of an effect by the scatter of its blocks, a test with few degrees of freedom
     that no colour of the noise upsets.
@@ -50,6 +51,7 @@ class DiagnosisSettings:
     level: float = 0.008
     max_effects: int = 4
     ghost_share: float = 0.0008
+    ghost_of_noise: float = 0.25
     indistinguishable: float = 6.0
     robust_level: float = 0.0005
     block: float = 20.0
