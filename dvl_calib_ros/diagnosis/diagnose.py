@@ -20,11 +20,11 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_or_arm import ARM, combination
+from .clock_or_arm import ARM, CLOCKS, Combination, combination
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
-from .fitting import prior_std
+from .fitting import Fit, prior_std
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
 from .recordings import RecordedStreams, load_recordings
@@ -274,8 +274,16 @@ def _found(selection: EffectSelection, selected: Selected, covariance: Array, n_
         closure_alone(selection, gap, effect.name),
         min(1.0, float(np.exp(selected.log_p)) * n_tested),
         {names[recording]: parameters for recording, parameters in ordered.items()} if is_of_each else {},
-        combination(fit, covariance, effect.name) if ARM in selected.equivalent else None,
+        _known_together(fit, covariance, selected),
     )
+
+
+def _known_together(fit: Fit, covariance: Array, selected: Selected) -> Combination | None:
+    """What is known of a lever arm and a clock that are one to the data; of several clocks by that which tells most."""
+    name, others = selected.effect.name, selected.equivalent
+    clocks = [name] if ARM in others else [each for each in others if each in CLOCKS] if name == ARM else []
+    known = [found for clock in clocks if (found := combination(fit, covariance, clock)) is not None]
+    return min(known, key=lambda each: each.value[2] - each.value[1], default=None)
 
 
 def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:

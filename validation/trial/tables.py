@@ -34,7 +34,9 @@ the diagnosis, and the truth stays sealed until the answers are there.
 Families: *simulated* manoeuvres with effects of a strength q wanted; *half_real*: motion recorded at sea, a DVL
 computed exactly from it, effects as large as at sea; *horizontal*: the same cases with a reference that does not
 measure the vertical; *several*: two to four recordings of one vehicle, a delay of its own each day, and a mounting that
-may have moved. At sea every effect is drawn so that it can be known (q of 12 or more beside the others, 6 standard
+may have moved; *displaced*: motion of the sea and of a boat, a DVL up to 3.5 m from a horizontal reference that lags,
+clocks that are late, stamps that leap once or twice. At sea every effect
+is drawn so that it can be known (q of 12 or more beside the others, 6 standard
 deviations from every rival). *Error after over the possible*: with what was said compensated, over with the truth
 compensated, both with the noise in them. *Theory*: what the best test could do. Bounds are exact
 (Clopper-Pearson), 95 %.

@@ -17,6 +17,7 @@ from validation.trial import generator, recorded
 from validation.trial.cases import draw
 from validation.trial.generator import VERTICALS, Noise
 from validation.trial.half_real import HORIZONTAL, MIN_DISTANCE, MIN_Q
+from validation.trial.motion import BOAT
 from validation.trial.plan import Case, Family, plan
 from validation.trial.recorded import recordings_folder
 from validation.trial.strength import Yardstick
@@ -181,3 +182,22 @@ def test_without_the_recordings_their_cases_are_left_out_and_told(tmp_path, monk
         capture_output=True, text=True, check=False, cwd=ROOT,
     )  # fmt: skip
     assert done.returncode == 0 and recorded.NO_RECORDINGS.split(";")[0] in done.stderr
+
+
+def test_a_displaced_dvl_has_what_its_name_says_beside_a_long_arm_and_a_horizontal_reference():
+    displaced = Case(Category.TRIPLE, KIND, "lag+late+leaps", number=1, family=Family.DISPLACED)
+    drawn = draw(displaced, 0)
+    assert {"lever_arm", "reference_lag", "time_offset_jump"} < set(drawn.faults) and len(drawn.faults) == 4
+    assert 0.5 <= np.linalg.norm(list(drawn.faults["lever_arm"].values())) <= 3.5
+    assert drawn.scene.vertical in HORIZONTAL and min(drawn.truth.distances.values()) >= MIN_DISTANCE
+    leap = drawn.faults["time_offset_jump"]
+    times = np.array([0.0, leap["at_s"] + 1.0, leap["again_at_s"] + 1.0])
+    late = dvl_stamps(times, {"time_offset_jump": leap}) - times
+    assert late == pytest.approx([0.0, leap["seconds"], leap["seconds"] + leap["again_seconds"]])
+
+
+def test_a_displaced_dvl_of_the_boat_moves_as_the_boat_does():
+    if not recorded.has_boat(recordings_folder()):
+        pytest.skip("no recordings of the boat")
+    motion = draw(Case(Category.NULL, BOAT, family=Family.DISPLACED), 0).scene.motions[0]
+    assert 0.8 < np.median(motion.at(np.arange(0.0, motion.seconds)).speed) < 0.9
