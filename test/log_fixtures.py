@@ -80,6 +80,32 @@ def pd0(i: int, heading: int, pitch: int, roll: int, nmea: Sequence[bytes] = ())
     return body + struct.pack("<H", sum(body) & 0xFFFF)
 
 
+def nortek(
+    i: int,
+    velocity: Sequence[float],
+    late: float = 0.0,
+    status: int = 0xFFFFF,
+    fom: float = 0.004,
+    identity: int = 0x1B,
+) -> bytes:
+    """A record of each 0.125 s of bottom track, by the tables of Nortek's guide. velocity: X, Y, Z1, Z2."""
+    seconds, fraction = divmod(1250 * i, 10_000)
+    leader = struct.pack(
+        "<BBI6BHHII3f", 1, 46, 123456, 125, 10, 21, 10, 30, 15 + seconds, fraction, 4, 0, status, 1500.0, 8.0, 2.0
+    )
+    by_axis = struct.pack("<20f", *velocity, *[fom] * 4, *[late] * 4, *[0.1] * 4, *[0.02] * 4)
+    data = leader + struct.pack("<24f", *range(24)) + by_axis
+    header = struct.pack("<BBBBHH", 0xA5, 10, identity, 0x10, len(data), _nortek_checksum(data))
+    return header + struct.pack("<H", _nortek_checksum(header)) + data
+
+
+def _nortek_checksum(data: bytes) -> int:
+    value = 0xB58C
+    for at in range(0, len(data) - 1, 2):
+        value += data[at] | data[at + 1] << 8
+    return (value + (data[-1] << 8) * (len(data) % 2)) & 0xFFFF
+
+
 def general_nmea(specific: int, body: bytes, delta: float) -> bytes:
     """Data of ID 2022h, by the tables of bytes in RDI's guides."""
     return struct.pack("<HHHd", 0x2022, specific, len(body), delta) + body

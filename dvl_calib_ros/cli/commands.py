@@ -86,7 +86,7 @@ COMMANDS = (
     ),
     Command(
         "import",
-        "turn CSV or NPY trajectories, or logs of a DVL (Water Linked JSON, RDI PD0) or of ArduPilot, into bags",
+        "turn CSV or NPY trajectories, or logs of a DVL (Water Linked, RDI, Nortek) or of ArduPilot, into bags",
         "dvl-calib import T12_dvl.csv --gnss T12_gnss.csv --attitude T12_attitude.csv -o T12",
         module="import_",
     ),

@@ -7,8 +7,8 @@ forward-right-down body in north-east-down. Files whose header names speed and c
 heading (of a compass, with pitch and roll or without), are read by their columns; units are in the names (_deg, knots).
 
 A log of Water Linked's JSON reports, of RDI's PD0 ensembles (with the DVL's own heading, pitch and roll, and the NMEA
-that WinRiver II put into them) or of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known by its content; so
-are a receiver's RMC sentences.
+that WinRiver II put into them), of Nortek's DVLs or of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known
+by its content; so are a receiver's RMC sentences.
 They have their own times: give --start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.
 """
 

@@ -1,6 +1,7 @@
 """Logs of DVLs as the instruments write them: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
 
-Those of ArduPilot, which hold DVL, GNSS and attitude of one vehicle, are in `ardupilot_logs`.
+Those of Nortek are in `nortek_logs`, those of ArduPilot, which hold DVL, GNSS and attitude of one vehicle, in
+`ardupilot_logs`.
 
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
@@ -26,6 +27,7 @@ from ..calibration.frames import FLU_FROM_FRD, Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from ..errors import InputError
 from .attitudes import imu_samples
+from .nortek_logs import is_nortek_log, read_nortek_log
 from .pd0_nmea import GENERAL_NMEA, Nmea
 
 PD0_START = b"\x7f\x7f"
@@ -62,7 +64,7 @@ def is_dvl_log(path: Path) -> bool:
             start = file.read(_SNIFFED)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if _is_ardupilot_log(path, start):
+    if _is_ardupilot_log(path, start) or is_nortek_log(start):
         return True
     return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or b'"vx"' in start
 
@@ -74,13 +76,15 @@ def _is_ardupilot_log(path: Path, start: bytes) -> bool:
 
 
 def read_dvl_log(path: Path) -> DvlLog:
-    """Read a log of either kind. Raises InputError for what is none, or holds no velocity that can be used."""
+    """Read a log of any kind. Raises InputError for what is none, or holds no velocity that can be used."""
     with path.open("rb") as file:
         start = file.read(_SNIFFED)
     if _is_ardupilot_log(path, start):
         from .ardupilot_logs import read_ardupilot_log  # which gives this module's log
 
         log = read_ardupilot_log(path)
+    elif is_nortek_log(start):
+        log = DvlLog(*read_nortek_log(path.read_bytes()))
     else:
         log = (_read_json if b'"vx"' in start else _read_pd0)(path, path.read_bytes())
     if not log.samples:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from log_fixtures import START_S, dataflash, general_nmea, pd0, rmc, sentence, telemetry
+from log_fixtures import START_S, dataflash, general_nmea, nortek, pd0, rmc, sentence, telemetry
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.frames import rotation_from_quaternion
@@ -140,6 +141,30 @@ def test_nmea_in_pd0_that_says_nothing_is_left_out_and_the_velocity_kept(tmp_pat
     log = read_dvl_log(tmp_path / "dive.PD0")
     assert len(log.samples) == 5 and not log.references
     assert log.left_out == {"with NMEA that is damaged or empty": 5 * len(spoilt)}
+
+
+def test_bottom_track_of_nortek_is_a_velocity_at_its_echo(tmp_path, capsys):
+    path = tmp_path / "dive.ad2cp"
+    configuration = nortek(0, (9.0,) * 4, identity=0xA0)  # another record before
+    path.write_bytes(
+        configuration + b"\xa5\x0a" + b"".join(nortek(i, (1.5, 0.2, -0.03, -0.01), 0.01) for i in range(8))
+        + nortek(8, (1.5, 0.2, -0.03, -32.768), status=0xFFFFF & ~(1 << 15))
+        + nortek(9, (-32.768,) * 4) + nortek(10, (1.5, 0.2, 0.0, 0.0), status=0xFFFFF & ~(1 << 12))
+        + nortek(11, (9.0,) * 4)[:-1] + b"\0" + nortek(12, (1.6, 0.0, 0.0, 0.0), fom=0.0) + nortek(13, (9.0,) * 4)[:-60]
+    )  # fmt: skip
+    assert is_dvl_log(path)
+    log = read_dvl_log(path)
+    assert log.left_out == {"without bottom lock": 2}
+    expected = [(1.5, -0.2, 0.02)] * 8 + [(1.5, -0.2, 0.03), (1.6, 0.0, 0.0)]
+    np.testing.assert_allclose([each.velocity for each in log.samples], expected, atol=1e-7)
+    first_ns = round(datetime(2025, 11, 21, 10, 30, 15, tzinfo=timezone.utc).timestamp()) * 1_000_000_000
+    at = [each.stamp_ns - first_ns for each in log.samples]
+    np.testing.assert_allclose(at, [125e6 * i + 10e6 for i in range(8)] + [1e9, 1.5e9], atol=10)
+    np.testing.assert_allclose(log.samples[0].covariance, 0.004**2 * np.eye(3), atol=1e-9)
+    assert log.samples[-1].covariance is None
+    succeed(capsys, "import", path, "-o", tmp_path / "bag")
+    path.write_bytes(configuration)
+    assert not is_dvl_log(path)
 
 
 def test_rmc_sentences_are_horizontal_velocities_at_utc(tmp_path):
