@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.kalman import GaussianState
-from dvl_calib_ros.calibration.models import MODELS, Needs
+from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -77,7 +77,7 @@ def received(counts: dict[str, dict[str, int]]) -> dict[str, int]:
 
 
 def assert_agree(saved: dict, result: Result) -> None:
-    for name in MODELS:
+    for name in BY_VELOCITY:
         live, expected = saved["models"][name], result.estimates[name]
         np.testing.assert_allclose(live["state"], expected.state, rtol=0, atol=1e-12)
         np.testing.assert_allclose(live["covariance"], expected.covariance, rtol=0, atol=1e-12)
@@ -99,7 +99,7 @@ def assert_counts_add_up(counts: dict[str, dict[str, int]], models: dict[str, di
     assert decided == pairing["paired"] + pairing["unpaired"]
     assert dvl["usable"] == sum(pairing[key] for key in ("oriented", "not_oriented", "awaiting_attitude"))
     given = {Needs.NOTHING: dvl["usable"], Needs.ATTITUDE: pairing["oriented"], Needs.REFERENCE: pairing["paired"]}
-    for name, model in MODELS.items():
+    for name, model in ((name, MODELS[name]) for name in BY_VELOCITY):
         taken = models[name]["used"] + models[name]["gated"]
         assert taken == given[model.needs] or (model.aided and taken <= given[model.needs])
 

@@ -33,11 +33,12 @@ from .history import Counts, Numbers, StateTrace
 from .judging import Judge
 from .kalman import GaussianState
 from .message_counts import counted
-from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, Model, Needs
+from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
 from .navigation import Navigation
 from .observations import Observations
 from .observe import Observer
 from .parameters import IAC, ParameterError, Parameters
+from .positions import are_positions, check_model
 from .register.registration import Registration
 from .results import Day, Estimate, Result
 from .samples import (
@@ -125,6 +126,10 @@ class Calibrator:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
         self.parameters = parameters
         self._models = tuple(name for name in MODELS if name in models)
+        # of positions nothing is to be said where there are none
+        unknown = () if are_positions(parameters) else (WITH_POSITIONS,)
+        self._told = tuple(name for name in self._models if name not in unknown)
+        check_model(parameters)
         self._extended = [base for name in self._models if (base := MODELS[name].extends) is not None]
         self._initial = initial
         self._block_size = block_size
@@ -236,6 +241,11 @@ class Calibrator:
         self._advance()
         self._aligner.forget_old()
 
+    def feed_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
+        """Take a position of the reference point (3,) m, ENU from anywhere, and its variances (3,), nan if unknown."""
+        for each in self._further:
+            each.take_fix(stamp_ns, position, variance)
+
     def refuse(self, stream: str, reason: str) -> None:
         """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
         self._aligner.refuse(Stream(stream), reason)
@@ -313,6 +323,8 @@ class Calibrator:
         estimator = self._estimators[model.name]
         if model.extends is not None and EXTENDED_BY[model.extends] == model.name:
             self._selection.extend(from_ns, estimator.evidence)
+        if model.from_positions:
+            self._selection.go_by_positions(from_ns, estimator.evidence)
         if self._trace is not None:
             estimator.remember(from_ns)
 
@@ -464,6 +476,7 @@ class Calibrator:
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Change parameters that can change at run time (`ParameterSpec.read_only` False)."""
+        check_model(parameters)
         selection = self.selection  # by what was so far
         self.parameters = self._aligner.parameters = self._estimates.parameters = parameters
         self._doubted = None
@@ -546,7 +559,7 @@ class Calibrator:
         return Result(
             selected=self.selected,
             selected_because=self.selection.reason(self.parameters, None if chosen is None else chosen.evidence),
-            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._models},
+            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._told},
             segments=tuple(self.selection.segments),
             counts=self.counts,
             first_ns=self.first_ns,
@@ -562,7 +575,7 @@ class Calibrator:
     def _verifications(self, doubts: Sequence[Reason]) -> dict[str, Verification]:
         """Verdicts by model: live that of the selected one, with all that speaks against it."""
         if self._verified:
-            return {name: self.verification(name) for name in self._models}
+            return {name: self.verification(name) for name in self._told}
         if self._worker is None:
             return {}
         verification = self._judge.so_far(self.selected, fresh=True)

@@ -25,6 +25,7 @@ from .history import Counts, Numbers, StateTrace
 from .kalman import GaussianState
 from .models import Model
 from .models.plugged import load
+from .navigation import Navigation
 from .parameters import ParameterError, Parameters
 from .register.registration import Registration
 from .results import Day
@@ -183,6 +184,10 @@ class Estimator(ABC):
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
 
+    def navigation(self) -> Navigation | None:
+        """What it is worth to dead reckoning, of one that judges that itself; None: by velocities, as of all others."""
+        return None
+
     @abstractmethod
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
         """For every fold what it corrects on every day, had it not seen that fold."""
@@ -193,6 +198,10 @@ class Estimator(ABC):
 
     def take_rows(self) -> None:
         """Copy the rows that are judged, before they are forgotten."""
+        return None
+
+    def take_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
+        """Take a position of the reference point (3,) m, ENU, and its variances (3,) m², nan where not known."""
         return None
 
     def settle(self) -> None:

@@ -17,6 +17,7 @@ from .kalman import GaussianState
 from .models import MODELS, Model
 from .navigation import Navigation, dead_reckoned, objections
 from .results import Estimate
+from .told_arm import finds_arm
 from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
 
 # What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
@@ -37,8 +38,7 @@ class Judge:
         """The verdict on one model's calibration, by hold-out. moments: of the samples that it is judged by."""
         estimate = self._estimates.without_tilt(self._estimates.estimate(name))
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
-        rotation_dvl_from_body = self._estimates.parameters.rotation_dvl_from_body
-        held_out = self._estimates.estimators[name].held_out_error(moments, rotation_dvl_from_body)
+        held_out = self._held_out(name, moments)
         is_suspect = held_out is not None and held_out.corrected > min(
             SEVERAL * held_out.predicted, held_out.uncorrected
         )
@@ -50,9 +50,16 @@ class Judge:
         """The same of a running calibration, by what the worker looked at; nothing is waited for unless fresh."""
         estimate, further = self._estimate(name, fresh=fresh), self._further
         rest, suggestion = further.rest(fresh=fresh), further.suggestion if fresh else further.suggestion_so_far
+        if MODELS[name].from_positions:
+            held_out = self._held_out(name, Moments()) if fresh else None
+            return self._judged(estimate, held_out, None, (0.0, np.zeros((3, 3, 3))), suggestion)
         if rest is None or not MODELS[name].aided:
             return self._judged(estimate, None, None, (0.0, np.zeros((3, 3, 3))), suggestion)
         return self._judged(estimate, rest.held_out, rest.typical, rest.judged, suggestion)
+
+    def _held_out(self, name: str, moments: Moments) -> HeldOutError | None:
+        rotation_dvl_from_body = self._estimates.parameters.rotation_dvl_from_body
+        return self._estimates.estimators[name].held_out_error(moments, rotation_dvl_from_body)
 
     def _estimate(self, name: str, *, fresh: bool) -> Estimate:
         estimate = self._estimates.estimate(name)
@@ -93,6 +100,8 @@ class Judge:
         further, p = self._further, self._estimates.parameters
         suggested, rest = further.suggestion if fresh else further.suggestion_so_far, further.rest(fresh=fresh)
         navigation = None if rest is None else rest.navigation
+        if MODELS[name].from_positions:
+            navigation = self._estimates.estimators[name].navigation() if fresh else None
         found = doubts(
             self._estimate(name, fresh=fresh),
             (self._estimate(each.name, fresh=fresh) for each in self._estimates.arm_finders),
@@ -111,6 +120,10 @@ class Judge:
     def navigation(self, name: str, deviation: GaussianState | None) -> Navigation | None:
         """What one model's calibration is worth to dead reckoning, on data that it had not seen. None without
         reference, or with hardly any motion. deviation: how the heading deviates."""
+        with self._further.settled():
+            own = self._estimates.estimators[name].navigation()
+        if own is not None:
+            return own
         kept = self._further.recording
         if kept is None:
             return None
@@ -139,7 +152,7 @@ class Judge:
         if kept is None:
             return None
         x, recording = state.x, kept[0]
-        if model.estimator:
+        if finds_arm(model):
             return typical_error(recording, Terms.of_state(x), p)
         if self._compared is None or self._compared[0] is not recording:
             every = np.arange(len(recording.dvl.times))

@@ -154,7 +154,7 @@ def dead_reckoned(
         return None
     errors = [each.error[use, axes] for each in (before, after)]
     astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
-    ends = _stretches(along)
+    ends = ends_of_stretches(along)
     kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
@@ -162,8 +162,8 @@ def dead_reckoned(
         seconds=float(step_s.sum()),
         stretch_m=float(along[-1] if len(ends) == 2 else along[ends[1]] - along[ends[0]]),
         stretches=len(ends) - 1,
-        before=_drift(astray[0], along, ends),
-        after=_drift(astray[1], along, ends),
+        before=drift_over(astray[0], along, ends),
+        after=drift_over(astray[1], along, ends),
         noise_per_km=_noise(errors[1], step_s, along, ends),
         on_a_map=on_a_map,
         stamps_ns=np.round(recording.dvl.times[use[kept]] * 1e9).astype(np.int64) + epoch_ns,
@@ -225,7 +225,7 @@ def _steps(times: Array) -> Array:
     return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
 
 
-def _stretches(along: Array) -> Index:
+def ends_of_stretches(along: Array) -> Index:
     """Where stretches end (S + 1,), beginning with 0: of the longest length that there are enough of."""
     for length in STRETCHES_M:
         n = int(along[-1] // length)
@@ -234,7 +234,8 @@ def _stretches(along: Array) -> Index:
     return np.array([0, len(along) - 1])
 
 
-def _drift(astray: Array, along: Array, ends: Index) -> Drift:
+def drift_over(astray: Array, along: Array, ends: Index) -> Drift:
+    """Of a track that leads astray (N, 2) m, at N distances along it (m), over the stretches between ends (S + 1,)."""
     off = np.linalg.norm(np.diff(astray[ends], axis=0), axis=1)
     share = off / np.maximum(np.diff(along[ends]), 1e-9)
     return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(astray[-1])))

@@ -5,12 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from .frames import Array
-from .parameters import Parameters
+from .models import WITH_POSITIONS
+from .parameters import ParameterError, Parameters
 
 
 def are_positions(parameters: Parameters) -> bool:
     """Whether the reference is positions."""
-    return parameters.gnss_type.endswith("/NavSatFix")
+    return parameters.gnss_type.endswith(("/NavSatFix", "/PoseWithCovarianceStamped"))
+
+
+def check_model(parameters: Parameters) -> None:
+    """Raise ParameterError where a model is named that goes by positions, and the reference is velocities."""
+    if parameters.model == WITH_POSITIONS and not are_positions(parameters):
+        raise ParameterError(
+            f"model: {WITH_POSITIONS} goes by positions, and {parameters.gnss_type} holds velocities; name another "
+            "model, or a topic of positions (--gnss-topic, gnss_type: NavSatFix or PoseWithCovarianceStamped)"
+        )
 
 
 def of_moments(times: Array, velocity: Array, window_s: float) -> Array:

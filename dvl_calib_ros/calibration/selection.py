@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .models import EXTENDED_BY, WITH_HEADINGS
+from .models import EXTENDED_BY, WITH_HEADINGS, WITH_POSITIONS
 from .parameters import AUTO, IAC, Parameters
 from .samples import Mask, Stamps
 
@@ -93,6 +93,16 @@ EXTENDED_FROM, EXTENDED_UNTIL = 30.0, 15.0
 EVIDENCE_HOLDS_NS = 12_000_000_000
 
 
+class _Positions(NamedTuple):
+    """That the model of positions is to be taken, and why."""
+
+    evidence: Evidence
+
+
+def _why(evidence: Evidence) -> Reason:
+    return finding(evidence.code, **evidence.numbers)
+
+
 class Selection:
     """The selected model over time."""
 
@@ -103,8 +113,9 @@ class Selection:
         self._extended = False
         self._referenced_until_ns = 0
         self._headings = self._trimmed = False
+        self._by_positions: Evidence | None = None
         # what is to be taken note of once DVL samples reach its stamp: evidence, or that headings show the current
-        self._coming: deque[tuple[int, Evidence | None]] = deque()
+        self._coming: deque[tuple[int, Evidence | _Positions | None]] = deque()
 
     def extend(self, from_ns: int, evidence: Evidence) -> None:
         """From this stamp on, go by this evidence for the model that extends the one with GNSS."""
@@ -115,7 +126,11 @@ class Selection:
         self._trimmed = trimmed
         self._note(from_ns, None)
 
-    def _note(self, from_ns: int, what: Evidence | None) -> None:
+    def go_by_positions(self, from_ns: int, evidence: Evidence) -> None:
+        """From this stamp on, go by the model of positions, for what velocities made of them are worth."""
+        self._note(from_ns, _Positions(evidence))
+
+    def _note(self, from_ns: int, what: Evidence | _Positions | None) -> None:
         insort(self._coming, (from_ns, what), key=lambda each: each[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
@@ -128,6 +143,10 @@ class Selection:
             stamps_ns, paired = stamps_ns[at:], paired[at:]
             if evidence is None:
                 self._headings = True
+                self.record(int(stamps_ns[0]), parameters)
+                continue
+            if isinstance(evidence, _Positions):
+                self._by_positions = evidence.evidence
                 self.record(int(stamps_ns[0]), parameters)
                 continue
             self._evidence = evidence
@@ -165,6 +184,8 @@ class Selection:
             aided, unaided = parameters.gnss_model, parameters.gnss_free_model
         else:
             return parameters.model
+        if parameters.model == AUTO and self._by_positions is not None:
+            return WITH_POSITIONS
         if not self.gnss.available:
             return WITH_HEADINGS.get(unaided, unaided) if parameters.model == AUTO and self._headings else unaided
         if parameters.model == AUTO and self._extended:
@@ -176,6 +197,8 @@ class Selection:
         if parameters.model not in (AUTO, IAC):
             return finding("MODEL_NAMED")
         chosen = {"by": parameters.model, "gnss": self.gnss.reason}
+        if parameters.model == AUTO and self._by_positions is not None:
+            return finding("MODEL_CHOSEN_AS", **chosen, why=_why(self._by_positions))
         if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
             headings = "TRIM_KNOWN" if self._trimmed else "HEADINGS_TELL_CURRENT"
             return finding("MODEL_CHOSEN_AS", **chosen, why=finding(headings if self._headings else "HEADINGS_TOO_FEW"))
@@ -191,7 +214,7 @@ def eligible(parameters: Parameters) -> frozenset[str]:
         own = set(published_models(parameters))
     elif parameters.model == AUTO:
         unaided = parameters.gnss_free_model
-        own = {parameters.gnss_model, unaided, WITH_HEADINGS.get(unaided, unaided)}
+        own = {parameters.gnss_model, unaided, WITH_HEADINGS.get(unaided, unaided), *filter(None, [WITH_POSITIONS])}
     else:
         own = {parameters.model}
     return frozenset(own | {EXTENDED_BY[name] for name in own if name in EXTENDED_BY})

@@ -5,6 +5,7 @@ NAME_attitude.csv where there are such, and becomes one bag per recording. Units
 forward-right-down (frd) unless said otherwise and become ROS's forward-left-up; attitude is roll, pitch, yaw of the
 forward-right-down body in north-east-down. Files whose header names speed and course (over ground, from true north), or
 heading (of a compass, with pitch and roll or without), are read by their columns; units are in the names (_deg, knots).
+Latitude and longitude beside or instead of the speed become NavSatFix on gnss/fix.
 
 A log of Water Linked's JSON reports, of RDI's PD0 ensembles (with the DVL's own heading, pitch and roll, and the NMEA
 that WinRiver II put into them), of Nortek's DVLs or of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known

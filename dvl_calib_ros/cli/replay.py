@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Look into the bags, replay them, save, print."""
     from ..calibration.models import MODELS
+    from ..errors import InputError
     from ..files.result_file import result_document, save_result
     from ..replay.checked import checked_replay
     from ..replay.document import replay_document
@@ -58,6 +59,11 @@ def run(arguments: argparse.Namespace) -> None:
             mounting_is_guessed=bool(discovery.mounting_because),
         )
     result = replayed.result
+    if asked and not any(name in result.estimates for name in asked):
+        raise InputError(
+            f"--models: {', '.join(asked)} goes by positions, and the reference holds velocities; name another model, "
+            "or a topic of positions with --gnss-topic"
+        )
     discovery = discovery.with_mounting(result.parameters["mounting_rpy"])
 
     def write(path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES, TWIST_TYPE
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPE, REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.topics import spelled
 from ..verdict.reasons import Reason, finding
 
@@ -22,6 +22,8 @@ GNSS_WORDS = ("gnss", "gps", "navsat", "rtk", "ublox", "septentrio", "novatel", 
 TRUTH_WORDS = ("truth", "pose_gt", "p3d", "mocap", "qualisys", "optitrack")
 INS_WORDS = ("ins", "spatial", "sbg", "phins", "xsens", "mti", "vectornav", "microstrain", "navigation", "rovins")
 # What is made from the DVL proves nothing about it; what is commanded is not measured.
+# Poses are sent by all that navigates, with the DVL in it: only those of these are measured.
+ACOUSTIC_WORDS = ("usbl", "ssbl", "sbl", "lbl", "acoustic", "hipap", "ugps", "underwater_gps")
 DERIVED_WORDS = (
     "filtered", "ekf", "ukf", "fused", "dead_reckoning", "deadreckoning", "calibrated", "dvl_calibration",
     "local_position", "estimate",
@@ -129,6 +131,8 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
     for look in survey.looks.values():
         if look.topic == dvl or look.msgtype not in REFERENCE_TYPES or _has(look, COMMAND_WORDS):
             continue
+        if look.msgtype == POSE_TYPE and not _has(look, ACOUSTIC_WORDS):
+            continue
         if look.speed < MOVES_FROM:
             said.append(finding("TOPIC_DOES_NOT_MOVE", topic=look.topic))
             continue
@@ -155,7 +159,7 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
 
 def _rank(look: Look) -> float:
     """Of two forms of one velocity the one with a covariance goes first, and positions last."""
-    if REFERENCE_TYPES[look.msgtype].is_position:
+    if REFERENCE_TYPES[look.msgtype].position is not None:
         return 2.0
     return 0.0 if look.msgtype == TWIST_TYPE else 1.0
 

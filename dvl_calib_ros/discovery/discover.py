@@ -560,7 +560,7 @@ class _Search:
         have."""
         if self._gives("gnss_aided_std") or self._gives("use_message_covariance") or chosen.best_left > FITS:
             return
-        is_position = VELOCITY_TYPES[reference.msgtype].is_position
+        is_position = VELOCITY_TYPES[reference.msgtype].position is not None
         own = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
         too_little = not is_position and own > CLAIMS_TOO_LITTLE * reference.claimed_std
         if not (is_position or too_little or math.isnan(reference.claimed_std)):

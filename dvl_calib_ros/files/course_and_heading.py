@@ -1,4 +1,4 @@
-"""Course and speed over ground, and headings of a compass: horizontal recordings, by the names of their columns.
+"""Course and speed over ground, positions, headings of a compass: horizontal recordings, by their columns' names.
 
 A receiver's course and speed have no vertical: it is written as exactly 0, which marks an axis as not measured. Units
 stand in a column's name (`_deg`, `[rad]`, `_mps`, `knots`); without one they are SI and radians.
@@ -16,6 +16,7 @@ import numpy as np
 from ..calibration.frames import Array, over_ground
 from ..calibration.samples import ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
+from ..messages.encode import SatelliteFix
 from .attitudes import imu_samples
 from .nmea import KNOT
 from .trajectories import cells, numbers_of, stamps_ns
@@ -40,6 +41,16 @@ def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list
     return [
         ReferenceSample(at, (x, y, z), covariance, VelocityFrame.ENU)
         for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), velocities, strict=True)
+    ]
+
+
+def read_positions(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
+    """Latitude and longitude. Raises InputError."""
+    time, values = _named(path, ("latitude", "longitude"), notes)
+    rows = np.degrees(values).tolist()
+    return [
+        SatelliteFix(at, latitude, longitude)
+        for at, (latitude, longitude) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
     ]
 
 

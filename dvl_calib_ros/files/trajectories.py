@@ -24,7 +24,7 @@ from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import FLU_FROM_FRD, Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
-from ..messages.encode import SampleWriter
+from ..messages.encode import SampleWriter, SatelliteFix
 from .attitudes import imu_samples
 from .dvl_logs import DvlLog, is_dvl_log, read_dvl_log
 
@@ -267,14 +267,16 @@ def import_recording(
     else:
         log = DvlLog(read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes), Counter())
     references = list(log.references) if gnss is None else _references(gnss, options, notes)
+    fixes = [] if gnss is None else _fixes(gnss, start_ns, notes)
     if attitude is None:
         attitudes = list(log.attitudes)
         notes += log.notes
     else:
         attitudes = _attitudes(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
-        SampleWriter(bag).recording(attitudes, references, log.samples)
+        SampleWriter(bag).recording(attitudes, references, fixes, log.samples)
     written = {"dvl/twist": len(log.samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
+    written |= {"gnss/fix": len(fixes)} if fixes else {}
     written |= {f"reports {reason}, left out": count for reason, count in log.left_out.items()}
     return Imported(written, tuple(notes))
 
@@ -287,7 +289,15 @@ def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[Re
         return read_rmc(path, options.gnss_std, notes)
     if names_columns(path, "speed", "course"):
         return read_course(path, options.start_ns, options.gnss_std, notes)
+    if names_columns(path, "latitude", "longitude"):
+        return []
     return read_reference(path, options.start_ns, options.gnss_frame, options.gnss_std, notes)
+
+
+def _fixes(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
+    from .course_and_heading import names_columns, read_positions
+
+    return read_positions(path, start_ns, notes) if names_columns(path, "latitude", "longitude") else []
 
 
 def _attitudes(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:

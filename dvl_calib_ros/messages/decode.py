@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array, Vector
+from ..calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, Vector
 from ..calibration.imu_alignment import ImuAlignment
 from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from ..verdict.reasons import Reason, finding
-from .drivers import VelocityType, velocity_type
-from .fixes import FixDifference
+from .drivers import NOT_MEASURED, VelocityType, velocity_type
+from .fixes import FixDifference, Place, PositionType, matrix_of
 
 # Under which messages are counted that no sensor can mean, and those in another frame
 INVALID, WRONG_FRAME = "invalid", "wrong_frame"
@@ -121,6 +121,7 @@ class LinearCovariance:
 
 # F C F of a covariance C and the diagonal F = FLU_FROM_FRD, element by element
 TURNED_COVARIANCE = np.outer(FLU_FROM_FRD.diagonal(), FLU_FROM_FRD.diagonal())
+OnFix = Callable[[int, Array, Array], None]
 # what a message of another layout than its type's makes the readers raise
 UNREADABLE = (AttributeError, TypeError, ValueError, IndexError, OverflowError)
 
@@ -144,8 +145,10 @@ class _VelocityReader:
 class MessageDecoder:
     """Makes samples of messages of the types that parameters dvl_type and gnss_type name, and of sensor_msgs/Imu.
 
-    `problems` keeps the latest finding of each kind; on_problem is told in words when one is new. What is remembered of
-    the messages before are their frames: the DVL's first is its own. Raises InputError for a type that is none.
+    `problems` keeps the latest finding of each kind; on_problem is told in words when one is new. on_fix is told of
+    every position: stamp, place (3,) m in ENU from the first, and its variances (3,) m², nan where not known. What is
+    remembered of the messages before are their frames: the DVL's first is its own. Raises InputError for a type that is
+    none.
     """
 
     def __init__(self, parameters: Parameters, on_problem: Callable[[str], None] = lambda _: None) -> None:
@@ -155,6 +158,7 @@ class MessageDecoder:
         self.imu_alignment = ImuAlignment(parameters)
         self._reference_readers = [_VelocityReader(self.reference_type, turned) for turned in (False, True)]
         self._on_problem = on_problem
+        self.on_fix: OnFix = lambda *_: None
         self.forget()
 
     def forget(self) -> None:
@@ -165,7 +169,9 @@ class MessageDecoder:
         self._dvl_reader: _VelocityReader | None = None
         self._imu_frame: str | None = None
         self._reference_frames: dict[str, DeclaredFrame | None] = {}
-        self._fixes = FixDifference(self.parameters.position_window)
+        position = self.reference_type.position
+        self._fixes = FixDifference(self.parameters.position_window, None if position is None else position.between)
+        self._origin: Place | None = None
 
     # ------------------------------------------------------------------ one by one
 
@@ -195,19 +201,24 @@ class MessageDecoder:
             if frame is None:
                 return Refusal(WRONG_FRAME)
             stamp = self._stamp_ns(Stream.REFERENCE, message.header, received_ns)
-            if kind.is_position:
-                return self._difference(message, stamp, frame.frame)
+            if kind.position is not None:
+                return self._difference(kind.position, message, stamp, frame.frame)
             velocity, covariance = self._reference_readers[frame.points_down](message)
         except UNREADABLE as error:
             return self.undecodable(Stream.REFERENCE, f"{kind.name}, {type(error).__name__}: {error}")
         return ReferenceSample(stamp, velocity, covariance, frame.frame)
 
-    def _difference(self, message: Any, stamp_ns: int, frame: VelocityFrame) -> ReferenceSample | Refusal:
-        """The velocity between a satellite position and the one a window before."""
-        if message.status.status < 0:
+    def _difference(
+        self, kind: PositionType, message: Any, stamp_ns: int, frame: VelocityFrame
+    ) -> ReferenceSample | Refusal:
+        """The velocity between a position and the one a window before; the position itself goes to `on_fix`."""
+        if not kind.is_valid(message):
             return Refusal(NO_FIX)
-        given = message.position_covariance if message.position_covariance_type else None
-        found = self._fixes(stamp_ns, message.latitude, message.longitude, message.altitude, given)
+        place, given = kind.place(message), kind.covariance(message)
+        if frame is not VelocityFrame.BODY and math.isfinite(sum(place)):
+            self._origin = self._origin or place
+            self.on_fix(stamp_ns, *_east_north_up(kind, self._origin, place, given, frame))
+        found = self._fixes(stamp_ns, *place, given)
         if found is None:
             return Refusal(FIRST_FIX)
         return ReferenceSample(found.stamp_ns, found.velocity, found.covariance, frame)
@@ -323,3 +334,17 @@ class MessageDecoder:
         self.problems[kind] = found
         if is_new:  # two frames in turn, or ever new garbage, must not be told of at every message
             self._on_problem(str(found))
+
+
+def _east_north_up(
+    kind: PositionType, origin: Place, place: Place, covariance: Any, frame: VelocityFrame
+) -> tuple[Array, Array]:
+    """A position (3,) m from the origin, and its variances (3,) m², nan where not known."""
+    away, matrix = np.array(kind.between(origin, place)), matrix_of(covariance)
+    variance = np.full(3, math.nan) if matrix is None else np.diag(matrix).copy()
+    if frame is VelocityFrame.NED:
+        away, variance = ENU_FROM_NED @ away, variance[[1, 0, 2]]
+    variance[~((variance > 0.0) & (variance < NOT_MEASURED))] = math.nan
+    if not kind.has_height:
+        variance[2] = math.nan
+    return away, variance

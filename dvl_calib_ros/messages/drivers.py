@@ -22,9 +22,11 @@ from ..calibration.parameters import Parameters
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 from ..verdict.reasons import Reason, finding
+from .fixes import POSE, SATELLITES, PositionType
 from .px4 import of_vehicle_odometry
 
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 BOTTOM_TRACK, WATER_TRACK = 1, 2
 # coordinate_mode of ds_sensor_msgs/Dvl for the instrument's own axes
@@ -63,11 +65,11 @@ class VelocityType:
     frame_id: message -> frame of the velocity. is_read_in_columns: whether these are written for columns of messages as
     well, which takes a type without lists. points_down: its axes
     are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
-    is_reference, is_dvl: whether velocities of the reference and of DVLs come in this type. is_position: it holds
-    satellite positions, of which velocities are made (fixes.py). reference_frame: the axes of a reference in this type,
-    whatever its frame_id says, None if that says it. adapted: a message without header as all else reads it;
-    None: as it is. definitions: for bags that embed none, the versions of it that are about. install: how to get its
-    package, where ROS does not bring it.
+    is_reference, is_dvl: whether velocities of the reference and of DVLs come in this type. position: how positions are
+    read, of which velocities are made (fixes.py), None of a type of velocities. reference_frame: the axes of a
+    reference in this type, whatever its frame_id says, None if that says it. adapted: a message without header as all
+    else reads it; None: as it is. definitions: for bags that embed none, the versions of it that are about. install:
+    how to get its package, where ROS does not bring it.
     """
 
     name: str
@@ -83,7 +85,7 @@ class VelocityType:
     rules: tuple[Rule, ...] = ()
     is_reference: bool = False
     is_dvl: bool = True
-    is_position: bool = False
+    position: PositionType | None = None
     reference_frame: VelocityFrame | None = None
     adapted: Callable[[Any], Any] | None = None
     definitions: tuple[str, ...] = ()
@@ -424,6 +426,17 @@ _TYPES: dict[str, VelocityType] = {
             install="build px4_msgs in your workspace",
         ),
         VelocityType(
+            name=POSE_TYPE,
+            sent_by="acoustic positioning (USBL), motion capture",
+            velocity=_no_velocity,
+            covariance=lambda _: None,
+            is_read_in_columns=False,
+            covariance_says="of the difference of two positions, from `pose.covariance`; zero: not given",
+            is_reference=True,
+            is_dvl=False,
+            position=POSE,
+        ),
+        VelocityType(
             name="sensor_msgs/msg/NavSatFix",
             sent_by="receivers that give positions alone (RTK)",
             velocity=_no_velocity,
@@ -433,7 +446,7 @@ _TYPES: dict[str, VelocityType] = {
             frame_says="east-north-up",
             is_reference=True,
             is_dvl=False,
-            is_position=True,
+            position=SATELLITES,
             reference_frame=VelocityFrame.ENU,
         ),
     )

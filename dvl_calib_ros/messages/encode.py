@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,17 @@ from ..bags.writer import BagWriter
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Sample, VelocityFrame
 from .drivers import IMU_TYPE, TWIST_TYPE
 
+FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+
 FRAME_IDS = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
+
+
+class SatelliteFix(NamedTuple):
+    """A position of a receiver, degrees; its height is not known."""
+
+    stamp_ns: int
+    latitude_deg: float
+    longitude_deg: float
 
 
 class SampleWriter:
@@ -22,13 +32,15 @@ class SampleWriter:
         self._bag = bag
         self._types: Any = bag.typestore.types
 
-    def recording(self, *sensors: Iterable[Sample]) -> None:
+    def recording(self, *sensors: Iterable[Sample | SatelliteFix]) -> None:
         """Write the samples of any sensors, each in order of time, to the node's topics in order of time."""
         for sample in heapq.merge(*sensors, key=lambda sample: sample.stamp_ns):
             if isinstance(sample, DvlSample):
                 self.dvl("dvl/twist", sample)
             elif isinstance(sample, ReferenceSample):
                 self.reference("gnss/twist", sample, FRAME_IDS[sample.frame])
+            elif isinstance(sample, SatelliteFix):
+                self.fix("gnss/fix", sample)
             else:
                 self.imu("imu/data", sample)
 
@@ -39,6 +51,20 @@ class SampleWriter:
     def reference(self, topic: str, sample: ReferenceSample, frame_id: str) -> None:
         """Write a reference velocity as TwistWithCovarianceStamped."""
         self._bag.message(topic, TWIST_TYPE, sample.stamp_ns, self._twist(sample, frame_id))
+
+    def fix(self, topic: str, fix: SatelliteFix, frame_id: str = "gnss") -> None:
+        """Write a position as NavSatFix, without a covariance."""
+        types = self._types
+        message = types[FIX_TYPE](
+            header=self._header(fix.stamp_ns, frame_id),
+            status=types["sensor_msgs/msg/NavSatStatus"](0, 1),
+            latitude=fix.latitude_deg,
+            longitude=fix.longitude_deg,
+            altitude=0.0,
+            position_covariance=np.zeros(9),
+            position_covariance_type=0,
+        )
+        self._bag.message(topic, FIX_TYPE, fix.stamp_ns, message)
 
     def imu(self, topic: str, sample: ImuSample, frame_id: str = "base_link") -> None:
         """Write attitude and angular velocity as Imu, with covariance -1 where there is none."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from ..calibration.calibrator import Calibrator
+from ..calibration.frames import Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream
 from .decode import MessageDecoder, Refusal
 from .kept import KeptMessages
@@ -23,7 +24,9 @@ class MessageFeed:
     def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None] = lambda _: None) -> None:
         self.calibrator = calibrator
         self.decoder = MessageDecoder(calibrator.parameters, on_problem)
+        self.decoder.on_fix = self._fix
         self.kept = KeptMessages()
+        self._fixes: list[tuple[int, Array, Array]] = []
 
     def begin_again(self, calibrator: Calibrator) -> None:
         """Feed another calibrator from here on, and what is kept first."""
@@ -31,12 +34,15 @@ class MessageFeed:
         self.decoder.parameters = calibrator.parameters
         streams = self.kept.streams
         if streams is not None:
+            for fix in self._fixes:
+                calibrator.feed_fix(*fix)
             calibrator.feed(streams)
 
     def forget(self) -> None:
         """Forget what came so far."""
         self.decoder.forget()
         self.kept = KeptMessages()
+        self._fixes.clear()
 
     def dvl(self, message: Any, received_ns: int) -> DvlSample | None:
         """Feed a message of dvl_type; the sample as `Calibrator.feed_dvl` gives it back."""
@@ -56,6 +62,13 @@ class MessageFeed:
         if sample is not None:
             self.calibrator.feed_imu(sample)
         return sample
+
+    def _fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
+        if self.kept.is_kept:
+            self._fixes.append((stamp_ns, position, variance))
+        else:
+            self._fixes.clear()
+        self.calibrator.feed_fix(stamp_ns, position, variance)
 
     def _taken(self, stream: Stream, decoded: AnySample | Refusal) -> AnySample | None:
         """A message's sample; None for one that is refused, which is counted."""

@@ -1,4 +1,4 @@
-"""Velocity from satellite positions alone: their difference over a window, in east, north, up.
+"""Positions of satellites or of acoustics, as they are and as velocities over a window, in east, north, up.
 
 A position's errors from one second to the next are far more alike than its covariance says, except of RTK, whose
 covariance is honest: so the noise here is never claimed too small. The velocity is that of the middle of the window,
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,39 +32,54 @@ class FixedVelocity(NamedTuple):
     covariance: Array | None
 
 
+Place = tuple[float, float, float]
+
+
+class PositionType(NamedTuple):
+    """How positions are read from messages of a type.
+
+    is_valid: message -> whether it has one. place: message -> three numbers. covariance: message -> of east, north, up,
+    9 numbers or 36 of a pose, m²; None where not given. between: two places -> from one to the other, m.
+    has_height: whether its vertical is as good as the rest.
+    """
+
+    is_valid: Callable[[Any], bool]
+    place: Callable[[Any], Place]
+    covariance: Callable[[Any], Sequence[float] | Array | None]
+    between: Callable[[Place, Place], Vector]
+    has_height: bool
+
+
 class _Fix(NamedTuple):
     stamp_ns: int
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
+    place: Place
     covariance: Array | None
 
 
 class FixDifference:
-    """Takes fixes in order of time and gives velocities. window_s: over which positions are differenced."""
+    """Takes fixes in order of time and gives velocities.
 
-    def __init__(self, window_s: float = 1.0) -> None:
+    window_s: over which positions are differenced. between: as of `PositionType`, by default of latitude, longitude
+    (degrees) and altitude (m).
+    """
+
+    def __init__(self, window_s: float = 1.0, between: Callable[[Place, Place], Vector] | None = None) -> None:
         self._window_ns = round(window_s * 1e9)
+        self._between = between or east_north_up
         self._fixes: deque[_Fix] = deque(maxlen=MOST_FIXES)
 
     def __call__(
-        self,
-        stamp_ns: int,
-        latitude_deg: float,
-        longitude_deg: float,
-        altitude_m: float,
-        covariance: Sequence[float] | Array | None,
+        self, stamp_ns: int, x: float, y: float, z: float, covariance: Sequence[float] | Array | None
     ) -> FixedVelocity | None:
         """The velocity of the window that ends with this fix; None while there is no position a window before it.
 
-        covariance: (9,) m², ENU, None where not given.
+        x, y, z: its place. covariance: as of `PositionType`.
         """
-        matrix = None if covariance is None else np.asarray(covariance, dtype=float).reshape(3, 3)
-        fix = _Fix(stamp_ns, latitude_deg, longitude_deg, altitude_m, matrix)
+        fix = _Fix(stamp_ns, (x, y, z), matrix_of(covariance))
         fixes = self._fixes
         if fixes and stamp_ns <= fixes[-1].stamp_ns:
             fixes.clear()  # a clock set back, or a loop
-        if not math.isfinite(latitude_deg + longitude_deg + altitude_m):
+        if not math.isfinite(x + y + z):
             return None
         fixes.append(fix)
         # the latest that is a window old, give or take half the interval of a jittery receiver
@@ -79,7 +94,7 @@ class FixDifference:
         if passed_ns < 0.95 * self._window_ns:
             return None
         seconds = 1e-9 * passed_ns
-        east, north, up = east_north_up(before, fix)
+        east, north, up = self._between(before.place, fix.place)
         noise = None
         if before.covariance is not None and fix.covariance is not None:
             noise = (before.covariance + fix.covariance) / seconds**2
@@ -87,16 +102,56 @@ class FixDifference:
         return FixedVelocity(middle_ns, (east / seconds, north / seconds, up / seconds), noise)
 
 
-def east_north_up(start: _Fix, end: _Fix) -> Vector:
+def matrix_of(covariance: Sequence[float] | Array | None) -> Array | None:
+    """(3, 3) m² of a covariance of 9 numbers, or of 36 of a pose; None for none."""
+    if covariance is None:
+        return None
+    given = np.asarray(covariance, dtype=float)
+    return given.reshape(6, 6)[:3, :3] if given.size == 36 else given.reshape(3, 3)
+
+
+def east_north_up(start: Place, end: Place) -> Vector:
     """From one position to another nearby, m, on the ellipsoid's tangent plane between them."""
-    latitude = math.radians(0.5 * (start.latitude_deg + end.latitude_deg))
-    height = 0.5 * (start.altitude_m + end.altitude_m)
+    (start_deg, start_longitude_deg, start_m), (end_deg, end_longitude_deg, end_m) = start, end
+    latitude = math.radians(0.5 * (start_deg + end_deg))
+    height = 0.5 * (start_m + end_m)
     curved = 1.0 - ECCENTRICITY_SQUARED * math.sin(latitude) ** 2
     meridian = SEMI_MAJOR_M * (1.0 - ECCENTRICITY_SQUARED) / curved**1.5
     normal = SEMI_MAJOR_M / math.sqrt(curved)
-    longitude_deg = math.remainder(end.longitude_deg - start.longitude_deg, 360.0)
+    longitude_deg = math.remainder(end_longitude_deg - start_longitude_deg, 360.0)
     return (
         math.radians(longitude_deg) * (normal + height) * math.cos(latitude),
-        math.radians(end.latitude_deg - start.latitude_deg) * (meridian + height),
-        end.altitude_m - start.altitude_m,
+        math.radians(end_deg - start_deg) * (meridian + height),
+        end_m - start_m,
     )
+
+
+def straight(start: Place, end: Place) -> Vector:
+    """From one place of a plane map to another, m."""
+    return end[0] - start[0], end[1] - start[1], end[2] - start[2]
+
+
+def _geodetic(message: Any) -> Place:
+    return message.latitude, message.longitude, message.altitude
+
+
+def _of_pose(message: Any) -> Place:
+    position = message.pose.pose.position
+    return position.x, position.y, position.z
+
+
+def _pose_covariance(message: Any) -> Any:
+    given = np.asarray(message.pose.covariance, dtype=float)
+    return None if given[0] <= 0.0 or given[7] <= 0.0 else given
+
+
+SATELLITES = PositionType(
+    is_valid=lambda message: message.status.status >= 0,
+    place=_geodetic,
+    covariance=lambda message: message.position_covariance if message.position_covariance_type else None,
+    between=east_north_up,
+    has_height=False,
+)
+POSE = PositionType(
+    is_valid=lambda _: True, place=_of_pose, covariance=_pose_covariance, between=straight, has_height=True
+)

@@ -93,6 +93,11 @@ class KeptMessages(RowTable):
         self._move(0)
 
     @property
+    def is_kept(self) -> bool:
+        """Whether all so far is kept."""
+        return self._is_kept
+
+    @property
     def streams(self) -> Streams | None:
         """What came; None where that is not kept any more."""
         return Streams(*map(self._block, Stream)) if self._is_kept else None

@@ -33,6 +33,7 @@ from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
+from ..calibration.positions import check_model
 from ..calibration.samples import DvlSample, VelocityFrame
 from ..discovery.heading_claim import believed_heading
 from ..discovery.placement import Frames, not_default, placement
@@ -511,6 +512,7 @@ class CalibrationNode(AnsweringNode):
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         try:
             changed = self._changed(parameters)
+            check_model(changed)
             if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
                 check_in_folder(Path(changed.result_file), self._result_folder)
                 self._check_result_file(changed.result_file)

@@ -168,7 +168,7 @@ def replayed(
 
     """
     result, history, drift = run.result, run.history, run.navigation
-    shown = [name for name in MODELS if name in models or name == result.selected]
+    shown = [name for name in result.estimates if name in models or name == result.selected]
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Severity.REJECT
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)

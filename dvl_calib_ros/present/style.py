@@ -84,7 +84,7 @@ class LineStyle(NamedTuple):
 def _styles() -> dict[str, LineStyle]:
     colours = islice(cycle(_COLOURS), len(MODELS))
     return {
-        name: LineStyle(colour, "-" if model.aided else "--")
+        name: LineStyle(colour, "-." if model.from_positions else "-" if model.aided else "--")
         for (name, model), colour in zip(MODELS.items(), colours, strict=True)
     }
 

@@ -22,7 +22,7 @@ from ..calibration.robust import median
 from ..calibration.samples import Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.fixes import FixDifference
+from ..messages.fixes import FixDifference, PositionType
 from .columns import TopicColumns, stamped, turning
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
@@ -200,8 +200,8 @@ class _Numbers:
 
     def add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
         """Arrival, log time (ns) and message of each."""
-        if self._kind is not None and self._kind.is_position:
-            messages = _differences(messages)
+        if self._kind is not None and self._kind.position is not None:
+            messages = _differences(messages, self._kind.position)
         for arrival, log_ns, message in messages:
             with suppress(*UNREADABLE):
                 values, beside = self._of(message)
@@ -215,7 +215,7 @@ class _Numbers:
     def _of(self, message: Any) -> tuple[list[float], Array]:
         """A velocity, or quaternion and angular velocity of an IMU; and what is kept beside."""
         if self._kind is not None:
-            v = message.velocity if self._kind.is_position else self._kind.velocity(message)
+            v = message.velocity if self._kind.position else self._kind.velocity(message)
             return [v.x, v.y, v.z], turning(message)
         q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
         given = (
@@ -229,7 +229,7 @@ class _Numbers:
     def _claimed_variance(self, message: Any) -> float:
         if self._kind is None:
             return heading_variance(message.orientation_covariance)
-        given = message.covariance if self._kind.is_position else self._kind.covariance(message)
+        given = message.covariance if self._kind.position else self._kind.covariance(message)
         if given is None or self._kind.lacks_covariance(message):
             return math.nan
         flat = np.asarray(given, dtype=float).ravel()
@@ -250,20 +250,14 @@ class _Numbers:
         return stamps_ns, log_ns, values, beside, order[whole[order]]
 
 
-def _differences(messages: Iterable[tuple[int, int, Any]]) -> list[tuple[int, int, Any]]:
-    """Satellite positions as the velocities between them, at the middle of each window."""
-    difference = FixDifference()
+def _differences(messages: Iterable[tuple[int, int, Any]], kind: PositionType) -> list[tuple[int, int, Any]]:
+    """Positions as the velocities between them, at the middle of each window."""
+    difference = FixDifference(between=kind.between)
     found = []
     for arrival, log_ns, message in messages:
         at_ns = stamped(message, log_ns)
-        fixed = difference(
-            at_ns,
-            message.latitude,
-            message.longitude,
-            message.altitude,
-            message.position_covariance if message.position_covariance_type else None,
-        )
-        if fixed is not None and message.status.status >= 0:
+        fixed = difference(at_ns, *kind.place(message), kind.covariance(message))
+        if fixed is not None and kind.is_valid(message):
             velocity = SimpleNamespace(**dict(zip("xyz", fixed.velocity, strict=True)))
             seconds, nanoseconds = divmod(fixed.stamp_ns, 1_000_000_000)
             header = SimpleNamespace(

@@ -15,7 +15,7 @@ from ..calibration.samples import Codes, Stamps
 from ..calibration.screening import NOT_MEASURED_VARIANCE, screen_columns
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.fixes import FixDifference
+from ..messages.fixes import FixDifference, PositionType
 from .columns import Laid, TopicColumns, stamped
 from .look import FASTEST
 
@@ -67,8 +67,9 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
                 refused[rules[code - 1].counter] += int(np.count_nonzero(part.laid.broken == code))
     singly = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
     rows: list[_Row] = []
-    if msgtype in VELOCITY_TYPES and VELOCITY_TYPES[msgtype].is_position:
-        rows = _differences(singly, parameters)
+    position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None
+    if position is not None:
+        rows = _differences(singly, position, parameters)
     else:
         for arrival, log_ns, message, _ in singly:
             try:
@@ -131,16 +132,15 @@ def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Para
     return _Row(arrival, log_ns, at_ns, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
 
 
-def _differences(singly: Sequence[tuple[int, int, Any, str]], parameters: Parameters) -> list[_Row]:
-    """Satellite positions as the velocities between them."""
-    difference = FixDifference(parameters.position_window)
+def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType, parameters: Parameters) -> list[_Row]:
+    """Positions as the velocities between them."""
+    difference = FixDifference(parameters.position_window, kind.between)
     rows = []
     for arrival, log_ns, message, _ in singly:
-        if message is None or message.status.status < 0:
+        if message is None or not kind.is_valid(message):
             continue
-        given = message.position_covariance if message.position_covariance_type else None
         at_ns = stamped(message, log_ns)
-        found = difference(at_ns, message.latitude, message.longitude, message.altitude, given)
+        found = difference(at_ns, *kind.place(message), kind.covariance(message))
         if found is not None:
             variances = np.full(3, np.nan) if found.covariance is None else np.diag(found.covariance)
             # by the log time of the middle of its window, as if it had been measured then

@@ -17,6 +17,7 @@ from .replay import Replayed
 def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]:
     """Plain data of a replay, of the models asked for. Segments are in s since the first DVL sample."""
     result = replayed.result
+    told = [name for name in models if name in result.estimates]
     segments = []
     with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
         ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
@@ -29,8 +30,8 @@ def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]
             for segment, end in zip(result.segments, ends, strict=True)
         ]
     return {
-        "models": {name: estimate_document(result.estimates[name]) for name in models},
-        "verification": {name: verification_document(result.verifications[name]) for name in models},
+        "models": {name: estimate_document(result.estimates[name]) for name in told},
+        "verification": {name: verification_document(result.verifications[name]) for name in told},
         "selected": segments,
         **days_document(result),
         "counts": {name: dict(counts) for name, counts in result.counts.items()},

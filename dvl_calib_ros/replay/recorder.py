@@ -130,7 +130,7 @@ class Recorder:
             stamps_ns=np.append(stamps_ns[numbers], calibrator.last_ns or 0),
             models={
                 name: _model_history(estimates[name], calibrator, self.trace, numbers, stamps_ns[numbers])
-                for name in MODELS
+                for name in estimates
             },
             paired_share=_share(np.column_stack([paired[at], decided[at]])) if len(at) else np.full(1, np.nan),
             dvl_ns=dvl_ns.astype(np.int64),

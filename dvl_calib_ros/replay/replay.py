@@ -117,6 +117,7 @@ def replay(
         recordings_ns=recording.between_ns,
     )
     decoder = MessageDecoder(calibrator.parameters)
+    decoder.on_fix = calibrator.feed_fix
     _feed_all(recording, chosen, decoder, calibrator, on_progress)
     calibrator.finish()
     on_finished(calibrator)

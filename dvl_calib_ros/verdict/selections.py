@@ -56,6 +56,18 @@ SELECTIONS = (
         "Turns to one side at one speed do not tell a lever arm from an angle.",
         "",
     ),
+    _Said(
+        "POSITIONS_NOISY",
+        "velocities made of the positions would be off by {noise:.1f} m/s, so these are compared over legs",
+        "Positions with metres of noise: USBL, plain GPS.",
+        "",
+    ),
+    _Said(
+        "POSITIONS_SELDOM",
+        "positions come too seldom to make velocities of them, so these are compared over legs",
+        "More than three times position_window between two.",
+        "",
+    ),
     _Said("ARM_SHOWN", "a lever arm of {axes} m", "Another than the one that was given.", ""),
     _Said("DELAY_SHOWN", "DVL stamps {seconds:.2f} s {way}", "Against the clocks of reference and IMU.", ""),
     _Said("ARM_OR_DELAY_NOT_TOLD", "a lever arm or a delay", "Neither shows by itself.", ""),

@@ -17,7 +17,7 @@ from yaml_text import parsed
 
 from dvl_calib_ros import __version__
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.cli.commands import COMMANDS
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
@@ -196,9 +196,9 @@ def test_replay_json_has_the_documented_structure(document, bag):
     }  # fmt: skip
     assert document["recordings"] is None  # of one there is nothing to compare
     assert document["dvl"] == {"type": TWIST_TYPE, "turned_from_frd": False}
-    assert set(document["verification"]) == set(MODELS)
-    assert list(document["models"]) == list(MODELS)
-    for name, model in MODELS.items():
+    assert set(document["verification"]) == set(BY_VELOCITY)
+    assert tuple(document["models"]) == BY_VELOCITY
+    for name, model in ((name, MODELS[name]) for name in BY_VELOCITY):
         entry = document["models"][name]
         covariances = {"covariance", "covariance_of_recording", "covariance_of_filter"}
         assert set(entry) == {"state_names", "state", *covariances, "used", "gated", "convergence"}

@@ -37,7 +37,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros import NODE, World, until
 from std_srvs.srv import Trigger
 
-from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models import BY_VELOCITY
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.disk.yaml_files import load_yaml
@@ -285,7 +285,7 @@ def assert_survived(fault: Fault, node: Live) -> None:
         assert saved["counts"][stream][counter] == expected
     if fault.without is not None:
         clean = Offline(PARAMETERS).feed(as_messages(fault.without)).calibrator
-        for model in MODELS:
+        for model in BY_VELOCITY:
             np.testing.assert_allclose(saved["models"][model]["state"], clean.published(model).x, rtol=0, atol=1e-12)
     else:
         assert_near_truth(saved)
@@ -386,7 +386,7 @@ def test_a_best_effort_publisher_that_comes_later_is_heard_and_the_reliable_one_
 
 
 def test_a_storm_of_parameters_good_and_bad_costs_no_sample_and_ends_where_it_should(node):
-    messages, names = as_messages(CLEAN), [*MODELS, "M9"]
+    messages, names = as_messages(CLEAN), [*BY_VELOCITY, "M9"]
     asked, refused = [], []
     for number in range(0, len(messages), 6):
         node.publish(messages[number : number + 6])
@@ -397,7 +397,7 @@ def test_a_storm_of_parameters_good_and_bad_costs_no_sample_and_ends_where_it_sh
     assert asked.count("M9") > 5 and len(refused) == asked.count("M9") and all("'M9'" in reason for reason in refused)
     replay = Offline(PARAMETERS).feed(messages)
     saved, expected = node.when_like(replay), replay.calibrator.result()
-    for name in MODELS:
+    for name in BY_VELOCITY:
         np.testing.assert_allclose(saved["models"][name]["state"], expected.estimates[name].state, rtol=0, atol=1e-12)
     assert saved["counts"] == expected.counts and saved["model"] == "G1"
 
@@ -530,7 +530,7 @@ def test_a_result_file_whose_folder_goes_comes_back_or_becomes_something_else_co
     printed = process.output.partition("The result follows.\n")[2]
     file.parent.mkdir()
     file.write_text(printed)
-    assert len(load_initial_calibration(file)) == len(MODELS)
+    assert len(load_initial_calibration(file)) == len(BY_VELOCITY)
     world.close()
 
 

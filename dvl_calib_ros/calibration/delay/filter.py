@@ -99,7 +99,7 @@ class DelayFilter(Estimator):
         self._together = given.together
         self._gathered: list[Block] = []
         # by the stamp from which on they are told: those that are being solved, and the number of each among them
-        self._coming: deque[tuple[int, Solved, int]] = deque()
+        self._coming: deque[tuple[int, Solved[list[Outcome]], int]] = deque()
         self._gathered_ns: list[int] = []  # the same of those that are not
         self._is_telling = self._is_settled = False
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # asked for by each model's verification

@@ -9,18 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ..delay.model import G2
+from ..displacement.model import D1
 from .base import N_MEASUREMENT, Linearised, Model, Needs, Nuisance
 from .own import OWN
 from .plugged import plugged_models
 from .published import PUBLISHED
 
 __all__ = [
-    "BROKEN", "EXTENDED_BY", "LINEAR_MODELS", "MODELS", "N_MEASUREMENT", "WITH_HEADINGS", "Linearised", "Model",
-    "Needs", "Nuisance",
+    "BROKEN", "BY_VELOCITY", "EXTENDED_BY", "LINEAR_MODELS", "MODELS", "N_MEASUREMENT", "WITH_HEADINGS",
+    "WITH_POSITIONS", "Linearised", "Model", "Needs", "Nuisance",
 ]  # fmt: skip
 
 _G1, *_WITHOUT_REFERENCE = OWN
-_OWN = {model.name: model for model in (*PUBLISHED, _G1, G2, *_WITHOUT_REFERENCE)}
+_OWN = {model.name: model for model in (*PUBLISHED, _G1, G2, *_WITHOUT_REFERENCE, D1)}
 _PLUGGED, _PROBLEMS = plugged_models(_OWN)
 MODELS: Mapping[str, Model] = _OWN | _PLUGGED
 # What is wrong with models of other packages that cannot be used.
@@ -35,3 +36,7 @@ EXTENDED_BY: Mapping[str, str] = {
 WITH_HEADINGS: Mapping[str, str] = {
     model.instead_of: name for name, model in MODELS.items() if model.instead_of is not None
 }
+# The model that goes by positions; '' for none.
+WITH_POSITIONS: str = next((name for name, model in MODELS.items() if model.from_positions), "")
+# Those that go by velocities, or by none.
+BY_VELOCITY: tuple[str, ...] = tuple(name for name, model in MODELS.items() if not model.from_positions)

@@ -69,7 +69,8 @@ class Model:
     its states, '' for the linear filter.
     sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
     for none. uses_height: it wants `Observations.height`. instead_of: the model that `auto` leaves for this one once
-    headings show the current (headings.py).
+    headings show the current (headings.py). from_positions: it goes by positions, not by velocities made of them;
+    `auto` takes it where these are too noisy.
     """
 
     name: str
@@ -93,11 +94,12 @@ class Model:
     instead_of: str | None = None
     sideslip_std: float = 0.0
     uses_height: bool = False
+    from_positions: bool = False
 
     @property
     def aided(self) -> bool:
-        """Whether it needs a reference velocity (GNSS)."""
-        return self.needs is Needs.REFERENCE
+        """Whether it needs a reference: velocities, or positions."""
+        return self.needs is Needs.REFERENCE or self.from_positions
 
     @property
     def n_errors(self) -> int:

@@ -15,7 +15,7 @@ from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, fe
 from dvl_calib_ros.calibration import bank
 from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models import MODELS, Needs
+from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 
@@ -25,7 +25,7 @@ NOISY = MatchedRun(phi=(0.02, -0.03, 0.04), scale=0.004, dvl_std=0.01, gnss_std=
 # the matched run holds its depth exactly, which would pass for a receiver without a vertical velocity
 WIDE = Parameters(initial_std_misalignment=1.0, initial_std_scale=0.5, gnss_aided_std=1e-3, gnss_axes="xyz")
 SPARSE = variant(NOISY, **ONE_HERTZ)  # for what is tried sample by sample
-AIDED = [name for name, model in MODELS.items() if model.aided]
+AIDED = [name for name in BY_VELOCITY if MODELS[name].aided]
 
 
 def with_m1(samples, parameters=WIDE) -> Calibrator:
@@ -34,7 +34,7 @@ def with_m1(samples, parameters=WIDE) -> Calibrator:
 
 
 def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
-    for name in MODELS:
+    for name in BY_VELOCITY:
         np.testing.assert_allclose(a.state(name).x, b.state(name).x, rtol=0, atol=atol)
         np.testing.assert_allclose(a.state(name).p, b.state(name).p, rtol=0, atol=atol)
     assert a.selection.segments == b.selection.segments
@@ -47,7 +47,11 @@ def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
 def test_a_model_without_the_others_is_what_it_is_among_them(names, one_by_one):
     samples = make_samples(variant(NOISY, seconds=30))
     alone = calibrate(samples, models=names, verified=True)
-    assert [*alone.result().estimates] == [*alone.result().verifications] == [name for name in MODELS if name in names]
+    assert (
+        [*alone.result().estimates]
+        == [*alone.result().verifications]
+        == [name for name in BY_VELOCITY if name in names]
+    )
     for name in names:
         np.testing.assert_allclose(alone.state(name).x, one_by_one.state(name).x, rtol=0, atol=1e-12)
         np.testing.assert_allclose(alone.state(name).p, one_by_one.state(name).p, rtol=0, atol=1e-12)
@@ -226,7 +230,7 @@ def test_switching_models_at_any_time_equals_having_run_that_model_from_the_star
     for at, sample in enumerate(samples):
         feed(switched, [sample])
         if at % 50 == 0:
-            name = source.choice(list(MODELS))
+            name = source.choice(BY_VELOCITY)
             switched.set_parameters(switched.parameters.replace(model=name))
             from_start = calibrate(samples[: at + 1], Parameters(model=name), block_size=1)
             assert switched.selected == from_start.selected == name
@@ -268,7 +272,7 @@ def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expec
     assert [segment.model for segment in iac.selection.segments] == [*expected, *expected]
     assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in auto.selection.segments]
     assert iac.result().selected_because.sentence == "iac: GNSS is available"
-    for name in MODELS:  # what is selected changes no estimate
+    for name in BY_VELOCITY:  # what is selected changes no estimate
         np.testing.assert_array_equal(iac.state(name).x, auto.state(name).x)
 
 
@@ -395,7 +399,7 @@ def test_whatever_comes_the_counts_add_up_and_the_state_stays_finite(seed):
             orientation = source.choice([None, (0.0, 0.0, 0.0, 1.0), (*vector, 0.5)])
             calibrator.feed_imu(ImuSample(at, orientation, source.choice([None, vector])))
     check_sums(calibrator)
-    for name in MODELS:
+    for name in BY_VELOCITY:
         state = calibrator.state(name)
         assert np.isfinite(state.x).all()
         assert np.linalg.eigvalsh(state.p)[0] > 0.0
@@ -411,7 +415,7 @@ def check_sums(calibrator: Calibrator):
     assert dvl["accepted"] == dvl["usable"] + sum(dvl[key] for key in unused)
     passed_on = dvl["accepted"] - dvl["awaiting_imu"]
     assert passed_on == pairing["paired"] + pairing["unpaired"] + pairing["awaiting_reference"]
-    for name, model in MODELS.items():
+    for name, model in ((name, MODELS[name]) for name in BY_VELOCITY):
         estimate = calibrator.estimate(name)
         given_to = estimate.used + estimate.gated
         given = {Needs.NOTHING: dvl["usable"], Needs.ATTITUDE: pairing["oriented"], Needs.REFERENCE: pairing["paired"]}
@@ -746,7 +750,7 @@ def test_any_parameters_inside_their_bounds_with_any_covariances_leave_every_sta
         assert parameters.prior_source == "reference"
         return
     check_finite(calibrator)
-    for name in MODELS:
+    for name in BY_VELOCITY:
         assert np.linalg.eigvalsh(calibrator.state(name).p)[0] > 0.0, name
     if not given_values:  # what is no covariance is kept out, and not left to the gate or the last guard
         assert not any(name.endswith("restarted") for name in calibrator.counts["calibration"])

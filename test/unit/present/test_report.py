@@ -17,7 +17,7 @@ from io_fixtures import run, steady_run, write_bag
 from report_fixtures import FEW, Page, assert_described, drawn, evaluation, recorded, replay_page
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
@@ -38,7 +38,7 @@ def made(tmp_path_factory):
     """A report of a replay, and what was replayed."""
     with pytest.MonkeyPatch.context() as monkeypatch:
         drawn(monkeypatch)  # they take most of the time; `evaluated` has them
-        path, replayed = replay_page(tmp_path_factory.mktemp("report"), models=MODELS)
+        path, replayed = replay_page(tmp_path_factory.mktemp("report"), models=BY_VELOCITY)
     return Page(path), replayed
 
 
@@ -140,7 +140,7 @@ def test_warnings_are_shown(tmp_path):
 @pytest.mark.slow
 def test_every_figure_has_alternative_text_and_labelled_axes(tmp_path, monkeypatch):
     figures = drawn(monkeypatch)
-    page = Page(replay_page(tmp_path, models=MODELS)[0])
+    page = Page(replay_page(tmp_path, models=BY_VELOCITY)[0])
     path = tmp_path / "evaluation.html"
     write_report(path, evaluation())
     images = [*page.images(), *Page(path).images()]
@@ -395,7 +395,7 @@ def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_p
     html = path.read_text()
     assert '<td class="good">0.0300<small>0.0301 ×1.00</small></td>' in html
     assert '<td class="bad">' in html  # M2, far from the 0.10 of the made-up publication
-    last = list(MODELS)[-1]
+    last = BY_VELOCITY[-1]
     assert Page(path).row(last)[2:4] == ["–", "–"]  # no attitude there: neither the set nor the mean
 
 

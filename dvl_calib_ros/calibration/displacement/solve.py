@@ -1,0 +1,267 @@
+"""What positions tell of the DVL: least squares over legs of any length, with noise that lasts, and without outliers.
+
+Fixes less dead reckoning are y = o + J θ + noise, with o a constant of each stretch. Means over blocks of time are
+fitted at once; the noise of these is white, beside it a Gauss-Markov process (multipath, a beacon's sound speed) and a
+random walk (dead reckoning's own), as large and as lasting as a grid of hypotheses says. What is told is the mixture of
+all, by their evidence, so σ holds that the noise is not known either. θ: misalignment (3) rad, scale, lever arm (3) m
+beyond the parameters', by what fixes are late s, and coefficients (5) of the heading's deviation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..error_model import correction_matrix
+from ..frames import Array
+from ..kalman import GaussianState
+from ..parameters import Parameters
+from ..robust import median, robust_std
+from ..samples import Index, Mask
+from .legs import Legs
+
+N_ERRORS, N_THETA = 4, 13
+SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
+# Fewer fixes prove nothing.
+ENOUGH_FIXES = 12
+# Blocks of time, s: as many as can be solved at once, and no shorter.
+SHORTEST_BLOCK_S, MOST_BLOCKS = 10.0, 120
+# A fix is an outlier from so many σ beyond the median of so many neighbours to either side.
+OUTLYING, NEIGHBOURS = 4.5, 6
+# Outliers that last for minutes are so many σ from the median of all of a stretch: what drifts is spread evenly.
+FAR_OUT = 6.0
+# Huber's bound, σ, of a first fit.
+HUBER = 1.5
+# Hypotheses of noise: variance that lasts, of a block's white one, and for how long, s; variance that a random walk
+# gathers in WALK_S; how much larger a heading deviates than the parameter says (as of `heading_states`).
+LASTING: tuple[float, ...] = (0.3, 1.5, 8.0, 40.0)
+LASTING_S: tuple[float, ...] = (20.0, 60.0, 180.0, 600.0)
+WALKED, WALK_S = (0.0, 0.03, 0.3, 3.0), 300.0
+DEVIATES: Array = np.array([0.3, 1.0, 3.0])
+_DEVIATES_LOG: Array = -0.5 * (np.log(DEVIATES) / np.log(4.0)) ** 2
+_SHARE: Array = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
+# A stretch begins anywhere: its variance, of the largest other.
+ANYWHERE = 1e5
+ROUNDS = 3
+# No fix is better beside dead reckoning, m: in turns, late ones are off by half the acceleration times their lateness².
+FINEST_M = 0.3
+
+
+class DisplacementFit(NamedTuple):
+    """What was found. state: θ (13,) and its covariance. noise_m: standard deviation of a fix, white, of one axis.
+    used (N,): which fixes are no outliers."""
+
+    state: GaussianState
+    noise_m: float
+    used: Mask
+
+    @property
+    def errors(self) -> GaussianState:
+        """Misalignment and scale: D1's states."""
+        return GaussianState(self.state.x[:N_ERRORS], self.state.p[:N_ERRORS, :N_ERRORS])
+
+
+class _Linear(NamedTuple):
+    """y (N, 3) m and its columns (N, 3, 13) for absolute θ."""
+
+    y: Array
+    columns: Array
+
+
+class _Blocks(NamedTuple):
+    """Means over B blocks. seconds, stretch, weight (B,): fixes in each. y (A, B), columns (A, B, 13) of A axes."""
+
+    seconds: Array
+    stretch: Index
+    weight: Array
+    y: Array
+    columns: Array
+
+
+def white_noise(legs: Legs) -> float:
+    """Standard deviation of a fix beside its neighbours, m, of one axis, as the DVL is mounted."""
+    step = np.diff(legs.seconds)[:, None]
+    moved = np.diff(legs.position, axis=0) - 0.5 * step * (legs.velocity[1:] + legs.velocity[:-1])
+    return float(robust_std(moved[:, :2]).mean()) / math.sqrt(2.0)
+
+
+def _prior(errors: GaussianState, parameters: Parameters, span_s: float) -> GaussianState:
+    """θ before any data."""
+    p = parameters
+    deviation = p.heading_deviation_std * _SHARE / np.array([1.0, 1.0, 1.0, 1.0, max(span_s, 60.0)])
+    rest = np.array([*[p.initial_std_lever_arm] * 3, p.initial_std_time_offset, *np.maximum(deviation, 1e-12)])
+    covariance = np.diag(np.concatenate([np.zeros(N_ERRORS), rest**2]))
+    covariance[:N_ERRORS, :N_ERRORS] = errors.p
+    return GaussianState(np.concatenate([errors.x, np.zeros(len(rest))]), covariance)
+
+
+def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
+    """What all legs tell; None where there are too few. errors: misalignment and scale before them."""
+    if len(legs.seconds) < ENOUGH_FIXES:
+        return None
+    prior = _prior(errors, parameters, float(np.ptp(legs.seconds)))
+    std = np.sqrt(np.diag(prior.p))
+    theta = prior.x
+    for _ in range(ROUNDS):
+        theta = _first_fit(linear_about(legs, theta, parameters), legs, std)
+    used = np.ones(len(legs.seconds), dtype=bool)
+    state = GaussianState(theta, prior.p)
+    noise = 0.0
+    for _ in range(ROUNDS):
+        linear = linear_about(legs, state.x, parameters)
+        left = linear.y - linear.columns @ state.x
+        used = _no_outliers(left[:, :2], legs.stretch)
+        if used.sum() < ENOUGH_FIXES:
+            return None
+        state, noise = _fitted(_means(linear, legs, used, (0, 1)), prior)
+        has_height = used & np.isfinite(legs.variance[:, 2]) & np.isfinite(legs.position[:, 2])
+        if has_height.sum() >= ENOUGH_FIXES:
+            state, _ = _fitted(_means(linear, legs, has_height, (2,)), state)
+    # nobody knows when a heading that drifts is right; and by a pitch ε that is not known the way is longer by ε²/2
+    span_s, (x, p) = float(np.ptp(legs.seconds)), state
+    _, across, up = parameters.rotation_dvl_from_body.T
+    p[SCALE, SCALE] += 0.75 * float(across @ p[:3, :3] @ across) ** 2
+    p[:3, :3] += np.outer(up, up) * (x[DRIFT] ** 2 + p[DRIFT, DRIFT]) * span_s**2 / 12.0
+    return DisplacementFit(state, noise, used)
+
+
+def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
+    """Fixes less dead reckoning about θ, as linear in it."""
+    t = parameters.rotation_dvl_from_body
+
+    def matrix(errors: Array) -> Array:
+        return correction_matrix(errors[:3], np.full(3, errors[3]), t)
+
+    errors = theta[:N_ERRORS]
+    nudges = 1e-5 * np.eye(N_ERRORS)
+    slopes = [(matrix(errors + each) - matrix(errors - each)) / 2e-5 for each in nudges]
+    columns = np.empty((len(legs.seconds), 3, N_THETA))
+    for place, slope in enumerate(slopes):
+        columns[:, :, place] = np.einsum("nabc,bc->na", legs.way, slope)
+    # of the way's horizontal a misalignment about the level axes is next to nothing, and nothing is to be claimed by it
+    up = t[:, 2]
+    columns[:, :2, :3] = (columns[:, :2, :3] @ up)[..., None] * up
+    columns[:, :, ARM] = -legs.rotation
+    columns[:, :, LATE] = -legs.velocity
+    columns[:, :, DEVIATION] = -legs.drifted
+    # a drift has no mean over the run: yaw has that
+    east, north, _ = np.einsum("nabc,bc->na", legs.way, t.T).T
+    columns[:, 0, DRIFT] -= north * legs.seconds.mean()
+    columns[:, 1, DRIFT] += east * legs.seconds.mean()
+    way = np.einsum("nabc,bc->na", legs.way, matrix(errors))
+    y = legs.position - way + legs.rotation @ np.array(parameters.lever_arm)
+    return _Linear(y + columns[:, :, :N_ERRORS] @ errors, columns)
+
+
+def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
+    """θ (13,) by least squares with Huber's weights, noise being white."""
+    own = (legs.stretch[:, None] == np.unique(legs.stretch)).astype(float)
+    n, s = own.shape
+    x = np.zeros((2 * n, N_THETA + 2 * s))
+    for axis in (0, 1):
+        x[axis * n : (axis + 1) * n, :N_THETA] = linear.columns[:, axis]
+        x[axis * n : (axis + 1) * n, N_THETA + axis * s : N_THETA + (axis + 1) * s] = own
+    y = linear.y[:, :2].T.ravel()
+    weight, level = np.ones(2 * n), 1.0
+    for _ in range(12):
+        ridge = np.concatenate([(level / std) ** 2, np.full(2 * s, 1e-9)])
+        theta = np.linalg.solve((x.T * weight) @ x + np.diag(ridge), (x.T * weight) @ y)
+        left = np.abs(y - x @ theta)
+        level = max(float(median(left)) * 1.4826, 1e-6)
+        weight = np.minimum(1.0, HUBER * level / np.maximum(left, 1e-9))
+    return np.asarray(theta[:N_THETA])
+
+
+def _no_outliers(left: Array, stretch: Index) -> Mask:
+    """Which of N fixes are none, by what is left of them (N, 2) m."""
+    n = len(left)
+    places = np.clip(np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, n - 1)
+    near = np.where((stretch[places] == stretch[:, None])[..., None], left[places], np.nan)
+    away = left - np.nanmedian(near, axis=1)
+    near_enough = np.abs(away) < OUTLYING * np.maximum(robust_std(away), 1e-6)
+    centred = left.copy()
+    for each in np.unique(stretch):
+        own = stretch == each
+        centred[own] -= median(left[own])
+    in_reach = np.abs(centred) < FAR_OUT * np.maximum(robust_std(centred), FINEST_M)
+    return np.asarray((near_enough & in_reach).all(axis=1))
+
+
+def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Blocks:
+    """Means over blocks of time, of fixes in use."""
+    at = np.flatnonzero(use)
+    seconds = legs.seconds[at]
+    length = max(SHORTEST_BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
+    number = np.floor((seconds - seconds[0]) / length).astype(np.intp)
+    key = np.stack([legs.stretch[at], number])
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))
+    weight = np.diff(np.append(first, len(at))).astype(float)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, first, axis=0)) / weight.reshape(-1, *[1] * (values.ndim - 1))
+
+    y, columns = mean(linear.y[at][:, axes]), mean(linear.columns[at][:, axes])
+    return _Blocks(mean(seconds), legs.stretch[at][first], weight, y.T, columns.swapaxes(0, 1))
+
+
+def _hypotheses(blocks: _Blocks) -> Array:
+    """Covariances (G, B, B) of the noise, of a fix's white variance."""
+    t, white = blocks.seconds, 1.0 / blocks.weight
+    usual = float(median(white))
+    same = blocks.stretch[:, None] == blocks.stretch
+    starts = np.array([t[blocks.stretch == each][0] for each in blocks.stretch])
+    walk = np.where(same, np.minimum(t[:, None], t) - starts[:, None], 0.0) / WALK_S
+    apart = np.abs(t[:, None] - t)
+    lasting = [np.zeros_like(apart)] + [size * np.exp(-apart / tau) for size in LASTING for tau in LASTING_S]
+    each = np.array([one + more * walk for one in lasting for more in WALKED]) * usual + np.diag(white)
+    most = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
+    return np.asarray(each + ANYWHERE * most[:, None, None] * same)
+
+
+def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float]:
+    """Posterior by the mixture of all hypotheses, and white noise of one fix, m."""
+    covariance = _hypotheses(blocks)
+    axes, n, _ = blocks.columns.shape
+    root = np.linalg.cholesky(covariance)
+    log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    rows = np.concatenate([blocks.y[:, :, None], blocks.columns], axis=2)
+    rows = rows - rows.mean(axis=1, keepdims=True)  # of a stretch that begins anywhere it is no matter
+    whitened = np.linalg.solve(root[:, None], rows[None])  # (G, A, B, 14)
+    square = np.einsum("gabi,gabj->gij", whitened, whitened)
+    yy, by, told = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
+    freedom = float(axes * (n - len(np.unique(blocks.stretch))))
+    # hypotheses of the deviation beside those of the noise: (G, F, ...)
+    wider = np.ones((len(DEVIATES), N_THETA))
+    wider[:, DEVIATION] = DEVIATES[:, None]
+    known = np.linalg.inv(prior.p * wider[:, :, None] * wider[:, None, :])
+    level = np.maximum(yy / max(freedom, 1.0), FINEST_M**2)[:, None] * np.ones(len(DEVIATES))
+    for _ in range(6):
+        information = known + told[:, None] / level[..., None, None]
+        vector = (known @ prior.x) + by[:, None] / level[..., None]
+        x = np.linalg.solve(information, vector[..., None])[..., 0]
+        left = yy[:, None] - 2.0 * (x * by[:, None]).sum(axis=-1) + np.einsum("gfi,gij,gfj->gf", x, told, x)
+        spent = np.trace(np.linalg.solve(information, told[:, None] / level[..., None, None]), axis1=2, axis2=3)
+        level = np.maximum(left / np.maximum(freedom - spent, 1.0), FINEST_M**2)
+    information = known + told[:, None] / level[..., None, None]
+    p = np.linalg.inv(information)
+    away = x - prior.x
+    misfit = left / level + np.einsum("gfi,fij,gfj->gf", away, known, away)
+    likely = -0.5 * (
+        misfit
+        + freedom * np.log(level)
+        + axes * log_det[:, None]
+        + np.linalg.slogdet(information)[1]
+        - np.linalg.slogdet(known)[1]
+    )
+    likely = likely + _DEVIATES_LOG
+    share = np.exp(likely - likely.max())
+    share /= share.sum()
+    mean = np.einsum("gf,gfi->i", share, x)
+    apart = x - mean
+    # the level is found by so few: Student's t
+    few = np.maximum(freedom - spent, 3.0)
+    p = p * (few / (few - 2.0))[..., None, None]
+    total = np.einsum("gf,gfij->ij", share, p) + np.einsum("gf,gfi,gfj->ij", share, apart, apart)
+    return GaussianState(mean, 0.5 * (total + total.T)), float(np.sqrt((share * level).sum()))

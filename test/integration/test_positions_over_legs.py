@@ -1,0 +1,184 @@
+"""Positions with metres of noise, as recordings hold them: read, chosen by `auto`, live as in replay, and verified."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from position_fixtures import Noise, Truth, driven
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
+from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.models import WITH_POSITIONS
+from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample
+from dvl_calib_ros.discovery.discover import discover
+from dvl_calib_ros.files.trajectories import ImportOptions, import_recording
+from dvl_calib_ros.messages.drivers import POSE_TYPE
+from dvl_calib_ros.messages.encode import SampleWriter
+from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.opening import open_bags
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
+from dvl_calib_ros.replay.replay import replay
+
+TRUTH = Truth((0.0, 0.01, 0.03), 0.006, (0.5, 0.0, -0.3), 0.5)
+USBL = "usbl/pose"
+TOPICS = Topics(gnss=USBL)
+
+
+@cache
+def run(noise=Noise(), seconds=900.0, fix_s=1.0):  # noqa: B008
+    return driven(np.random.default_rng(3), seconds, truth=TRUTH, noise=noise, fix_s=fix_s)
+
+
+def write(path: Path, driven_run, topic: str = USBL) -> Path:
+    stamps, velocity, quaternion, fixes = driven_run
+    rotation = Rotation.from_quat(quaternion)
+    rates = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / (1e-9 * np.diff(stamps))[:, None]
+    with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:
+        writer, types = SampleWriter(bag), bag.typestore.types
+        # a fix takes a second through the water and the deck unit
+        rows = heapq.merge(
+            ((int(stamp), 0, row) for row, stamp in enumerate(stamps)),
+            ((int(stamp) + 1_000_000_000, 1, row) for row, stamp in enumerate(fixes.stamps_ns)),
+        )
+        for log_ns, is_fix, row in rows:
+            if not is_fix:
+                rate = rates[min(row, len(rates) - 1)].tolist()
+                writer.imu("imu/data", ImuSample(log_ns, tuple(quaternion[row].tolist()), tuple(rate)))
+                writer.dvl("dvl/twist", DvlSample(log_ns, tuple(velocity[row].tolist())))
+                continue
+            covariance = np.diag([*np.where(np.isnan(fixes.variance[row]), 1e7, fixes.variance[row]), 0.0, 0.0, 0.0])
+            pose = types["geometry_msgs/msg/Pose"](
+                types["geometry_msgs/msg/Point"](*fixes.position[row].tolist()),
+                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            )
+            inner = types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance.ravel())
+            message = types[POSE_TYPE](writer._header(int(fixes.stamps_ns[row]), "map"), inner)
+            bag.message(topic, POSE_TYPE, log_ns, message)
+    return path
+
+
+@pytest.fixture(scope="module")
+def usbl(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("usbl") / "bag", run())
+
+
+def test_auto_takes_legs_of_noisy_positions_and_verifies_them_on_legs_not_seen(usbl):
+    replayed = replay([usbl], Parameters(), TOPICS)
+    result = replayed.result
+    assert result.selected == WITH_POSITIONS and "compared over legs" in str(result.selected_because)
+    x, std = result.estimate.state, result.estimate.recording_std
+    assert abs(x[2] - TRUTH.phi[2]) < 3.0 * std[2] < math.radians(1.0)
+    assert abs(x[3] - TRUTH.scale) < 3.0 * std[3] < 0.02
+    observed = {each.axis: each.observed for each in result.estimate.observability}
+    assert observed["yaw"] and not observed["roll"] and not observed["pitch"]
+    held_out = result.verifications[WITH_POSITIONS].held_out
+    assert held_out is not None and held_out.corrected < 0.9 * held_out.uncorrected
+    assert held_out.corrected < 1.2 * held_out.predicted
+    assert result.verifications[WITH_POSITIONS].verdict.value == "accept"
+    assert (
+        replayed.navigation is not None and replayed.navigation.after.per_km < 0.6 * replayed.navigation.before.per_km
+    )
+
+
+def test_a_wrong_calibration_of_positions_is_not_verified(usbl, monkeypatch):
+    """Folds that say something else: what is judged is what dead reckoning makes of legs not seen."""
+    from dvl_calib_ros.calibration.displacement import filter as of_positions
+
+    solve = of_positions.solve
+
+    def solved(legs, parameters, errors):
+        fit = solve(legs, parameters, errors)
+        if fit is not None:
+            fit.state.x[2] -= 0.1
+        return fit
+
+    monkeypatch.setattr(of_positions, "solve", solved)
+    verification = replay([usbl], Parameters(), TOPICS).result.verifications[WITH_POSITIONS]
+    assert verification.verdict.value == "reject"
+
+
+def test_where_velocities_of_positions_are_good_auto_does_not(tmp_path):
+    bag = write(tmp_path / "bag", run(Noise(0.02)))
+    result = replay([bag], Parameters(), TOPICS).result
+    assert result.selected in ("G1", "G2")
+    assert {segment.model for segment in result.segments}.isdisjoint({WITH_POSITIONS})
+
+
+@pytest.mark.slow
+def test_positions_too_seldom_for_velocities_calibrate(tmp_path):
+    bag = write(tmp_path / "bag", run(fix_s=10.0, seconds=1800.0))
+    result = replay([bag], Parameters(), TOPICS).result
+    assert result.selected == WITH_POSITIONS and "too seldom" in str(result.selected_because)
+    assert abs(result.estimate.state[2] - TRUTH.phi[2]) < 3.0 * result.estimate.recording_std[2]
+
+
+def test_live_and_replay_agree_in_state_and_in_when_it_was_chosen(tmp_path):
+    usbl = write(tmp_path / "bag", run(seconds=200.0))
+    recording = open_recording([usbl], TOPICS)
+    parameters = recording.of_types(TOPICS, Parameters())
+    with ThreadPoolExecutor(1) as worker:
+        feed = MessageFeed(Calibrator(parameters, worker=worker))
+        take = {"dvl/twist": feed.dvl, USBL: feed.reference, "imu/data": feed.imu}
+        with open_bags([usbl]) as bag:
+            for topic, log_ns, message, _ in bag.messages(take):
+                take[topic](message, log_ns)
+        live = feed.calibrator.result()
+    offline = replay(recording, Parameters(), TOPICS).result
+    assert live.selected == offline.selected == WITH_POSITIONS
+    assert live.segments == offline.segments
+    np.testing.assert_allclose(live.estimate.state, offline.estimate.state, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(live.estimate.covariance, offline.estimate.covariance, rtol=0.0, atol=1e-12)
+
+
+def test_a_pose_is_discovered_only_where_its_name_says_that_it_was_measured(tmp_path, usbl):
+    """All that navigates sends poses, most of them with the DVL in them."""
+    other = write(tmp_path / "bag", run(seconds=300.0), topic="/navigator/pose")
+    assert discover(open_recording([usbl]), Parameters()).topics.gnss == USBL
+    assert discover(open_recording([other]), Parameters()).topics.gnss != "/navigator/pose"
+
+
+def test_the_model_of_positions_is_refused_where_there_are_velocities():
+    with pytest.raises(ParameterError, match=r"goes by positions, and .*Twist.* holds velocities; name another"):
+        Calibrator(Parameters(model=WITH_POSITIONS))
+
+
+def test_latitude_and_longitude_are_imported_beside_speed_and_course(tmp_path):
+    (tmp_path / "dvl.csv").write_text("t_s,vx_mps,vy_mps,vz_mps\n" + "".join(f"{i},1,0,0\n" for i in range(5)))
+    rows = [f"{i},1.0,90.0,52.34,{12.99 + 1.5e-5 * i}\n" for i in range(5)]
+    gnss = tmp_path / "gnss.csv"
+    gnss.write_text("t_s,speed_mps,course_deg,latitude_deg,longitude_deg\n" + "".join(rows))
+    imported = import_recording(tmp_path / "dvl.csv", gnss, None, tmp_path / "bag", ImportOptions(frame="flu"))
+    assert imported.counts["gnss/fix"] == imported.counts["gnss/twist"] == 5
+    with open_bags([tmp_path / "bag"]) as bag:
+        fixes = [message for _, _, message, _ in bag.messages(["gnss/fix"])]
+    assert [fix.longitude for fix in fixes] == pytest.approx([12.99 + 1.5e-5 * i for i in range(5)], abs=1e-12)
+    assert fixes[0].position_covariance_type == 0
+
+
+def test_a_boats_positions_alone_tell_what_its_velocities_tell(tmp_path):
+    """Lake Caputh, DGPS at 10 Hz."""
+    named = os.environ.get("DVL_CALIB_CAPUTH")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data" / "caputh"
+    name = "20250117163514"
+    if not folder.is_dir():
+        pytest.skip(f"no data in {folder}")
+    parts = [folder / f"{name}_{role}.csv" for role in ("dvl", "gnss", "attitude")]
+    import_recording(*parts, tmp_path / "bag", ImportOptions(frame="flu"))
+    by_velocity = replay([tmp_path / "bag"], Parameters()).result.estimate
+    by_position = replay([tmp_path / "bag"], Parameters(model=WITH_POSITIONS), Topics(gnss="gnss/fix")).result.estimate
+    yaw = by_position.state[2] - by_velocity.state[2]
+    assert abs(yaw) < 2.0 * math.hypot(by_position.recording_std[2], by_velocity.recording_std[2])
+    assert math.degrees(by_position.std[2]) <= 0.5
+    scale = by_position.state[3] - by_velocity.state[3]
+    assert abs(scale) < 2.0 * math.hypot(by_position.recording_std[3], by_velocity.recording_std[3])

@@ -1,0 +1,137 @@
+"""D1 against a simulation of its own: positions with metres of noise tell yaw and scale, and σ covers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from position_fixtures import Noise, Truth, driven
+
+from dvl_calib_ros.calibration.assembly import prior
+from dvl_calib_ros.calibration.displacement.legs import DeadReckoning
+from dvl_calib_ros.calibration.displacement.solve import solve
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
+
+
+def fitted(run, parameters=None):
+    parameters = parameters or Parameters()
+    stamps, velocity, quaternion, fixes = run
+    reckoning = DeadReckoning(parameters.rotation_dvl_from_body)
+    reckoning.add_fixes(fixes)
+    reckoning.add_rows(stamps, velocity, quaternion)
+    return solve(reckoning.legs(), parameters, prior(MODELS["D1"], parameters))
+
+
+def errors_of(fit, truth):
+    """Error and σ of yaw (rad) and scale."""
+    x, p = fit.errors
+    return np.array([x[2] - truth.phi[2], x[3] - truth.scale]), np.sqrt(np.diag(p))[[2, 3]]
+
+
+def drawn(rng):
+    phi = rng.normal(0.0, [0.01, 0.01, 0.03])
+    return Truth(
+        tuple(phi), rng.normal(0.0, 0.005), tuple(rng.normal(0.0, 1.0, 3)), abs(rng.normal(0.0, 1.0)),
+        tuple(rng.normal(0.0, math.radians(0.5), 2)),
+    )  # fmt: skip
+
+
+NOISES = {
+    "white": Noise(),
+    "that lasts for 30 s": Noise(2.0, 2.0, 30.0),
+    "that lasts for 2 minutes": Noise(2.0, 2.0, 120.0),
+    "with outliers": Noise(2.0, 0.0, 60.0, 0.05),
+}
+
+
+@pytest.mark.parametrize("kind", NOISES)
+def test_half_an_hour_of_positions_with_2_m_of_noise_tells_yaw_and_scale(kind):
+    rng = np.random.default_rng(5)
+    truth = drawn(rng)
+    fit = fitted(driven(rng, 1800.0, truth=truth, noise=NOISES[kind]))
+    error, std = errors_of(fit, truth)
+    assert (np.abs(error) < 3.0 * std).all()
+    assert std[1] < 0.005
+    assert math.degrees(std[0]) < (0.3 if kind in ("white", "with outliers") else 0.45)
+    assert np.count_nonzero(~fit.used) > 60 if kind == "with outliers" else np.count_nonzero(~fit.used) < 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", NOISES)
+def test_sigma_covers_over_a_hundred_runs(kind):
+    inside = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        truth = drawn(rng)
+        error, std = errors_of(fitted(driven(rng, 1800.0, truth=truth, noise=NOISES[kind])), truth)
+        inside.append(np.abs(error) < 2.0 * std)
+    share = np.mean(inside, axis=0)
+    assert (share >= 0.9).all(), share
+
+
+def test_of_horizontal_positions_no_level_angle_is_claimed_and_with_heights_pitch_is_found():
+    truth = Truth((0.01, 0.02, -0.02), 0.004)
+    prior_std = Parameters().initial_std_misalignment
+    x, p = fitted(driven(np.random.default_rng(2), 1200.0, truth=truth)).errors
+    np.testing.assert_allclose(x[:2], 0.0, atol=1e-9)
+    assert (np.sqrt(np.diag(p)[:2]) > 0.95 * prior_std).all()
+    x, p = fitted(driven(np.random.default_rng(2), 1200.0, truth=truth, depths=True)).errors
+    assert abs(x[1] - 0.02) < 3.0 * math.sqrt(p[1, 1]) < 0.005
+
+
+def test_across_a_gap_of_the_dvl_nothing_is_concluded():
+    """The way in it is not known: were it taken as none, yaw would be off by degrees."""
+    rng = np.random.default_rng(8)
+    truth = Truth((0.0, 0.0, 0.02), 0.003)
+    stamps, velocity, quaternion, fixes = driven(rng, 1800.0, truth=truth)
+    seconds = 1e-9 * (stamps - stamps[0])
+    kept = ((seconds < 500.0) | (seconds > 560.0)) & ((seconds < 1100.0) | (seconds > 1130.0))
+    fit = fitted((stamps[kept], velocity[kept], quaternion[kept], fixes))
+    error, std = errors_of(fit, truth)
+    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.4
+
+
+def test_fixes_come_seldom_with_dropouts_and_a_slow_dvl():
+    rng = np.random.default_rng(9)
+    truth = Truth((0.0, 0.0, -0.03), 0.004, (1.0, 0.0, 0.0), 1.0)
+    stamps, velocity, quaternion, fixes = driven(rng, 1800.0, fix_s=10.0, dvl_hz=1.0, truth=truth)
+    heard = rng.random(len(fixes.stamps_ns)) < 0.6
+    error, std = errors_of(fitted((stamps, velocity, quaternion, fixes.part(np.flatnonzero(heard)))), truth)
+    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.5
+
+
+def test_noise_for_minutes_far_from_the_rest_is_left_out():
+    """As a receiver's under a bridge: 14 m off for a minute, all fixes alike."""
+    rng = np.random.default_rng(10)
+    truth = Truth((0.0, 0.0, 0.01), 0.003)
+    stamps, velocity, quaternion, fixes = driven(rng, 900.0, truth=truth, noise=Noise(0.3))
+    bad = slice(400, 450)
+    fixes.position[bad] += [-14.0, 6.0, 0.0]
+    fit = fitted((stamps, velocity, quaternion, fixes))
+    error, std = errors_of(fit, truth)
+    assert not fit.used[bad].any()
+    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.3
+
+
+def test_rows_one_by_one_give_what_columns_give_whenever_fixes_come():
+    parameters = Parameters()
+    stamps, velocity, quaternion, fixes = driven(np.random.default_rng(4), 300.0)
+    whole = DeadReckoning(parameters.rotation_dvl_from_body)
+    whole.add_fixes(fixes)
+    whole.add_rows(stamps, velocity, quaternion)
+    single = DeadReckoning(parameters.rotation_dvl_from_body)
+    given = 0
+    for row, stamp in enumerate(stamps.tolist()):
+        single.add_rows(stamps[row : row + 1], velocity[row : row + 1], quaternion[row : row + 1])
+        if row % 97 == 0:
+            single.legs()
+        while given < len(fixes.stamps_ns) and fixes.stamps_ns[given] + 4_000_000_000 < stamp:  # late
+            single.add_fixes(fixes.part(slice(given, given + 1)))
+            given += 1
+    one, other = whole.legs(), single.legs()
+    n = len(other.seconds)
+    assert n > 0.9 * len(one.seconds)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a[:n], b, rtol=1e-12, atol=1e-9)
