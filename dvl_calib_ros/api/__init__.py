@@ -18,7 +18,7 @@ from dataclasses import replace as with_values
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..calibration.models import MODELS
+from ..calibration.models import BY_VELOCITY
 from ..calibration.parameters import ParameterError, Parameters
 from ..diagnosis.results import Diagnosis
 from ..discovery.discover import Discovery, Given, discover
@@ -422,7 +422,7 @@ def evaluate(
     found = [] if paths is None else _paths(paths)
     named = {"dvl": dvl_topic, "gnss": gnss_topic, "imu": imu_topic}
     topics = Topics(**{stream: topic for stream, topic in named.items() if topic is not None})
-    known = tuple(MODELS) if len(found) > 1 else EVALUATED
+    known = BY_VELOCITY if len(found) > 1 else EVALUATED
     names = known if models is None else tuple(models)
     for name in names:
         if name not in known:

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
-    from ..calibration.models import MODELS
+    from ..calibration.models import BY_VELOCITY
     from ..disk.atomic import save_text
     from ..errors import InputError
     from ..evaluation.documents import evaluation_csv, evaluation_document
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..present import evaluation as present
 
     are_bags = _are_bags(arguments.paths)
-    models = common.chosen("--models", arguments.models, tuple(MODELS) if are_bags else EVALUATED)
+    models = common.chosen("--models", arguments.models, BY_VELOCITY if are_bags else EVALUATED)
     sets = common.chosen("--sets", arguments.sets, [each.name for each in SETS])
     if not 1 <= arguments.seeds <= MAX_SEEDS:
         raise InputError(f"--seeds: {arguments.seeds} is outside 1 .. {MAX_SEEDS}")
