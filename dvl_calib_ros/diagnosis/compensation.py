@@ -25,8 +25,8 @@ def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | N
     """The parameters with what was found on top: the rest of a lever arm, of a clock's offset, drift and jump.
 
     recording: of several, whose own (of the day) are wanted; None: only what belongs to the vehicle, and the day's
-    where there is but one recording. Only the first name of a set is taken. What the calibration has no parameter for
-    is left alone.
+    where there is but one recording. Only the first name of a set is taken, and of a lever arm that may be a clock the
+    parts that are one for sure. What the calibration has no parameter for is left alone.
     """
     values: dict[str, Any] = {}
     for effect in sorted(diagnosis.effects, key=lambda each: each.name == "time_offset_jump"):
@@ -39,8 +39,13 @@ def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | N
         if not found:
             continue
         if effect.name == "lever_arm":
-            axes = zip(parameters.lever_arm, ("x_m", "y_m", "z_m"), strict=True)
-            values["lever_arm"] = tuple(known + found[axis] for known, axis in axes)
+            sure = {
+                name: value
+                for name, (value, low, high) in parameter_values.items()
+                if not effect.equivalent_to or low > 0.0 or high < 0.0
+            }
+            axes = zip(parameters.lever_arm, ("x_m", "y_m", "z_m"), strict=True)  # a height is not always shown
+            values["lever_arm"] = tuple(known + sure.get(axis, 0.0) for known, axis in axes)
         elif effect.name in OFFSETS:
             name = OFFSETS[effect.name]
             values[name] = values.get(name, getattr(parameters, name)) + found["seconds"]

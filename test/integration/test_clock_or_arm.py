@@ -10,6 +10,8 @@ import pytest
 from conftest import ROOT, few
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.files.trajectories import ImportOptions, import_folder
 
 RUNS = ("20250117163514", "20250117164453", "20250130113805")
@@ -63,3 +65,6 @@ def test_the_diagnosis_claims_no_arm_ahead_either(bags, name):
     assert low < 0.0 < high
     _, low, high = arm.parameters["y_m"]  # by others +0.13 to +0.31
     assert 0.0 < low < 0.22 < high and "z_m" not in arm.parameters
+    # --apply writes what is an arm for sure; a height that is not shown ended in a traceback
+    ahead, across, up = compensated(Parameters(), diagnosis).lever_arm
+    assert ahead == up == 0.0 and across == arm.parameters["y_m"][0]
