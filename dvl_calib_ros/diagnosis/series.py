@@ -51,6 +51,11 @@ class HeldOutTwin:
     noise: Array
     regimes: Mapping[str, NDArray[np.bool_]]
 
+    @property
+    def level(self) -> float:
+        """Length of `noise`, m/s."""
+        return float(np.sqrt((self.noise**2).sum()))
+
     def errors(self, has_effects: bool) -> dict[str, Array]:
         """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
         return {"without": self.without, "with": self.with_effects} if has_effects else {"twin": self.without}

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.frames import Array
+from ..calibration.models import MODELS
 from ..verdict.answering import Answering
 
 UNCALIBRATED = "uncalibrated"
@@ -252,6 +253,22 @@ class Evaluation(Answering):
     def columns(self) -> tuple[str, ...]:
         """Names along C."""
         return (UNCALIBRATED, *self.models)
+
+    def best(self, values: Array) -> dict[str, tuple[str, float]]:
+        """Of values (C,): name and value of the lowest model with GNSS, and of that without, where there is one."""
+        found = {
+            words: [
+                (name, float(value))
+                for name, value in zip(self.columns, values, strict=True)
+                if name in MODELS and MODELS[name].aided == aided and np.isfinite(value)
+            ]
+            for words, aided in (("with GNSS", True), ("without GNSS", False))
+        }
+        return {words: min(each, key=lambda pair: pair[1]) for words, each in found.items() if each}
+
+    def of_models(self, values: Array) -> Array:
+        """Of values (..., C) those of the models (..., M)."""
+        return np.asarray(values[..., [self.columns.index(name) for name in self.models]])
 
     @property
     def seed_mean(self) -> Array:

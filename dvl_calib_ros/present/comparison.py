@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import Comparison, Difference
+from ..calibration.comparison import ChiSquare, Comparison, Difference
 from ..calibration.comparison_words import date, reasons, remarks
 from ..calibration.extrinsics import MOUNTING, Extrinsics
 from ..calibration.frames import Array, rpy_from_rotation
-from .document import Answer, Document, Section, Sentence, Table, Where, figures, with_std
+from .document import (
+    Answer,
+    Columns,
+    Document,
+    Section,
+    Sentence,
+    Table,
+    Where,
+    columns_for,
+    figures,
+    table_by,
+    with_std,
+)
 
 # Of more pairs than these a terminal shows the neighbours in time.
 MOST_PAIRS = 10
@@ -54,12 +67,19 @@ def comparison(result: Comparison) -> Document:
     neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
     near = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
     few = len(pairs) <= MOST_PAIRS
-    columns = shown_quantities(result)
-    own = [
-        (each.name, date(each.first_ns), each.model, str(each.used), *_cells(values_of(each), each.std, columns))
-        for each in ordered
-    ]
-    head = ("", "from (UTC)", "model", "samples", *(f"{each.name}, {each.unit}" for each in columns))
+    columns: Columns[Extrinsics] = {
+        "": lambda each: each.name,
+        "from (UTC)": lambda each: date(each.first_ns),
+        "model": lambda each: each.model,
+        "samples": lambda each: str(each.used),
+        **columns_for(
+            {f"{each.name}, {each.unit}": each for each in shown_quantities(result)},
+            lambda each, quantity: with_std(
+                quantity.factor * values_of(each)[quantity.component], quantity.factor * each.std[quantity.component]
+            ),
+        ),
+    }
+    own = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
     return Document(
         title="DVL calibrations compared",
         subtitle=", ".join(each.name for each in ordered),
@@ -74,7 +94,7 @@ def comparison(result: Comparison) -> Document:
                 ],
                 Where.PAGE,
             ),
-            Section("Calibrations", [Table(head, own, dense=True, notes=(OWN_NOTE,), words=3)]),
+            Section("Calibrations", [own]),
             Section(
                 "Differences, the later less the earlier",
                 [_differences(pairs, by_name)],
@@ -103,27 +123,26 @@ def values_of(each: Extrinsics) -> Array:
     return np.array([*rpy_from_rotation(each.rotation_body_from_dvl), *each.lever_arm, each.scale, each.time_offset])
 
 
-def _cells(values: Array, stds: Array, columns: Sequence[ComparedQuantity], signed: bool = False) -> list[str]:
-    return [
-        with_std(each.factor * values[each.component], each.factor * stds[each.component], signed=signed)
-        for each in columns
-    ]
+DIFFERENCES_NOTE = (
+    "Angles are the turn of the mounting about the body's axes. χ² (of so many components) of angles and lever arm "
+    "together; p: how often chance alone makes it as large."
+)
 
 
 def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
-    columns = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
-    rows = []
-    for each, name in zip(differences, names, strict=True):
-        test = each.test(MOUNTING)
-        p = f"{test.p:.2f}" if test.p >= 0.01 else f"{test.p:.0e}"
-        last = (f"{test.value:.1f} of {test.freedom}", p) if test.freedom else ("–", "–")
-        rows.append((name, *_cells(each.value, each.std, columns, signed=True), *last))
-    return Table(
-        ("", *(f"{each.turn}, {each.unit}" for each in columns), "mounting: χ²", "p"),
-        rows,
-        dense=True,
-        notes=(
-            "Angles are the turn of the mounting about the body's axes. χ² (of so many components) of angles and lever "
-            "arm together; p: how often chance alone makes it as large.",
+    shown = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
+    columns: Columns[tuple[str, Difference, ChiSquare]] = {
+        "": lambda each: each[0],
+        **columns_for(
+            {f"{each.turn}, {each.unit}": each for each in shown},
+            lambda each, quantity: with_std(
+                quantity.factor * each[1].value[quantity.component],
+                quantity.factor * each[1].std[quantity.component],
+                signed=True,
+            ),
         ),
-    )
+        "mounting: χ²": lambda each: f"{each[2].value:.1f} of {each[2].freedom}" if each[2].freedom else "–",
+        "p": lambda each: "–" if not each[2].freedom else f"{each[2].p:.{'2f' if each[2].p >= 0.01 else '0e'}}",
+    }
+    rows = [(name, each, each.test(MOUNTING)) for name, each in zip(names, differences, strict=True)]
+    return replace(table_by(columns, rows, (DIFFERENCES_NOTE,)), dense=True)

@@ -25,8 +25,18 @@ TOLD = 20
 
 def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
     """Every quantity that two have shown, a picture each. components: those alone."""
-    quantities = (each for each in shown_quantities(comparison) if each.component in components)
-    return [_picture(comparison, quantity) for quantity in quantities]
+    made = []
+    for quantity in (each for each in shown_quantities(comparison) if each.component in components):
+        at = quantity.component
+        known = [each for each in comparison.calibrations if each.shown[at]]
+        told = ", ".join(
+            f"{each.name} {quantity.factor * values_of(each)[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
+            for each in (known if len(known) <= TOLD else (known[0], known[-1]))
+        )
+        told += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
+        alt = f"{quantity.name} over time, in {quantity.unit}: {told}"
+        made.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
+    return made
 
 
 def trend_png(comparison: Comparison) -> bytes:
@@ -46,21 +56,10 @@ def trend_png(comparison: Comparison) -> bytes:
     return target.getvalue()
 
 
-def _picture(comparison: Comparison, quantity: ComparedQuantity) -> Picture:
-    def draw() -> Figure:
-        figure, axes = new_figure(height=PANEL_HEIGHT)
-        _draw(axes, comparison, quantity)
-        return figure
-
-    at = quantity.component
-    known = [each for each in comparison.calibrations if each.shown[at]]
-    told = ", ".join(
-        f"{each.name} {quantity.factor * values_of(each)[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
-        for each in (known if len(known) <= TOLD else (known[0], known[-1]))
-    )
-    told += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
-    title = f"{quantity.name.capitalize()}, {quantity.unit}"
-    return picture(title, f"{quantity.name} over time, in {quantity.unit}: {told}", draw)
+def _panel(comparison: Comparison, quantity: ComparedQuantity) -> Figure:
+    figure, axes = new_figure(height=PANEL_HEIGHT)
+    _draw(axes, comparison, quantity)
+    return figure
 
 
 def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,23 +16,28 @@ from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect
 from ..diagnosis.series import BODY_AXES, DiagnosisSeries, HeldOutTwin
 from ..diagnosis.where import GapPlace
+from ..effects.base import EffectParameter
 from ..effects.registry import EFFECTS
 from .document import (
     Answer,
     Cell,
     Columns,
     Document,
+    Figures,
+    Item,
     Number,
     Numbers,
-    Said,
     Section,
     Sentence,
     Table,
     Warned,
     Where,
+    columns_for,
     facts_by,
+    figure,
     figures,
     intervals,
+    mm,
     p_value,
     quantity,
     section,
@@ -99,7 +105,7 @@ FOUND: Columns[FoundEffect] = {
     "effect": lambda effect: " or ".join((effect.name, *effect.equivalent_to)),
     "closes alone": lambda effect: share(effect.closure),
     "p, adjusted": lambda effect: p_value(effect.p),
-    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, said_of(effect.name)), "text"),
+    "parameters (95 %)": lambda effect: Cell(intervals(effect.parameters, EFFECTS.get(effect.name)), "text"),
 }
 NEEDS: Columns[tuple[str, str]] = {"not testable": lambda each: each[0], "needs": lambda each: Cell(each[1], "text")}
 NOISE: Columns[NoiseFinding] = {
@@ -114,22 +120,21 @@ def diagnosis(d: Diagnosis) -> Document:
     """Where the DVL differs from what calibration leads to expect, which effect makes it, and what cannot be told."""
     series, has_effects = d.series, bool(d.effects)
     found = [
-        f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, said_of(e.name))}." for e in d.effects
+        f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, EFFECTS.get(e.name))}." for e in d.effects
     ]
+    known = [(each.name, EFFECTS[each.name].remedy) for each in d.effects if each.name in EFFECTS]
+    to_do = [f"To do for {name}: {remedy}." for name, remedy in known if remedy]
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
     of_each = [
-        (effect.name, recording, intervals(parameters, said_of(effect.name)))
+        (effect.name, recording, intervals(parameters, EFFECTS.get(effect.name)))
         for effect in d.effects
         for recording, parameters in effect.by_recording.items()
     ]
-    followed = (
-        figures("twin_pictures.followed_picture", series.followed, series.axes) if series and series.followed else None
-    )
     regimes = None if series is None else figures("diagnosis_pictures.regime_picture", series, has_effects)
     return Document(
         title="Sim-to-real gap of the DVL",
         subtitle="" if series is None else ", ".join(series.recordings),
-        answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found, *_to_do(d)]),
+        answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found, *to_do]),
         warnings=d.notes,
         sections=[
             section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
@@ -137,28 +142,17 @@ def diagnosis(d: Diagnosis) -> Document:
             section("", Warned(), where=Where.PAGE),
             section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
             section("", Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)),
-            section(
-                "",
-                figures("diagnosis_pictures.closure_picture", d)
-                if has_effects and math.isfinite(d.gap.closure)
-                else None,
-                where=Where.PAGE,
-            ),
+            section("", _closed(d) if has_effects and math.isfinite(d.gap.closure) else None, where=Where.PAGE),
             section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
             section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),
             *(_of_series(d, series) if series is not None else []),
-            section(
-                "What is left",
-                Sentence(_left(d)),
-                followed,
-                where=Where.PAGE,
-            ),
+            section("What is left", *_left(d), where=Where.PAGE),
             section(
                 "What this data cannot tell",
                 *_alike(d),
                 Sentence(f"Next: {d.next_manoeuvre}."),
                 table_by(NEEDS, d.untestable.items()),
-                _detectable_table(d),
+                table_by(DETECTABLE, _detectable(d), (DETECTABLE_NOTE,)),
             ),
             section("The noise", table_by(NOISE, d.noise)),
         ],
@@ -173,19 +167,20 @@ def _of_series(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
             drawn = figures("diagnosis_pictures.trace_pictures", each.name, series, axes)
             title = f"{each.name}: measured and as the effect says"
             yield section(title, drawn, Sentence(TRACES_NOTE, soft=True), where=Where.PAGE)
-    table = twin_table(series.twins, has_effects)
+    errors = [each for twin in series.twins for each in twin_errors(twin, has_effects)]
+    heads = {TWIN_HEADS.get(name, "recorded less twin, m/s"): name for name in (errors[0].errors if errors else ())}
+    columns: Columns[TwinError] = {
+        **TWIN,
+        **columns_for(heads, lambda each, name: f"{each.errors[name]:.4f}"),
+        "noise, m/s": lambda each: f"{each.twin.level:.4f}",
+    }
+    table = table_by(columns, errors, (TWIN_NOTE,), words=2)
     yield section("Recorded against the simulated twin", Sentence(TWINS_NOTE, soft=True), table, where=Where.PAGE)
     for twin in series.twins:
         yield section(twin.name, figures("twin_pictures.twin_pictures", twin, axes, has_effects), where=Where.PAGE)
 
 
 # ------------------------------------------------------------------ sentences
-
-
-def _to_do(d: Diagnosis) -> list[str]:
-    """What each effect that was found asks for."""
-    known = [effect for effect in d.effects if effect.name in EFFECTS]
-    return [f"To do for {each.name}: {EFFECTS[each.name].remedy}." for each in known if EFFECTS[each.name].remedy]
 
 
 def _alike(d: Diagnosis) -> Iterator[Sentence]:
@@ -204,71 +199,105 @@ def _alike(d: Diagnosis) -> Iterator[Sentence]:
             )
 
 
-def said_of(effect: str) -> dict[str, Said]:
-    """How its parameters are said; of an effect that was found with another library than the installed one, none."""
-    parameters = EFFECTS[effect].parameters if effect in EFFECTS else ()
-    return {each.name: Said(each.spoken, each.unit) for each in parameters}
-
-
-def _mm(value: float) -> str:
-    return f"{1e3 * value:.1f} mm/s"
-
-
 def _numbers(d: Diagnosis) -> list[Number]:
     gap = d.gap
-    found = [Number("error", _mm(gap.before), note="held-out rms, noise included")]
+    found = [Number("error", f"{mm(gap.before)} mm/s", note="held-out rms, noise included")]
     if d.effects:
         low, high = gap.interval
-        found.append(Number("with the effects", _mm(gap.after), note="held-out rms, noise included"))
+        found.append(Number("with the effects", f"{mm(gap.after)} mm/s", note="held-out rms, noise included"))
         told = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=told))
-    claimed = "" if gap.reported is None else f"; the messages claim {_mm(gap.reported)}"
-    found.append(Number("noise", _mm(gap.noise_floor), note=f"as high frequencies show it{claimed}"))
-    return [*found, Number("not explained", _mm(gap.not_explained), note="left beyond the noise")]
+    claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"as high frequencies show it{claimed}"))
+    return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="left beyond the noise")]
 
 
-def _left(d: Diagnosis) -> str:
+def _closed(d: Diagnosis) -> Figures:
+    """Share of the gap that each effect closes, and all together."""
+    alone = ", ".join(f"{effect.name} {share(effect.closure)}" for effect in d.effects)
+    return figure(
+        "diagnosis_figures.closure_bars",
+        "Closure",
+        f"Share of the gap closed: {alone}; together {share(d.gap.closure)}",
+        [effect.name for effect in d.effects],
+        np.array([effect.closure for effect in d.effects]),
+        (d.gap.closure, *d.gap.interval),
+        caption="Line: 95 % interval, by a bootstrap over blocks of time.",
+    )
+
+
+def _left(d: Diagnosis) -> Iterator[Item]:
+    """How much the effects do not explain, whether that follows anything, and what it follows most."""
     gap, series = d.gap, d.series
     if not math.isfinite(gap.after):
-        return "Not known: this data says nothing of the gap."
+        yield Sentence("Not known: this data says nothing of the gap.")
+        return
     amount = (
-        f"{_mm(gap.after)} rms, noise of {_mm(gap.noise_floor)} included, on held-out data: {_mm(gap.not_explained)} "
-        "are not explained."
+        f"{mm(gap.after)} mm/s rms, noise of {mm(gap.noise_floor)} mm/s included, on held-out data: "
+        f"{mm(gap.not_explained)} mm/s are not explained."
     )
     if series is None:
-        return amount
+        yield Sentence(amount)
+        return
     rest = series.rest
     if rest.found:
         said = rest.follows.full_sentence.removesuffix(".")
     else:
         said = "Nothing in it follows motion or time more than chance would"
     p = p_value(math.exp(rest.log_p))
-    return f"{amount} {said} (p {p if p.startswith('<') else f'= {p}'})."
+    yield Sentence(f"{amount} {said} (p {p if p.startswith('<') else f'= {p}'}).")
+    if series.followed:
+        where, followed = series.axes[series.followed.axis], series.followed
+        yield figure(
+            "diagnosis_figures.against_what_it_follows",
+            f"What is left {where}, against {followed.label.partition(',')[0]}",
+            f"What the fit leaves {where} against {followed.label}, with means of groups and their standard deviations",
+            followed,
+            f"left {where}, mm/s",
+            caption="Dots: what is left, averaged over two samples of the slower stream. Band: standard deviation of a "
+            "group about its mean; bars: of the mean, twice.",
+        )
 
 
 # ------------------------------------------------------------------ tables
 
 
-def _detectable_table(d: Diagnosis) -> Table:
-    rows: list[tuple[str | Cell, ...]] = []
+class Detectable(NamedTuple):
+    """The smallest size of a parameter that would have been found. effect: in the first row of each.
+
+    spec: None of an effect that is not in the library.
+    """
+
+    effect: str
+    parameter: str
+    size: float
+    spec: EffectParameter | None
+
+    @property
+    def said(self) -> tuple[list[float], str]:
+        """It and the size worth knowing of, in a unit that both are said in."""
+        return quantity((self.size, self.spec.typical), self.spec.unit) if self.spec else ([self.size], "")
+
+
+DETECTABLE_NOTE = (
+    "The size that this data would show four times in five at the level of the tests; green where that is no more than "
+    "the size worth knowing of."
+)
+DETECTABLE: Columns[Detectable] = {
+    "effect": lambda each: each.effect,
+    "smallest size found": lambda each: Cell(
+        f"{each.spec.spoken if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
+        "text" if each.spec is None else "text good" if each.size <= each.spec.typical else "text far",
+    ),
+    "worth knowing of": lambda each: f"{each.said[0][1]:g} {each.said[1]}" if each.spec else "–",
+}
+
+
+def _detectable(d: Diagnosis) -> Iterator[Detectable]:
     for name, sizes in d.minimum_detectable.items():
         specs = {spec.name: spec for spec in EFFECTS[name].parameters} if name in EFFECTS else {}
         for i, (parameter, size) in enumerate(sizes.items()):
-            spec = specs.get(parameter)
-            typical = math.nan if spec is None else spec.typical
-            said = parameter if spec is None else spec.spoken
-            (found, worth), unit = quantity((size, typical), "" if spec is None else spec.unit)
-            kind = "text" if spec is None else "text good" if size <= typical else "text far"
-            worth_knowing = "–" if spec is None else f"{worth:g} {unit}"
-            rows.append((name if i == 0 else "", Cell(f"{said} {three(found)} {unit}".strip(), kind), worth_knowing))
-    return Table(
-        ("effect", Cell("smallest size found", "text"), "worth knowing of"),
-        rows,
-        notes=(
-            "The size that this data would show four times in five at the level of the tests; green where that is no "
-            "more than the size worth knowing of.",
-        ),
-    )
+            yield Detectable(name if i == 0 else "", parameter, size, specs.get(parameter))
 
 
 def rms(values: Array) -> float:
@@ -276,23 +305,32 @@ def rms(values: Array) -> float:
     return float(np.sqrt((values**2).sum(axis=1).mean())) if len(values) else float("nan")
 
 
-def twin_table(twins: Sequence[HeldOutTwin], has_effects: bool) -> Table:
-    """Error of every recording in every regime of motion, m/s."""
-    rows = []
-    for twin in twins:
-        noise = float(np.sqrt((twin.noise**2).sum()))
-        for regime, mask in {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}.items():
-            errors = [f"{rms(values[mask]):.4f}" for values in twin.errors(has_effects).values()]
-            rows.append(
-                (twin.name if regime == ALL else "", regime, f"{100.0 * mask.mean():.0f} %", *errors, f"{noise:.4f}")
-            )
-    heads = ("without, m/s", "with, m/s") if has_effects else ("recorded less twin, m/s",)
-    return Table(
-        ("recording", "regime", "share", *heads, "noise, m/s"),
-        rows,
-        words=2,
-        notes=(
-            "Rms of the vector, with the noise of DVL and reference, where there is a reference. The error and the "
-            "noise at the top are those of all recordings together. The twin moves as the reference says.",
-        ),
-    )
+class TwinError(NamedTuple):
+    """What a recording differs by from its twin, m/s rms, in a regime of motion; by what the twin has of effects."""
+
+    twin: HeldOutTwin
+    regime: str
+    share: float
+    errors: Mapping[str, float]
+
+
+def twin_errors(twin: HeldOutTwin, has_effects: bool) -> list[TwinError]:
+    """Of all of the run, then of each regime."""
+    found = twin.errors(has_effects)
+    regimes = {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}
+    return [
+        TwinError(twin, regime, float(mask.mean()), {name: rms(values[mask]) for name, values in found.items()})
+        for regime, mask in regimes.items()
+    ]
+
+
+TWIN_HEADS = {"without": "without, m/s", "with": "with, m/s"}
+TWIN_NOTE = (
+    "Rms of the vector, with the noise of DVL and reference, where there is a reference. The error and the noise at "
+    "the top are those of all recordings together. The twin moves as the reference says."
+)
+TWIN: Columns[TwinError] = {
+    "recording": lambda each: each.twin.name if each.regime == ALL else "",
+    "regime": lambda each: each.regime,
+    "share": lambda each: f"{100.0 * each.share:.0f} %",
+}

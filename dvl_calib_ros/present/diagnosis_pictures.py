@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.frames import Array
-from ..diagnosis.results import Diagnosis
 from ..diagnosis.series import DiagnosisSeries
 from . import diagnosis_figures as figures
-from .document import share
 from .style import Picture, picture
 from .time_axis import CUT_FROM_S, TimeAxis, running_mean
 
@@ -67,16 +65,6 @@ def _gap(
     low, high = np.percentile(resampled, [2.5, 97.5])
     value, low, high = np.sqrt(np.maximum([excess.sum() / counts.sum(), low, high], 0.0)).tolist()
     return value, low, high
-
-
-def closure_picture(d: Diagnosis) -> Picture:
-    """Share of the gap that each effect closes, and all together."""
-    alone = ", ".join(f"{effect.name} {share(effect.closure)}" for effect in d.effects)
-    return picture(
-        "Closure", f"Share of the gap closed: {alone}; together {share(d.gap.closure)}",
-        figures.closure_bars, [effect.name for effect in d.effects], np.array([e.closure for e in d.effects]),
-        (d.gap.closure, *d.gap.interval), caption="Line: 95 % interval, by a bootstrap over blocks of time.",
-    )  # fmt: skip
 
 
 def trace_pictures(name: str, series: DiagnosisSeries, axes: Mapping[str, str]) -> Iterable[Picture]:

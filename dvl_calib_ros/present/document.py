@@ -8,19 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
     from ..calibration.navigation import Navigation
+    from ..effects.base import AnyEffect
     from .style import Picture
 
 
+# Characters of a bar
+BAR = 20
+# Errors of a held-out verification, in the order in which they are drawn
+HELD_OUT_KINDS = ("uncorrected", "corrected", "predicted")
 # Class of a cell that holds a verdict
 CELL_KINDS = {Severity.ACCEPT: "good", Severity.MARGINAL: "off", Severity.REJECT: "bad"}
 
@@ -97,6 +102,18 @@ def table_by(columns: Columns[T], of: Iterable[T], notes: Sequence[str] = (), wo
     return Table(head, rows, notes=notes, words=words)
 
 
+Key = TypeVar("Key")
+
+
+def columns_for(keys: Mapping[str, Key], cell: Callable[[T, Key], str | Cell]) -> Columns[T]:
+    """A column for each key, under its heading: what of it a row's object holds."""
+
+    def column(key: Key) -> Callable[[T], str | Cell]:
+        return lambda each: cell(each, key)
+
+    return {heading: column(key) for heading, key in keys.items()}
+
+
 @dataclass(frozen=True)
 class Sentence:
     """A sentence. soft: less than the others."""
@@ -107,15 +124,26 @@ class Sentence:
 
 @dataclass(frozen=True)
 class Figures:
-    """Pictures, which only a page has drawn: by a function of a module of this room, from what it is given."""
+    """Pictures, which only a page has drawn: by a function of a module of this room, from what it is given.
+
+    title, alt, caption: of the one picture whose figure the function draws; none where it makes pictures itself.
+    """
 
     module: str
     name: str
     given: tuple[Any, ...]
+    title: str = ""
+    alt: str = ""
+    caption: str = ""
 
     def draw(self) -> Sequence[Picture]:
         """Make them, which imports matplotlib."""
-        found = getattr(import_module(f"{__package__}.{self.module}"), self.name)(*self.given)
+        function = getattr(import_module(f"{__package__}.{self.module}"), self.name)
+        if self.title:
+            from .style import picture
+
+            return [picture(self.title, self.alt, function, *self.given, caption=self.caption)]
+        found = function(*self.given)
         return found if isinstance(found, Sequence) else list(found) if isinstance(found, Iterable) else [found]
 
 
@@ -123,6 +151,11 @@ def figures(function: str, *given: Any) -> Figures:
     """Those that a function draws, such as ``twin_pictures.twin_pictures``."""
     module, _, name = function.partition(".")
     return Figures(module, name, given)
+
+
+def figure(function: str, title: str, alt: str, *given: Any, caption: str = "") -> Figures:
+    """The one that a function draws, such as ``diagnosis_figures.closure_bars``; see `Picture`."""
+    return replace(figures(function, *given), title=title, alt=alt, caption=caption)
 
 
 @dataclass(frozen=True)
@@ -286,6 +319,17 @@ def share(value: float) -> str:
     return f"{100.0 * value:.0f} %".replace("-", "−") if math.isfinite(value) else "–"
 
 
+def mm(value: float) -> str:
+    """A speed, m/s, in mm/s."""
+    return f"{1e3 * value:.1f}"
+
+
+def bar(full: float, kind: str) -> Cell:
+    """A share as a bar. kind: a class of the style sheet."""
+    blocks = round(BAR * full)
+    return Cell("█" * blocks + "░" * (BAR - blocks), f"bar {kind}")
+
+
 def three(value: float) -> str:
     """Three significant digits."""
     if math.isinf(value):
@@ -306,13 +350,6 @@ _SPOKEN: Mapping[str, tuple[float, str]] = {
 _SMALL = {"s": (1e3, "ms"), "m/s": (1e3, "mm/s"), "s/h": (1e3, "ms/h")}
 
 
-class Said(NamedTuple):
-    """What a parameter is called before its value, and its unit."""
-
-    name: str
-    unit: str
-
-
 def quantity(values: Sequence[float], unit: str) -> tuple[list[float], str]:
     """Values and their unit as people say them: degrees, ms and mm/s for rad, s and m/s."""
     factor, spoken = _SPOKEN.get(unit, (1.0, unit))
@@ -321,12 +358,16 @@ def quantity(values: Sequence[float], unit: str) -> tuple[list[float], str]:
     return [factor * each for each in values], spoken
 
 
-def intervals(parameters: Mapping[str, tuple[float, float, float]], said: Mapping[str, Said] | None = None) -> str:
-    """Values and from where to where each may be, by name, with the digits that this tells; – where there are none."""
+def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffect | None = None) -> str:
+    """Values and from where to where each may be, by name, with the digits that this tells; – where there are none.
+
+    of: the effect whose parameters they are; None where that is not known here.
+    """
+    specs = {} if of is None else {each.name: each for each in of.parameters}
     texts = []
     for name, values in parameters.items():
-        of = (said or {}).get(name, Said(name, ""))
-        (value, low, high), unit = quantity(values, of.unit)
+        said, unit = (specs[name].spoken, specs[name].unit) if name in specs else (name, "")
+        (value, low, high), unit = quantity(values, unit)
         width = high - low
         if math.isfinite(width) and width > 0.0:
             digits = max(0, 1 - math.floor(math.log10(width)))
@@ -334,7 +375,7 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], said: Mappin
         else:
             shown = [three(each) for each in (value, low, high)]
         space = "" if unit.startswith("°") else " "
-        texts.append(" ".join(f"{of.name} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
+        texts.append(" ".join(f"{said} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
     return "; ".join(texts) or "–"
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from ..calibration.frames import Array
 from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.protocol import MANOEUVRING
@@ -19,8 +18,10 @@ from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVari
 from ..verdict.kinds import VERDICT_WORDS
 from .document import (
     CELL_KINDS,
+    HELD_OUT_KINDS,
     Cell,
     Document,
+    Item,
     Legend,
     Number,
     Numbers,
@@ -30,6 +31,7 @@ from .document import (
     Warned,
     Where,
     facts_by,
+    figure,
     figures,
     number,
     section,
@@ -102,7 +104,7 @@ def evaluation(e: Evaluation) -> Document:
     where = "mean over the sets" if len(e.sets) > 1 else f"set {e.sets[0].name}"
     found = [
         Number(UNCALIBRATED, f"{e.set_mean[e.columns.index(UNCALIBRATED)]:.4f} m/s", note=f"Avg.VRMSE, {where}"),
-        *(Number(f"best {w}", f"{value:.4f} m/s", note=name) for w, (name, value) in _best(e.set_mean, e).items()),
+        *(Number(f"best {w}", f"{value:.4f} m/s", note=name) for w, (name, value) in e.best(e.set_mean).items()),
     ]
     of_models = any(each.name in MODELS for each in e.convergence)
     is_published = bool(np.isfinite(e.published_of_these).any())
@@ -117,11 +119,7 @@ def evaluation(e: Evaluation) -> Document:
             section("", Numbers(found)),
             section("", facts_by(FACTS, e)),
             section("", Warned(), where=Where.PAGE),
-            section(
-                "Velocity error after calibration",
-                _scores(e),
-                figures("evaluation_pictures.improvement_picture", e),
-            ),
+            section("Velocity error after calibration", *_scores(e)),
             section("Velocity error against calibration time", times, where=Where.TERMINAL),
             section(
                 "Velocity error against calibration time",
@@ -139,11 +137,7 @@ def evaluation(e: Evaluation) -> Document:
             ),
             section("What was done before", baselines),
             *(
-                section(
-                    f"Can the uncertainty be trusted? {title}",
-                    _coverage(found),
-                    figures("evaluation_pictures.coverage_picture", found),
-                )
+                section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
                 for title, found in coverages
                 if found
             ),
@@ -167,31 +161,18 @@ def evaluation(e: Evaluation) -> Document:
     )
 
 
-def _best(values: Array, e: Evaluation) -> dict[str, tuple[str, float]]:
-    """Name and value of the best model with and without GNSS among the columns, where there is one."""
-    found = {
-        words: [
-            (name, float(value))
-            for name, value in zip(e.columns, values, strict=True)
-            if name in MODELS and MODELS[name].aided == aided and math.isfinite(value)
-        ]
-        for words, aided in (("with GNSS", True), ("without GNSS", False))
-    }
-    return {words: min(each, key=lambda pair: pair[1]) for words, each in found.items() if each}
-
-
 def _summary(e: Evaluation) -> Iterable[str]:
     """What was found, in sentences."""
     uncalibrated = e.set_mean[e.columns.index(UNCALIBRATED)]
-    published = _best(e.published_of_these.mean(axis=0), e)
-    for words, (name, value) in _best(e.set_mean, e).items():
+    published = e.best(e.published_of_these.mean(axis=0))
+    for words, (name, value) in e.best(e.set_mean).items():
         gain = 100.0 * (1.0 - value / uncalibrated)
         sentence = f"Best {words}: {name} with {value:.4f} m/s, {gain:.0f} % less than uncalibrated"
         if words in published:
             sentence += "; best published: {} with {:.4f} m/s".format(*published[words])
         yield sentence + "."
     if e.each is not None and e.each.runs:
-        medians = _best(e.each.median(), e).items()
+        medians = e.best(e.each.median()).items()
         found = ", ".join(f"{name} {value:.4f} m/s {words}" for words, (name, value) in medians)
         yield f"Calibrated on each of {len(e.each.runs)} runs with attitude, best medians: {found}."
     if e.own_generator:
@@ -203,8 +184,9 @@ def _summary(e: Evaluation) -> Iterable[str]:
             yield f"{near} of {len(ratio)} published cells are met within 25 %."
 
 
-def _scores(e: Evaluation) -> Table:
-    """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below."""
+def _scores(e: Evaluation) -> Iterable[Item]:
+    """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below; and how
+    much of the error is gone, by model."""
 
     def cell(value: float, published: float) -> str | Cell:
         if not math.isfinite(value) or not math.isfinite(published):
@@ -226,10 +208,22 @@ def _scores(e: Evaluation) -> Table:
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
             "beyond. Means are those of the cells beside them, not the paper's."
         )
-    return Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
+    yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
+    base = e.columns.index(UNCALIBRATED)
+    gone, gone_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
+    told = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
+    yield figure(
+        "evaluation_figures.improvement_bars",
+        "Improvement over uncalibrated",
+        f"Mean over the sets: {told}",
+        e.models,
+        gone,
+        gone_published,
+    )
 
 
-def _coverage(coverages: Sequence[Coverage]) -> Table:
+def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
+    """Share of the errors inside the intervals that σ claims, by model."""
     states = list(dict.fromkeys(name for coverage in coverages for name in coverage.state_names))
     rows: list[tuple[str | Cell, ...]] = []
     for coverage in coverages:
@@ -243,13 +237,20 @@ def _coverage(coverages: Sequence[Coverage]) -> Table:
         ]
         rows.append((coverage.model, *pooled, *(shares.get(name, "–") for name in states), str(coverage.n_errors)))
     named = [re.sub("^(phi_|delta_k_?)", lambda found: SYMBOLS[found[0]], name) for name in states]
-    return Table(
+    yield Table(
         ("model", "68 % interval", "95 % interval", *named, "errors each"),
         rows,
         notes=(
             "Per cent of the errors (estimate minus truth) inside the interval that σ claims, over all states and for "
             "each (68 / 95); green within 60–76 and 91–98 %. Below: σ is too small.",
         ),
+    )
+    yield figure(
+        "evaluation_figures.coverage_points",
+        "Errors inside the claimed intervals",
+        ", ".join(f"{c.model} {100 * c.pooled_68:.0f} and {100 * c.pooled_95:.0f} %" for c in coverages),
+        [coverage.model for coverage in coverages],
+        {0.68: [c.pooled_68 for c in coverages], 0.95: [c.pooled_95 for c in coverages]},
     )
 
 
@@ -269,7 +270,17 @@ def _pull(study: ErrorsInVariables) -> Section:
         Sentence(study.formula),
         Table(("GNSS σ, m/s", *study.models), rows, notes=("Pull of the scale in %: predicted / measured.",)),
         Legend(study.models, ""),
-        figures("evaluation_pictures.pull_picture", study),
+        figure(
+            "evaluation_figures.errors_in_variables",
+            "Errors in variables",
+            "Pull of the scale by noise in the reference, predicted and measured",
+            study.models,
+            study.gnss_std,
+            study.predicted,
+            study.measured,
+            study.standard_error,
+            caption="Lines: predicted by the formula. Points: measured, ± 2 standard errors.",
+        ),
     )
 
 
@@ -295,10 +306,20 @@ def _study(e: Evaluation, study: EachStudy, title: str) -> list[Section]:
         "model mostly says that it has not seen yaw; – where it cannot run.",
     )
     table = Table(("run", "headings, °", *e.columns), rows, marked=len(study.runs), dense=True, notes=notes)
-    picture = figures("evaluation_pictures.study_picture", e, study)
+    median = ", ".join(f"{name} {v:.4f}" for name, v in zip(e.columns, medians["median"].tolist(), strict=True))
+    by_run = figure(
+        "evaluation_figures.error_by_run",
+        "Avg.VRMSE by calibration run",
+        f"Avg.VRMSE, median over the runs, m/s: {median}",
+        study.run_names,
+        e.models,
+        study.seed_mean[:, e.columns.index(UNCALIBRATED)],
+        e.of_models(study.seed_mean),
+        caption="Bars: uncalibrated. Filled: models with GNSS. Hollow: without.",
+    )
     return [
         section(title, table, where=Where.TERMINAL),
-        section(title, Legend(e.models, ""), picture, table, where=Where.PAGE),
+        section(title, Legend(e.models, ""), by_run, table, where=Where.PAGE),
     ]
 
 
@@ -319,8 +340,16 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
         "calibration run was held back in turn and corrected with a calibration that had not seen it; the noise of the "
         "reference is in all errors.",
     )
-    drawn = [
-        figures("evaluation_pictures.held_out_picture", name, [each for each in held_out if each.set_name == name])
-        for name in sets
-    ]
+    drawn = []
+    for name in sets:
+        own = [each for each in held_out if each.set_name == name]
+        drawn.append(
+            figure(
+                "replay_figures.held_out_errors",
+                f"{name}: error on held-out data",
+                "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in own),
+                [each.model for each in own],
+                *(np.array([getattr(each, kind) for each in own]) for kind in HELD_OUT_KINDS),
+            )
+        )
     return section("Held-out verification", Table(("model", *sets), rows, notes=notes), *drawn)

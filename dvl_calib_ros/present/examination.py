@@ -7,10 +7,9 @@ from ..examination.expected import Shown
 from ..files.parameter_edit import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
-from .document import Answer, Cell, Columns, Commands, Document, FindingLine, Section, Sentence, table_by
+from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by
 from .typed import options, typed
 
-BAR = 20
 SHOWN_NOTE = "A full bar is fine (fine_std_misalignment, fine_std_scale); red is not shown, and yellow between."
 ANSWERS = {
     "yes": (Severity.ACCEPT, "This recording can calibrate the DVL."),
@@ -63,12 +62,6 @@ def _why(examined: Examination) -> str:
     return f"Not shown yet: {' and '.join(missing)}." if missing else ""
 
 
-def _bar(each: Shown) -> Cell:
-    full = round(BAR * each.share)
-    kind = "good" if each.share >= 1.0 else "off" if not each.needs else "bad"
-    return Cell("█" * full + "░" * (BAR - full), f"bar {kind}")
-
-
 CONTENTS: Columns[Content] = {
     "": lambda each: each.role,
     "topic": lambda each: each.topic,
@@ -78,7 +71,7 @@ CONTENTS: Columns[Content] = {
 }
 SHOWN: Columns[Shown] = {
     "": lambda each: each.name,
-    "shown": _bar,
+    "shown": lambda each: bar(each.share, "good" if each.share >= 1.0 else "off" if not each.needs else "bad"),
     "expected ±1σ": lambda each: f"±{each.std:.2f} {each.unit}",
     "needs": lambda each: each.needs,
 }

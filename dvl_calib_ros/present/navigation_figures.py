@@ -22,15 +22,16 @@ _OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
 
 
 def navigation_pictures(
-    one: Navigation, corrected: Mapping[str, Navigation], where: str = "", time: TimeAxis | None = None
+    one: Navigation, corrected: Mapping[str, Navigation], where: str = "", stamps_ns: Array | None = None
 ) -> Sequence[Picture]:
     """Map, if headings are known, and error along the track.
 
     one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone; the first
-    four are drawn. time: of figures whose cursor the map follows.
+    four are drawn. stamps_ns: of figures whose cursor the map follows.
     """
     told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
     alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
+    time = None if stamps_ns is None else TimeAxis(stamps_ns)
     figures = []
     if one.on_a_map:
         figures.append(

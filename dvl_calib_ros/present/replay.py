@@ -27,6 +27,7 @@ from ..replay.replay import Replayed
 from ..verdict.kinds import Severity
 from .document import (
     CELL_KINDS,
+    HELD_OUT_KINDS,
     Answer,
     Cell,
     Columns,
@@ -43,6 +44,7 @@ from .document import (
     Where,
     Worth,
     facts_by,
+    figure,
     figures,
     fitting_unit,
     section,
@@ -119,12 +121,6 @@ def _when(run: Replayed) -> str:
     return f"{first:%Y-%m-%d %H:%M:%S} to {last:%Y-%m-%d %H:%M:%S} UTC, {duration}"
 
 
-def _used(run: Replayed) -> str:
-    estimate = run.result.estimate
-    what = "references" if MODELS[estimate.model].estimator else "DVL samples"
-    return f"{estimate.used} {what}, {estimate.gated} rejected as outliers"
-
-
 FACTS: Mapping[str, Callable[[Replayed], str]] = {
     "Model": lambda run: (
         f"{run.result.selected} ({run.result.selected_because.sentence}); {run.result.estimate.convergence.value}"
@@ -136,7 +132,10 @@ FACTS: Mapping[str, Callable[[Replayed], str]] = {
         f"{run.result.counts['dvl']['accepted']} of the DVL, {run.result.counts['pairing']['paired']} with a reference "
         "velocity at their time"
     ),
-    "Used by the model": _used,
+    "Used by the model": lambda run: (
+        f"{run.result.estimate.used} {'references' if MODELS[run.result.selected].estimator else 'DVL samples'}, "
+        f"{run.result.estimate.gated} rejected as outliers"
+    ),
 }
 
 
@@ -203,7 +202,9 @@ def replayed(
                 "What it means for navigation",
                 *map(Sentence, in_words(drift) if drift else ()),
                 Map(drift) if drift and drift.on_a_map else None,
-                figures("replay_pictures.navigation", drift, history) if drift and history else None,
+                figures("navigation_figures.navigation_pictures", drift, {"": drift}, "", history.stamps_ns)
+                if drift and history
+                else None,
             ),
             section(
                 "",
@@ -296,7 +297,13 @@ def _held_out(result: Result, shown: Sequence[str]) -> Iterator[Item]:
     if judged:
         yield Sentence(HELD_OUT_NOTE)
         yield replace(table_by(HELD_OUT, verifications.values()), marked=list(verifications).index(result.selected))
-        yield figures("replay_pictures.held_out_picture", judged)
+        yield figure(
+            "replay_figures.held_out_errors",
+            "Velocity error on held-out data",
+            "; ".join(f"{name}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for name, e in judged.items()),
+            list(judged),
+            *(np.array([getattr(error, kind) for error in judged.values()]) for kind in HELD_OUT_KINDS),
+        )
 
 
 def _over_time(run: Replayed, shown: Sequence[str]) -> Iterator[Section]:

@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-
-import numpy as np
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from ..calibration.models import MODELS
-from ..calibration.navigation import Navigation
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
-from ..calibration.verification import HeldOutError
 from ..replay.recorder import ModelHistory, RunHistory
 from ..replay.replay import Replayed
 from . import replay_figures as figures
-from .navigation_figures import navigation_pictures
 from .style import Picture, picture
 from .terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 from .time_axis import TimeAxis
 
 BODY_AXES = ("ahead", "to port", "up")
-HELD_OUT_KINDS = ("uncorrected", "corrected", "predicted")
-
-
-def navigation(found: Navigation, history: RunHistory) -> Sequence[Picture]:
-    """The track, by the same time as the other figures."""
-    return navigation_pictures(found, {"": found}, time=TimeAxis(history.stamps_ns))
-
-
-def held_out_picture(judged: dict[str, HeldOutError]) -> Picture:
-    """Errors on held-out data, model by model."""
-    errors = [np.array([getattr(error, kind) for error in judged.values()]) for kind in HELD_OUT_KINDS]
-    alt = "; ".join(f"{name}: {e.uncorrected:.3f} to {e.corrected:.3f} m/s" for name, e in judged.items())
-    return picture("Velocity error on held-out data", alt, figures.held_out_errors, list(judged), *errors)
+# What becomes of DVL samples, by model
+FATES: Mapping[str, Callable[[Result, str], int]] = {
+    "used": lambda result, name: result.estimates[name].used,
+    "gated": lambda result, name: result.estimates[name].gated,
+    "not given": lambda result, name: max(
+        0, result.counts["dvl"]["usable"] - result.estimates[name].used - result.estimates[name].gated
+    ),
+    "slow or turning": lambda result, _: sum(
+        result.counts["dvl"][fate] for fate in ("slow", "turning", "no_turn_rate")
+    ),
+}
 
 
 def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]) -> Iterable[Picture]:
@@ -101,7 +94,7 @@ def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
 def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> list[Picture]:
     """What became of the samples, and which model was selected when."""
     time = TimeAxis(history.stamps_ns)
-    fates = _fates(result, shown)
+    fates = {fate: [count(result, name) for name in shown] for fate, count in FATES.items()}
     ends = [*(segment.from_ns for segment in result.segments[1:]), result.last_ns]
     segments = [(each.model, each.from_ns, end) for each, end in zip(result.segments, ends, strict=False)]
     switches = ", ".join(dict.fromkeys(name for name, _, _ in segments)) or "none"
@@ -117,15 +110,3 @@ def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> 
             caption="GNSS: dark where DVL samples had a GNSS velocity beside them.",
         ),
     ]  # fmt: skip
-
-
-def _fates(result: Result, shown: Sequence[str]) -> dict[str, list[int]]:
-    dvl = result.counts["dvl"]
-    fates: dict[str, list[int]] = {"used": [], "gated": [], "not given": [], "slow or turning": []}
-    for name in shown:
-        estimate = result.estimates[name]
-        fates["used"].append(estimate.used)
-        fates["gated"].append(estimate.gated)
-        fates["not given"].append(max(0, dvl["usable"] - estimate.used - estimate.gated))
-        fates["slow or turning"].append(dvl["slow"] + dvl["turning"] + dvl["no_turn_rate"])
-    return fates

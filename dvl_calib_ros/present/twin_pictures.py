@@ -8,10 +8,10 @@ import numpy as np
 from scipy.signal import welch
 
 from ..calibration.frames import Array
-from ..diagnosis.followed import Followed
 from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
-from .diagnosis import ALL, rms
+from .diagnosis import twin_errors
+from .document import mm
 from .style import Picture, picture
 from .time_axis import TimeAxis
 
@@ -56,16 +56,15 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
         figures.quantiles, pooled, twin.noise[measured],
         caption="On the line, it is distributed as the noise is; what is far off runs out of the picture.",
     )  # fmt: skip
-    masks = {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}
-    errors = {name: np.array([[rms(values[mask])] for mask in masks.values()]) for name, values in found.items()}
+    parts = twin_errors(twin, has_effects)
+    errors = {name: np.array([[each.errors[name]] for each in parts]) for name in found}
     alt = "; ".join(
-        f"{regime}: " + ", ".join(f"{name} {1e3 * errors[name][i, 0]:.1f} mm/s" for name in errors)
-        for i, regime in enumerate(masks)
+        f"{each.regime}: " + ", ".join(f"{name} {mm(error)} mm/s" for name, error in each.errors.items())
+        for each in parts
     )
     yield picture(
-        f"{twin.name}: error by regime", alt,
-        figures.error_bars, list(masks), errors, float(np.sqrt((twin.noise**2).sum())),
-    )  # fmt: skip
+        f"{twin.name}: error by regime", alt, figures.error_bars, [each.regime for each in parts], errors, twin.level
+    )
 
 
 def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:
@@ -82,16 +81,3 @@ def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:
     step = np.floor(SPECTRUM_STEPS * np.log10(frequency / frequency[0])).astype(int)
     _, group, n = np.unique(step, return_inverse=True, return_counts=True)
     return np.bincount(group, frequency) / n, np.sqrt(np.bincount(group, power) / n)
-
-
-def followed_picture(followed: Followed, axes: Mapping[str, str]) -> Picture:
-    """What is left against what it follows most."""
-    where = axes[followed.axis]
-    label = followed.label.partition(",")[0]
-    return picture(
-        f"What is left {where}, against {label}",
-        f"What the fit leaves {where} against {followed.label}, with means of groups and their standard deviations",
-        figures.against_what_it_follows, followed, f"left {where}, mm/s",
-        caption="Dots: what is left, averaged over two samples of the slower stream. Band: standard deviation of a "
-        "group about its mean; bars: of the mean, twice.",
-    )  # fmt: skip

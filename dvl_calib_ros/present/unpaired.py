@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..effects.registry import EFFECTS as LIBRARY
 from ..unpaired.results import (
     ComparedEffect,
     ComparedNoise,
@@ -11,7 +12,6 @@ from ..unpaired.results import (
     UnpairedComparison,
 )
 from ..verdict.kinds import Severity
-from .diagnosis import said_of
 from .document import (
     Answer,
     Cell,
@@ -22,6 +22,7 @@ from .document import (
     Where,
     figures,
     intervals,
+    mm,
     p_value,
     section,
     table_by,
@@ -34,13 +35,12 @@ SEVERITIES = {
     SimulatorVerdict.DIFFERENT: Severity.REJECT,
 }
 CELLS = {ComparisonStatus.MISSING: "bad", ComparisonStatus.OTHER_SIZE: "off", ComparisonStatus.ONLY_SIMULATOR: "off"}
-MM = 1e3
 EFFECTS: Columns[ComparedEffect] = {
     "effect": lambda each: " or ".join((each.name, *each.equivalent_to)),
     "": lambda each: Cell(each.status.words, CELLS.get(each.status, "")),
-    "vehicle (95 %)": lambda each: Cell(intervals(each.vehicle, said_of(each.name)), "text"),
-    "simulator (95 %)": lambda each: Cell(intervals(each.simulator, said_of(each.name)), "text"),
-    "adds, mm/s": lambda each: f"{MM * each.adds_mps:.1f}",
+    "vehicle (95 %)": lambda each: Cell(intervals(each.vehicle, LIBRARY.get(each.name)), "text"),
+    "simulator (95 %)": lambda each: Cell(intervals(each.simulator, LIBRARY.get(each.name)), "text"),
+    "adds, mm/s": lambda each: mm(each.adds_mps),
     "mostly on": lambda each: str(each.lies or "–"),
     "p, adjusted": lambda each: p_value(each.p),
 }
@@ -51,13 +51,13 @@ EFFECTS_NOTE = (
 LEVELS = ("noise of the DVL by regime, mm/s", "vehicle", "simulator")
 RUNGS: Columns[Rung] = {
     "simulator": lambda r: r.name,
-    "error, mm/s": lambda r: f"{MM * r.error_mps:.1f}",
+    "error, mm/s": lambda r: mm(r.error_mps),
     "energy distance": lambda r: f"{r.distance:.2f}",
     "alike: below": lambda r: f"{r.null95:.2f}",
     "p": lambda r: p_value(r.p),
 }
 RUNGS_NOTE = (
-    "On stretches of the vehicle's own motion that were held out; noise of {:.1f} mm/s stays in the error. Energy "
+    "On stretches of the vehicle's own motion that were held out; noise of {} mm/s stays in the error. Energy "
     "distance: between windows of recorded and simulated velocity, each less that of an ideal DVL, by their means and "
     "scatter on the axes."
 )
@@ -75,8 +75,8 @@ NOISE: Columns[ComparedNoise] = {
 def unpaired(c: UnpairedComparison) -> Document:
     """What the simulator's DVL lacks, how far the gap shrinks with it, and what could not be told."""
     effects = table_by(EFFECTS, c.effects, (EFFECTS_NOTE,), words=len(EFFECTS))
-    rungs = table_by(RUNGS, c.rungs, (RUNGS_NOTE.format(MM * c.floor_mps),))
-    levels = [(name, *(f"{MM * each:.1f}" for each in both)) for name, both in c.levels.items()]
+    rungs = table_by(RUNGS, c.rungs, (RUNGS_NOTE.format(mm(c.floor_mps)),))
+    levels = [(name, *map(mm, both)) for name, both in c.levels.items()]
     sides = {"vehicle": c.vehicle, "simulator": c.simulator}
     names = sorted({name for side in c.not_shown.values() for name in side})
     unseen = [(name, *(side.get(name, "would have shown") for side in c.not_shown.values())) for name in names]

@@ -17,7 +17,6 @@ from dvl_calib_ros.present.document import (
     Answer,
     Cell,
     Document,
-    Said,
     Section,
     Sentence,
     Table,
@@ -108,13 +107,13 @@ def test_a_topic_is_broken_between_its_parts_only():
 
 def test_sizes_are_said_in_units_that_people_use():
     values = (0.0421, 0.03, 0.05)
-    assert intervals({"sin_rad": values}, {"sin_rad": Said("sin", "rad")}) == "sin 2.4° (1.7 to 2.9)"
-    assert intervals({"seconds": values}, {"seconds": Said("", "s")}) == "42 ms (30 to 50)"
-    assert intervals({"seconds": (1.5, 1.0, 2.0)}, {"seconds": Said("", "s")}) == "1.5 s (1.0 to 2.0)"
-    assert intervals(
-        {"x_mps": values, "at_s": (0.0, 0.0, math.inf)}, {"x_mps": Said("x", "m/s"), "at_s": Said("at", "s")}
-    ) == ("x 42 mm/s (30 to 50); at 0.00 s (0.00 to ∞)")
-    assert intervals({"ratio": values}, {"ratio": Said("ratio", "1")}) == "ratio 4.2 % (3.0 to 5.0)"
+    assert intervals({"sin_rad": values}, EFFECTS["heading_error"]) == "sin 2.4° (1.7 to 2.9)"
+    assert intervals({"seconds": values}, EFFECTS["dvl_time_offset"]) == "42 ms (30 to 50)"
+    assert intervals({"seconds": (1.5, 1.0, 2.0)}, EFFECTS["dvl_time_offset"]) == "1.5 s (1.0 to 2.0)"
+    assert intervals({"x_mps": values, "y_mps": (0.0, 0.0, math.inf)}, EFFECTS["velocity_bias"]) == (
+        "x 42 mm/s (30 to 50); y 0.00 m/s (0.00 to ∞)"
+    )
+    assert intervals({"ratio": values}, EFFECTS["sound_speed_moved"]) == "ratio 4.2 % (3.0 to 5.0)"
     assert intervals({"share": values}) == "share 0.042 (0.030 to 0.050)"
     assert intervals({}) == "–"
 
