@@ -1,4 +1,5 @@
-"""How large the package is: lines of code (neither blank, comment nor docstring), modules, arrows between rooms."""
+"""How large the package is: lines of code (neither blank, comment nor docstring), modules, arrows between rooms, and
+functions that lay out a part of a result (`layout.layout_functions`)."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 
+from .layout import layout_functions
 from .rooms import arrows, arrows_up, modules, room_of, sizes
 
 
@@ -16,12 +18,15 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", action="store_true", help="one line of JSON, without the rooms")
     arguments = parser.parse_args(argv)
     lines, up, n_modules = sizes(), arrows_up(), Counter(map(room_of, modules()))
+    layout = list(layout_functions())
     if arguments.json:
         counts = {"lines": lines.total(), "modules": n_modules.total(), "rooms": len(lines)}
-        print(json.dumps(counts | {"arrows": len(arrows()), "arrows_up": len(up)}))
+        print(json.dumps(counts | {"arrows": len(arrows()), "arrows_up": len(up), "layout": len(layout)}))
         return 0
     for room, count in lines.most_common():
         print(f"{count:7}  {n_modules[room]:4}  {room}")
     print(f"{lines.total():7} lines of code in {n_modules.total()} modules and {len(lines)} rooms")
     print(f"{len(arrows()):7} arrows between rooms, {len(up)} up{': ' if up else ''}{', '.join(map(' -> '.join, up))}")
+    of_layout = sum(each.lines for each in layout)
+    print(f"{len(layout):7} functions of {of_layout} lines lay out a part of a result")
     return 0

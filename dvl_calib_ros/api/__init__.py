@@ -28,7 +28,7 @@ from ..recordings.recording import Recording, open_recording
 from ..simulation.scenario import Scenario
 from ..verdict.answering import Answering
 from .calibrated import Calibration, Mounting
-from .printed import printed
+from .printed import framed, printed
 
 if TYPE_CHECKING:
     from ..bags.recover import Recovered
@@ -65,6 +65,7 @@ __all__ = [
     "simulate",
 ]
 Answering.laid_out = printed
+Answering.framed = framed
 StrPath = str | os.PathLike[str]
 Bags = StrPath | Sequence[StrPath]
 

@@ -185,6 +185,25 @@ class Calibration:
             return velocity
         return velocity - np.cross(np.asarray(angular_velocity, dtype=float), self.mounting.xyz_m)
 
+    def tables(self) -> dict[str, pandas.DataFrame]:
+        """Give the tables of its page as data frames.
+
+        Returns
+        -------
+        dict of str to pandas.DataFrame
+            By the heading that each stands below. Columns of numbers hold floats, in the unit of their heading, those
+            with a σ have it beside them as ``... ±1σ``; others hold texts.
+
+        Raises
+        ------
+        InputError
+            Without pandas.
+        """
+        from ..present.replay import replayed
+        from .printed import frames_of
+
+        return frames_of(replayed(self.replayed, self.bags, tuple(MODELS)))
+
     def to_pandas(self) -> pandas.DataFrame:
         """Give the selected model over time.
 

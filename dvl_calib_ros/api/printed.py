@@ -1,10 +1,15 @@
-"""Results as text and as HTML of a notebook: what the commands print of them."""
+"""Results as text, as HTML of a notebook, and as data frames: what the commands print of them."""
 
 from __future__ import annotations
 
 import io
+from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from ..present.document import Document
+
+if TYPE_CHECKING:
+    import pandas
 
 # Columns of what is printed, as of the commands into a pipe
 WIDTH = 160
@@ -15,6 +20,21 @@ def printed(result: object, as_html: bool) -> str:
     from ..present.documents import DOCUMENTS
 
     return text_of(DOCUMENTS[type(result)](result), as_html)
+
+
+def framed(result: object) -> dict[str, pandas.DataFrame]:
+    """Tables of a result by their headings. Raises InputError without pandas."""
+    from ..present.documents import DOCUMENTS
+
+    return frames_of(DOCUMENTS[type(result)](result))
+
+
+def frames_of(document: Document) -> dict[str, pandas.DataFrame]:
+    """Tables of a document by their headings. Raises InputError without pandas."""
+    try:
+        return document.frames()
+    except ModuleNotFoundError:
+        raise InputError("tables need the Python package pandas; pip install pandas") from None
 
 
 def text_of(document: Document, as_html: bool) -> str:

@@ -75,6 +75,17 @@ class Examination(Answering):
         needed = [each for each in self.shown if each.name in ("pitch", "yaw")]  # what turns a track and lifts it
         return "yes" if needed and not any(each.needs for each in needed) else "partly"
 
+    @property
+    def why(self) -> str:
+        """Why it cannot, or not all of it, in a sentence; '' where nothing is missing or the findings say it."""
+        errors = [each for each in self.findings if each.severity is Severity.ERROR]
+        if errors:
+            return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
+        if not self.has_reference:
+            return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
+        missing = [each.name for each in self.shown if each.needs]
+        return f"Not shown yet: {' and '.join(missing)}." if missing else ""
+
     def document(self) -> dict[str, Any]:
         """Plain data, for JSON."""
         return {

@@ -22,13 +22,24 @@ def cross_check(check: CrossCheck) -> Document:
         by = {f"by {one}": check.navigation.get((each, bag)) for each, one in zip(check.bags, check.names, strict=True)}
         found = {name: each for name, each in by.items() if each is not None}
         if found:
-            first = next(iter(found.values()))
-            pictures.append(figures("navigation_figures.navigation_pictures", first, found, f", {name}"))
+            one = next(iter(found.values()))
+            pictures.append(figures("navigation_figures.navigation_pictures", one, found, f", {name}"))
     head, nothing = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
     errors = [(*nothing, *(number(value, 4) for value in check.uncorrected.tolist()))]
     for name, of_models in zip(check.names, check.corrected, strict=True):
         for model, row in zip(check.models, of_models, strict=True):
             errors.append((name, model, *(number(value, 4) for value in row.tolist())))
+    of_pairs = [[check.navigation.get((calibrated, bag)) for bag in check.bags] for calibrated in check.bags]
+    first = [next((each for each in of_bag if each is not None), None) for of_bag in zip(*of_pairs, strict=True)]
+    drifts = [("nothing", "as mounted", [each and each.before for each in first])]
+    drifts += [
+        (name, model, [each and each.after for each in of_bags])
+        for name, model, of_bags in zip(check.names, check.selected, of_pairs, strict=True)
+    ]
+    by_drift = [
+        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in of_bags))
+        for name, model, of_bags in drifts
+    ]
     return Document(
         title="Bags checked against each other",
         subtitle=", ".join(check.names),
@@ -42,7 +53,7 @@ def cross_check(check: CrossCheck) -> Document:
             ),
             section(
                 "Dead reckoning on bags that were not calibrated on",
-                Table(head, _drifts(check) if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
+                Table(head, by_drift if check.navigation else (), notes=(DRIFT_NOTE,), words=2),
                 *pictures,
             ),
             section(
@@ -52,18 +63,3 @@ def cross_check(check: CrossCheck) -> Document:
         ],
         parameters=check.parameters,
     )
-
-
-def _drifts(check: CrossCheck) -> list[tuple[str, ...]]:
-    """Of each bag as it is, then with the calibration of each other."""
-    found = [[check.navigation.get((calibrated, bag)) for bag in check.bags] for calibrated in check.bags]
-    first = [next((each for each in of_bag if each is not None), None) for of_bag in zip(*found, strict=True)]
-    rows = [("nothing", "as mounted", [each and each.before for each in first])]
-    rows += [
-        (name, model, [each and each.after for each in of_bags])
-        for name, model, of_bags in zip(check.names, check.selected, found, strict=True)
-    ]
-    return [
-        (name, model, *("–" if each is None else f"{each.per_km:.1f} ({each.percent:.2g} %)" for each in drifts))
-        for name, model, drifts in rows
-    ]

@@ -23,7 +23,6 @@ from .document import (
     Cell,
     Columns,
     Document,
-    Figures,
     Item,
     Number,
     Numbers,
@@ -131,6 +130,16 @@ def diagnosis(d: Diagnosis) -> Document:
         for recording, parameters in effect.by_recording.items()
     ]
     regimes = None if series is None else figures("diagnosis_pictures.regime_picture", series, has_effects)
+    alone = ", ".join(f"{effect.name} {share(effect.closure)}" for effect in d.effects)
+    closed = figure(
+        "diagnosis_figures.closure_bars",
+        "Closure",
+        f"Share of the gap closed: {alone}; together {share(d.gap.closure)}",
+        [effect.name for effect in d.effects],
+        np.array([effect.closure for effect in d.effects]),
+        (d.gap.closure, *d.gap.interval),
+        caption="Line: 95 % interval, by a bootstrap over blocks of time.",
+    )
     return Document(
         title="Sim-to-real gap of the DVL",
         subtitle="" if series is None else ", ".join(series.recordings),
@@ -142,7 +151,7 @@ def diagnosis(d: Diagnosis) -> Document:
             section("", Warned(), where=Where.PAGE),
             section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
             section("", Table(("effect", "recording", "parameters (95 %)"), of_each, words=3)),
-            section("", _closed(d) if has_effects and math.isfinite(d.gap.closure) else None, where=Where.PAGE),
+            section("", closed if has_effects and math.isfinite(d.gap.closure) else None, where=Where.PAGE),
             section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
             section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),
             *(_of_series(d, series) if series is not None else []),
@@ -210,20 +219,6 @@ def _numbers(d: Diagnosis) -> list[Number]:
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
     found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"as high frequencies show it{claimed}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="left beyond the noise")]
-
-
-def _closed(d: Diagnosis) -> Figures:
-    """Share of the gap that each effect closes, and all together."""
-    alone = ", ".join(f"{effect.name} {share(effect.closure)}" for effect in d.effects)
-    return figure(
-        "diagnosis_figures.closure_bars",
-        "Closure",
-        f"Share of the gap closed: {alone}; together {share(d.gap.closure)}",
-        [effect.name for effect in d.effects],
-        np.array([effect.closure for effect in d.effects]),
-        (d.gap.closure, *d.gap.interval),
-        caption="Line: 95 % interval, by a bootstrap over blocks of time.",
-    )
 
 
 def _left(d: Diagnosis) -> Iterator[Item]:

@@ -7,6 +7,7 @@ What a result says is laid out once, by the module of this room that is called a
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -17,6 +18,8 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
+    import pandas
+
     from ..calibration.navigation import Navigation
     from ..effects.base import AnyEffect
     from .style import Picture
@@ -81,14 +84,31 @@ class Table:
     dense: bool = False
     words: int = 1
 
-    def frame(self) -> Any:
-        """The table as a pandas DataFrame of texts. Raises ImportError without pandas."""
+    def frame(self) -> pandas.DataFrame:
+        """The table as a DataFrame: a column of numbers holds these, with their σ and whether they are shown (no ?) in
+        columns beside it; others hold texts.
+
+        Raises ImportError without pandas.
+        """
         import pandas
 
         head, *rows = ([getattr(cell, "text", cell) for cell in row] for row in (self.head, *self.rows))
-        return pandas.DataFrame(rows, columns=head)
+        columns: list[pandas.Series[Any]] = []
+        for name, texts in zip(head, zip(*rows, strict=True), strict=False):
+            read = [found for text in texts if (found := _NUMBER.fullmatch(text.replace("−", "-")))]
+            if len(read) < len(texts) or not any(each["value"] for each in read):
+                columns.append(pandas.Series(texts, name=name))
+                continue
+            columns.append(pandas.to_numeric(pandas.Series([each["value"] for each in read], name=name)))
+            if any(each["std"] for each in read):
+                columns.append(pandas.to_numeric(pandas.Series([each["std"] for each in read], name=f"{name} ±1σ")))
+            if any(each["unseen"] for each in read):
+                columns.append(pandas.Series([not each["unseen"] for each in read], name=f"{name} shown"))
+        return pandas.concat(columns, axis=1)
 
 
+# A number, perhaps with its σ and a mark where it is not shown, or a dash for none
+_NUMBER = re.compile(r"(?P<value>[+-]?\d+(\.\d+)?)( ± (?P<std>\d+(\.\d+)?))?(?P<unseen> \?)?|–")
 T = TypeVar("T")
 # Heading -> what a column holds of a row's object.
 Columns = Mapping[str, Callable[[T], str | Cell]]
@@ -145,6 +165,17 @@ class Figures:
             return [picture(self.title, self.alt, function, *self.given, caption=self.caption)]
         found = function(*self.given)
         return found if isinstance(found, Sequence) else list(found) if isinstance(found, Iterable) else [found]
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Figures that stand beside each other, where there is room."""
+
+    figures: Sequence[Figures]
+
+    def draw(self) -> Sequence[Picture]:
+        """Make them."""
+        return [each for of in self.figures for each in of.draw()]
 
 
 def figures(function: str, *given: Any) -> Figures:
@@ -246,7 +277,9 @@ class Warned:
     warned: bool = True
 
 
-Item = Warned | Sentence | Table | Figures | FindingLine | Commands | Facts | Numbers | Worth | Legend | Map
+Item = (
+    Warned | Sentence | Table | Figures | SideBySide | FindingLine | Commands | Facts | Numbers | Worth | Legend | Map
+)
 
 
 @dataclass(frozen=True)
@@ -291,9 +324,23 @@ class Document:
     folded: Sequence[str] = ()
 
     @property
-    def tables(self) -> list[Table]:
-        """All of them, in order."""
-        return [item for section in self.sections for item in section.items if isinstance(item, Table)]
+    def tables(self) -> dict[str, Table]:
+        """All of them in order, by the heading that each stands below; of further ones below it with their number."""
+        found: dict[str, Table] = {}
+        heading, below = self.title, 0
+        for each in self.sections:
+            if each.title and each.title != heading:
+                heading, below = each.title, 0
+            for item in each.items:
+                table = item.table if isinstance(item, Numbers) else item
+                if isinstance(table, Table) and table.rows and table not in found.values():
+                    below += 1
+                    found[heading if below == 1 else f"{heading} ({below})"] = table
+        return found
+
+    def frames(self) -> dict[str, pandas.DataFrame]:
+        """Its tables as data frames. Raises ImportError without pandas."""
+        return {heading: table.frame() for heading, table in self.tables.items()}
 
 
 def number(value: float, digits: int = 2, *, signed: bool = False) -> str:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.protocol import MANOEUVRING
-from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut
+from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from ..verdict.kinds import VERDICT_WORDS
 from .document import (
     CELL_KINDS,
@@ -27,18 +27,21 @@ from .document import (
     Numbers,
     Section,
     Sentence,
+    SideBySide,
     Table,
     Warned,
     Where,
     facts_by,
     figure,
-    figures,
     number,
     section,
 )
 
-# Deviation from a published figure up to which a cell is coloured so
-DEVIATIONS = ((0.05, "good"), (0.25, "off"), (0.5, "far"), (math.inf, "bad"))
+# Deviations from a published figure up to which a cell is coloured so; the last is where there is none
+WITHIN, KINDS = (0.05, 0.25, 0.5, math.inf), ("good", "off", "far", "bad", "")
+BODY_AXES = ("ahead", "to port", "up")
+# Points of a trace that are drawn
+TRACE_POINTS = 400
 CONVERGENCE_NOTE = (
     "Error of the misalignment, ° rms: of the whole angle / of pitch and yaw alone. Calibrated on each run with "
     f"attitude, for each noise of the reference. A published network has {PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s."
@@ -88,17 +91,6 @@ def evaluation(e: Evaluation) -> Document:
         ("Calibrated on the sets", e.coverage),
         *((title, study.coverage) for study, title in studies if study is not None),
     ]
-    by_time = [
-        (each.name, "all" if window is None else f"{window:g} s", *(number(value, 4) for value in row.tolist()))
-        for each, of_set in zip(e.sets, e.seed_mean_by_time, strict=True)
-        for window, row in zip(e.windows_s, of_set, strict=True)
-    ]
-    times = Table(("set", "first", *e.columns), by_time, notes=("Avg.VRMSE, m/s.",), words=2)
-    angles = [
-        (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
-        for k, seconds in enumerate(TIMES_S)
-    ]
-    converging = Table(("first", *(each.label for each in e.convergence)), angles, notes=(CONVERGENCE_NOTE,))
     others = [(name, *(f"{value:.4f}" for value in each), f"{each.mean():.4f}") for name, each in e.baselines.items()]
     baselines = Table(("Avg.VRMSE, m/s", *(each.name for each in e.sets), "mean"), others, notes=(BASELINES_NOTE,))
     where = "mean over the sets" if len(e.sets) > 1 else f"set {e.sets[0].name}"
@@ -106,8 +98,6 @@ def evaluation(e: Evaluation) -> Document:
         Number(UNCALIBRATED, f"{e.set_mean[e.columns.index(UNCALIBRATED)]:.4f} m/s", note=f"Avg.VRMSE, {where}"),
         *(Number(f"best {w}", f"{value:.4f} m/s", note=name) for w, (name, value) in e.best(e.set_mean).items()),
     ]
-    of_models = any(each.name in MODELS for each in e.convergence)
-    is_published = bool(np.isfinite(e.published_of_these).any())
     return Document(
         title="Evaluation of the DVL calibration models",
         subtitle=e.source,
@@ -120,21 +110,8 @@ def evaluation(e: Evaluation) -> Document:
             section("", facts_by(FACTS, e)),
             section("", Warned(), where=Where.PAGE),
             section("Velocity error after calibration", *_scores(e)),
-            section("Velocity error against calibration time", times, where=Where.TERMINAL),
-            section(
-                "Velocity error against calibration time",
-                Legend(e.models, ""),
-                Sentence("Rings: published.", soft=True) if is_published else None,
-                figures("evaluation_pictures.time_pictures", e),
-                where=Where.PAGE,
-            ),
-            section("How fast is the misalignment found?", converging if e.convergence else None, where=Where.TERMINAL),
-            section(
-                "How fast is the misalignment found?",
-                Sentence(CONVERGENCE_CAPTION, soft=True) if of_models else None,
-                figures("evaluation_pictures.convergence_pictures", e) if of_models else None,
-                where=Where.PAGE,
-            ),
+            *_by_time(e),
+            *(_converging(e) if e.convergence else []),
             section("What was done before", baselines),
             *(
                 section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
@@ -144,18 +121,7 @@ def evaluation(e: Evaluation) -> Document:
             *([_pull(e.errors_in_variables)] if e.errors_in_variables is not None else []),
             *(each for study, title in studies if study is not None and study.runs for each in _study(e, study, title)),
             *([_held_out(e.held_out)] if e.held_out else []),
-            *(
-                section(
-                    f"Velocity before and after correction: {trace.trajectory}, calibrated on {trace.calibrated_on}",
-                    Legend(list(trace.corrected), ""),
-                    Sentence(
-                        f"Errors put in: {trace.combination}. Corrected by {trace.best}, the best on it.", soft=True
-                    ),
-                    figures("evaluation_pictures.trace_pictures", trace),
-                    where=Where.PAGE,
-                )
-                for trace in e.traces
-            ),
+            *map(_trace, e.traces),
         ],
         parameters=e.parameters,
     )
@@ -187,19 +153,16 @@ def _summary(e: Evaluation) -> Iterable[str]:
 def _scores(e: Evaluation) -> Iterable[Item]:
     """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below; and how
     much of the error is gone, by model."""
-
-    def cell(value: float, published: float) -> str | Cell:
-        if not math.isfinite(value) or not math.isfinite(published):
-            return number(value, 4)
-        ratio = value / published
-        kind = next(kind for limit, kind in DEVIATIONS if abs(ratio - 1.0) <= limit)
-        return Cell(f"{value:.4f}", kind, f"{published:.4f} ×{ratio:.2f}")
-
     here, published = (np.vstack([each, each.mean(axis=0)]).T for each in (e.seed_mean, e.published_of_these))
-    rows = [
-        (name, *(cell(*pair) for pair in zip(*both, strict=True)))
-        for name, *both in zip(e.columns, here.tolist(), published.tolist(), strict=True)
-    ]
+    ratio = here / published
+    kinds = np.searchsorted(WITHIN, np.abs(ratio - 1.0))  # nan after all others
+    rows: list[tuple[str | Cell, ...]] = []
+    for name, *of_sets in zip(e.columns, *map(np.ndarray.tolist, (here, published, ratio, kinds)), strict=True):
+        cells = (
+            Cell(number(value, 4), KINDS[kind], f"{known:.4f} ×{times:.2f}" if math.isfinite(times) else "")
+            for value, known, times, kind in zip(*of_sets, strict=True)
+        )
+        rows.append((name, *cells))
     notes = [
         "Avg.VRMSE in m/s: root mean square of the velocity error, mean over trajectories, combinations and seeds."
     ]
@@ -220,6 +183,69 @@ def _scores(e: Evaluation) -> Iterable[Item]:
         gone,
         gone_published,
     )
+
+
+def _by_time(e: Evaluation) -> Iterator[Section]:
+    """Error against how long was calibrated, by set."""
+    title = "Velocity error against calibration time"
+    rows = [
+        (each.name, "all" if window is None else f"{window:g} s", *(number(value, 4) for value in row.tolist()))
+        for each, of_set in zip(e.sets, e.seed_mean_by_time, strict=True)
+        for window, row in zip(e.windows_s, of_set, strict=True)
+    ]
+    table = Table(("set", "first", *e.columns), rows, notes=("Avg.VRMSE, m/s.",), words=2)
+    yield section(title, table, where=Where.TERMINAL)
+    drawn = [
+        figure(
+            "evaluation_figures.error_over_calibration_time",
+            f"{each.name}: calibrated on {each.calibration_run}",
+            f"Avg.VRMSE against calibration time for set {each.name}, all models",
+            e.models,
+            e.windows_s,
+            float(e.seed_mean[i, e.columns.index(UNCALIBRATED)]),
+            e.of_models(e.seed_mean_by_time[i]),
+            each.window_s,
+            e.of_models(e.published_of_these[i]),
+        )
+        for i, each in enumerate(e.sets)
+    ]
+    is_published = bool(np.isfinite(e.published_of_these).any())
+    rings = Sentence("Rings: published.", soft=True) if is_published else None
+    yield section(title, Legend(e.models, ""), rings, SideBySide(drawn), where=Where.PAGE)
+
+
+def _converging(e: Evaluation) -> Iterator[Section]:
+    """Error of the misalignment against time."""
+    title = "How fast is the misalignment found?"
+    rows = [
+        (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
+        for k, seconds in enumerate(TIMES_S)
+    ]
+    table = Table(("first", *(each.label for each in e.convergence)), rows, notes=(CONVERGENCE_NOTE,))
+    yield section(title, table, where=Where.TERMINAL)
+    shown = [each for each in e.convergence if each.name in MODELS]
+    if not shown:
+        return
+    drawn = []
+    for what, values in (
+        ("Pitch and yaw", [each.level_deg for each in shown]),
+        ("The whole angle", [each.angle_deg for each in shown]),
+    ):
+        told = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
+        drawn.append(
+            figure(
+                "evaluation_figures.misalignment_over_time",
+                f"{what}, error against time",
+                f"{what} against time; after {TIMES_S[-1]:g} s {told}",
+                TIMES_S,
+                [each.name for each in shown],
+                [each.gnss_std for each in shown],
+                values,
+                (PUBLISHED_S, PUBLISHED_DEG),
+                caption="rms over runs, combinations of errors and seeds. Star: published for a network.",
+            )
+        )
+    yield section(title, Sentence(CONVERGENCE_CAPTION, soft=True), SideBySide(drawn), where=Where.PAGE)
 
 
 def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
@@ -353,3 +379,40 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
             )
         )
     return section("Held-out verification", Table(("model", *sets), rows, notes=notes), *drawn)
+
+
+def _trace(trace: Trace) -> Section:
+    """Velocity of one trajectory before and after the correction by the model that does best on it."""
+    step = max(1, len(trace.time) // TRACE_POINTS)
+    time_s, truth, uncorrected = trace.time[::step], trace.truth[::step], trace.uncorrected[::step]
+    corrected = {name: velocity[::step] for name, velocity in trace.corrected.items()}
+    best = trace.best
+    drawn = [
+        figure(
+            "evaluation_figures.velocity_of_trace",
+            f"Velocity {where}",
+            f"Velocity {where} of {trace.trajectory}: truth, DVL, and corrected by {best}, m/s",
+            time_s,
+            truth[:, axis],
+            uncorrected[:, axis],
+            corrected[best][:, axis],
+            f"velocity {where}, m/s",
+        )
+        for axis, where in enumerate(BODY_AXES)
+    ]
+    error = figure(
+        "evaluation_figures.error_of_trace",
+        "Velocity error, all models",
+        "Length of the velocity error before and after correction, m/s",
+        time_s,
+        np.linalg.norm(uncorrected - truth, axis=1),
+        {name: np.linalg.norm(velocity - truth, axis=1) for name, velocity in corrected.items()},
+        caption="Running root mean square. Dotted: uncorrected.",
+    )
+    return section(
+        f"Velocity before and after correction: {trace.trajectory}, calibrated on {trace.calibrated_on}",
+        Legend(list(trace.corrected), ""),
+        Sentence(f"Errors put in: {trace.combination}. Corrected by {best}, the best on it.", soft=True),
+        SideBySide([*drawn, error]),
+        where=Where.PAGE,
+    )

@@ -34,7 +34,7 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
     return Document(
         title="What is in a recording",
         subtitle=names,
-        answer=Answer(examined.verdict, severity, [f"{answer} {_why(examined)}".rstrip()]),
+        answer=Answer(examined.verdict, severity, [f"{answer} {examined.why}".rstrip()]),
         warnings=examined.notes,
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *said]),
@@ -50,16 +50,6 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
         ],
         lead=lead,
     )
-
-
-def _why(examined: Examination) -> str:
-    errors = [each for each in examined.findings if each.severity is Severity.ERROR]
-    if errors:
-        return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
-    if not examined.has_reference:
-        return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
-    missing = [each.name for each in examined.shown if each.needs]
-    return f"Not shown yet: {' and '.join(missing)}." if missing else ""
 
 
 CONTENTS: Columns[Content] = {
@@ -79,8 +69,13 @@ SHOWN: Columns[Shown] = {
 
 def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[str, str]]:
     """What to type next."""
-    if is_live:
-        return [("next", _live_command(examined))]
+    if is_live:  # the node on the topics that were found, with what was found of them
+        discovery, default = examined.discovery, Topics()
+        names = ((role, getattr(discovery.topics, role)) for role in ("dvl", "gnss", "imu"))
+        topics = [(role, name) for role, name in names if name.lstrip("/") not in ("", getattr(default, role))]
+        values = {name: list(value) if isinstance(value, tuple) else value for name, value in discovery.values.items()}
+        told = options(topics, [f"{name}:={as_yaml(value)}" for name, value in values.items()])
+        return [("next", typed("run --watch", (), *told, "-p", "result_file:=calibration.yaml"))]
     given = [
         word
         for found in examined.findings
@@ -90,13 +85,3 @@ def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[st
     if examined.verdict == "no" and not given:
         return [("next", "dvl-calib doctor BAG   (once it is recorded again)")]
     return [("next", typed("replay", examined.paths, *given, "--save", "calibration.yaml"))]
-
-
-def _live_command(examined: Examination) -> str:
-    """The node on the topics that were found, with what was found of them."""
-    discovery, default = examined.discovery, Topics()
-    names = ((role, getattr(discovery.topics, role)) for role in ("dvl", "gnss", "imu"))
-    topics = [(role, name) for role, name in names if name.lstrip("/") not in ("", getattr(default, role))]
-    found = {name: list(value) if isinstance(value, tuple) else value for name, value in discovery.values.items()}
-    values = [f"{name}:={as_yaml(value)}" for name, value in found.items()]
-    return typed("run --watch", (), *options(topics, values), "-p", "result_file:=calibration.yaml")

@@ -1,8 +1,12 @@
-"""Results that print as their answer."""
+"""Results that print as their answer, and give their tables."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class Answering:
@@ -13,6 +17,8 @@ class Answering:
 
     laid_out: Callable[[Answering, bool], str] | None = None
     """Result and whether HTML is wanted -> text."""
+    framed: Callable[[Answering], dict[str, pandas.DataFrame]] | None = None
+    """Result -> its tables by heading."""
 
     def __repr__(self) -> str:
         show = Answering.laid_out
@@ -21,3 +27,20 @@ class Answering:
     def _repr_html_(self) -> str | None:
         show = Answering.laid_out
         return None if show is None else show(self, True)
+
+    def tables(self) -> dict[str, pandas.DataFrame]:
+        """Give the tables of its page and of the terminal as data frames.
+
+        Returns
+        -------
+        dict of str to pandas.DataFrame
+            By the heading that each stands below. Columns of numbers hold these, in the unit of their heading, with
+            their σ as ``... ±1σ`` and whether they are shown as ``... shown`` beside them; others hold texts.
+
+        Raises
+        ------
+        InputError
+            Without pandas.
+        """
+        make = Answering.framed
+        return {} if make is None else make(self)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 import math
 import re
+import sys
 from html import unescape
 
 import pytest
 from report_fixtures import comparison as compared
 from rich.console import Console
 
+import dvl_calib_ros.api  # noqa: F401  results learn from it how they are laid out
 from dvl_calib_ros.effects.registry import EFFECTS
+from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.present.comparison import comparison
 from dvl_calib_ros.present.document import (
     Answer,
@@ -23,6 +26,7 @@ from dvl_calib_ros.present.document import (
     Where,
     intervals,
     number,
+    section,
     table_by,
     with_std,
 )
@@ -73,7 +77,7 @@ def test_what_both_show_is_the_same_and_what_one_shows_is_not_at_the_other(tmp_p
 
 def test_a_comparison_has_the_same_numbers_at_a_terminal_and_on_a_page(tmp_path):
     document = comparison(compared("it"))
-    cells = [cell for table in document.tables for row in table.rows for cell in row]
+    cells = [cell for table in document.tables.values() for row in table.rows for cell in row]
     terminal, page = at_terminal(document), on_page(document, tmp_path)
     assert len(cells) > 50
     for cell in cells:
@@ -82,8 +86,41 @@ def test_a_comparison_has_the_same_numbers_at_a_terminal_and_on_a_page(tmp_path)
 
 def test_a_table_is_a_data_frame():
     pandas = pytest.importorskip("pandas")
-    frame = MADE.tables[0].frame()
-    assert isinstance(frame, pandas.DataFrame) and frame.loc[0, "n"] == "1.5"
+    frame = TABLE.frame()
+    assert isinstance(frame, pandas.DataFrame) and frame.loc[0, "n"] == 1.5
+
+
+def test_a_column_of_numbers_with_a_deviation_is_two_of_floats_and_one_of_words_is_left():
+    pytest.importorskip("pandas")
+    rows = [("a", "−1.50 ± 0.25", "3", "7 of 9", "2.0 ?"), ("b", Cell("–", "off"), "–", "–", "1.0")]
+    frame = Table(("", "yaw, °", "n", "χ²", "δk"), rows).frame()
+    assert list(frame.columns) == ["", "yaw, °", "yaw, ° ±1σ", "n", "χ²", "δk", "δk shown"]
+    assert list(frame["δk"]) == [2.0, 1.0] and list(frame["δk shown"]) == [False, True]
+    assert frame["yaw, °"][0] == -1.5 and frame["yaw, ° ±1σ"][0] == 0.25 and frame["n"][0] == 3.0
+    assert frame[["yaw, °", "n"]].isna().iloc[1].all() and list(frame["χ²"]) == ["7 of 9", "–"]
+
+
+def test_tables_below_one_heading_are_numbered_and_one_that_is_shown_twice_counts_once():
+    other = Table(("", "m"), [("row", "2")])
+    sections = [
+        section("One", TABLE, where=Where.TERMINAL), section("One", TABLE, other, where=Where.PAGE),
+        section("", Table(("k",), [("1",)])),
+    ]  # fmt: skip
+    made = Document("Title", "", None, (), sections)
+    assert list(made.tables) == ["One", "One (2)", "One (3)"] and made.tables["One (2)"] is other
+
+
+def test_results_give_their_tables_as_data_frames_by_their_headings(monkeypatch):
+    pytest.importorskip("pandas")
+    result = compared("monday.yaml")
+    frames = result.tables()
+    assert list(frames)[:2] == ["Calibrations", "Differences, the later less the earlier"]
+    assert list(frames["Calibrations"][""]) == ["monday.yaml", "tuesday.yaml", "wednesday.yaml"]
+    assert frames["Calibrations"]["yaw, °"].iloc[-1] == pytest.approx(math.degrees(0.012), abs=0.006)
+    assert frames["Calibrations"]["yaw, ° ±1σ"].iloc[0] == pytest.approx(math.degrees(0.001), abs=0.006)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="pip install pandas"):
+        result.tables()
 
 
 @pytest.mark.parametrize(("value", "said"), [(1.005, "1.00"), (-0.001, "0.00"), (-2.5, "−2.50"), (float("nan"), "–")])
