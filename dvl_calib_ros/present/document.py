@@ -356,6 +356,11 @@ def with_std(value: float, std: float, digits: int = 2, *, signed: bool = False)
     return f"{number(value, digits, signed=signed)} ± {std:.{digits}f}" if std == std else "–"
 
 
+def counted(count: int, what: str) -> str:
+    """So many of something."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def p_value(p: float) -> str:
     """A probability; – for none."""
     return "–" if p != p else f"{p:.2g}" if p >= 1e-3 else "< 0.001"

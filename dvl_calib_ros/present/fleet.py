@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,15 +20,19 @@ from .comparison import QUANTITIES, values_of
 from .document import (
     Answer,
     Cell,
+    Columns,
     Document,
-    Figures,
+    Item,
     Section,
     Sentence,
-    Table,
     Where,
+    columns_for,
+    counted,
+    figure,
     figures,
     number,
     section,
+    table_by,
     with_std,
 )
 
@@ -52,19 +59,35 @@ def fleet(result: Fleet) -> Document:
         said = ["No mounting moved."]
     if not said:
         said = ["No vehicle has calibrations of two days, so nothing can be compared."]
-    said.append(f"{_counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
-    done = f"{_counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
+    said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
+    done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
+    sitting = [VehicleNow(each, now(each)) for each in vehicles]
+    scales = [
+        (each.name, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.scale))
+        for each in vehicles
+    ]
+    several = any(len(each.recordings) > 1 for each in result.persons)
+    compasses = [(each.name, each.heading) for each in vehicles if each.heading is not None]
+    told = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in compasses)
+    drawn = figure("fleet_figures.compass", "Deviation, °", f"Deviation of the heading by heading: {told}", compasses)
     return Document(
         title="DVL calibrations of a fleet",
-        subtitle=f"{_counted(len(vehicles), 'vehicle')}, {_counted(recordings, 'recording')}; {done}",
+        subtitle=f"{counted(len(vehicles), 'vehicle')}, {counted(recordings, 'recording')}; {done}",
         answer=Answer(result.word, severity, said),
         warnings=result.notes,
         sections=[
-            Section("Vehicles", [_vehicles(vehicles)]),
-            section("Recordings that need a person", _persons(result.persons) if result.persons else None),
+            Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True)]),
+            section(
+                "Recordings that need a person",
+                table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=2),
+            ),
             *(_trend(each) for each in sorted(vehicles, key=_by_word)),
-            _speed_of_sound(vehicles),
-            _heading(vehicles),
+            section("Speed of sound", table_by(SPEEDS, [each for each in scales if each[1]], (SPEED_NOTE,))),
+            section(
+                "Deviation of the compass",
+                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True),
+                drawn if compasses else None,
+            ),
         ],
     )
 
@@ -72,10 +95,6 @@ def fleet(result: Fleet) -> Document:
 def _by_word(vehicle: VehicleHistory) -> int:
     """Those whose mounting moved come first."""
     return len(WORDS) if vehicle.compared is None else WORDS.index(vehicle.compared.word)
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def now(vehicle: VehicleHistory) -> Extrinsics | None:
@@ -89,44 +108,66 @@ def now(vehicle: VehicleHistory) -> Extrinsics | None:
     return fused(days)
 
 
-def _vehicles(vehicles: tuple[VehicleHistory, ...]) -> Table:
-    rows: list[tuple[str | Cell, ...]] = []
-    for each in vehicles:
-        found, compared = now(each), each.compared
-        word = "not compared" if compared is None else compared.word
-        times = f" ({len(compared.moved)}×)" if compared is not None and len(compared.moved) > 1 else ""
-        kind = {"moved": "bad", "suspicious": "off", "same": "good"}.get(word, "")
-        angles = ["–"] * 4
-        if found is not None:
-            values = values_of(found)
-            angles = [
-                with_std(quantity.factor * values[quantity.component], quantity.factor * found.std[quantity.component])
-                for quantity in _ANGLES_AND_SCALE
-            ]
-        rows.append(
-            (each.name, str(each.recordings), str(len(each.days)), Cell(word + times, f"text {kind}".strip()), *angles)
-        )
-    head: tuple[str | Cell, ...] = (
+class VehicleNow(NamedTuple):
+    """A vehicle with its mounting as it is, None where no recording is usable."""
+
+    history: VehicleHistory
+    mounting: Extrinsics | None
+
+    @property
+    def word(self) -> str:
+        """What comparing its days says."""
+        return "not compared" if self.history.compared is None else self.history.compared.word
+
+    @property
+    def moved(self) -> int:
+        """How many times its mounting moved."""
+        return 0 if self.history.compared is None else len(self.history.compared.moved)
+
+
+MOUNTING_NOTE = "Angles and scale since the mounting last moved, ±1σ. Rejected recordings are in none of them."
+KINDS = {"moved": "text bad", "suspicious": "text off", "same": "text good"}
+VEHICLES: Columns[VehicleNow] = {
+    "": lambda each: each.history.name,
+    "recordings": lambda each: str(each.history.recordings),
+    "days": lambda each: str(len(each.history.days)),
+    "mounting": lambda each: Cell(
+        each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text")
+    ),
+    **columns_for(
+        {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
+        lambda each, quantity: (
+            "–"
+            if each.mounting is None
+            else with_std(
+                quantity.factor * values_of(each.mounting)[quantity.component],
+                quantity.factor * each.mounting.std[quantity.component],
+            )
+        ),
+    ),
+}
+SEVERAL_NOTE = "Of several recordings the sentence is that of the first."
+PERSONS: Columns[NeedsPerson] = {
+    "recordings": lambda each: str(len(each.recordings)),
+    "why": lambda each: Cell(
+        full(each.why) + (f" [{each.code}]" if each.code else ""),
         "",
-        "recordings",
-        "days",
-        Cell("mounting", "text"),
-        *(f"{each.name}, {each.unit}" for each in _ANGLES_AND_SCALE),
-    )
-    note = "Angles and scale since the mounting last moved, ±1σ. Rejected recordings are in none of them."
-    return Table(head, rows, notes=(note,), dense=True)
-
-
-def _persons(persons: tuple[NeedsPerson, ...]) -> Table:
-    rows = []
-    for each in persons:
-        more = len(each.recordings) - NAMED
-        below = ", ".join(each.recordings[:NAMED]) + (f" and {more} more" if more > 0 else "")
-        why = full(each.why) + (f" [{each.code}]" if each.code else "")
-        rows.append((str(len(each.recordings)), Cell(why, "", below)))
-    several = any(len(each.recordings) > 1 for each in persons)
-    notes = ("Of several recordings the sentence is that of the first.",) if several else ()
-    return Table(("recordings", "why"), rows, notes=notes, words=2)
+        ", ".join(each.recordings[:NAMED])
+        + (f" and {len(each.recordings) - NAMED} more" if len(each.recordings) > NAMED else ""),
+    ),
+}
+COMPASS_NOTE = (
+    "Error of the heading reference with the yaw (from east, to the left), ±1σ; a constant is part of the mounting."
+)
+COMPASS: Columns[tuple[str, CompassDeviation]] = {
+    "": lambda each: each[0],
+    "recordings": lambda each: str(each[1].recordings),
+    "largest": lambda each: f"{number(largest(each[1]))}°",
+    **columns_for(
+        {"sin, °": 0, "cos, °": 1, "sin 2, °": 2, "cos 2, °": 3},
+        lambda each, k: with_std(each[1].value[k], each[1].std[k]),
+    ),
+}
 
 
 def _trend(vehicle: VehicleHistory) -> Section:
@@ -134,54 +175,30 @@ def _trend(vehicle: VehicleHistory) -> Section:
         days = len(vehicle.days)
         why = {0: "no recording is usable", 1: "all are of one day"}.get(days, "no two days show the same angle")
         return Section(vehicle.name, [Sentence(f"There is nothing to compare: {why}.", soft=True)], Where.PAGE)
-    shown: list[Sentence | Figures] = [Sentence(each.full_sentence) for each in reasons(vehicle.compared)]
+    shown: list[Item] = [Sentence(each.full_sentence) for each in reasons(vehicle.compared)]
     components = tuple(each.component for each in _ANGLES_AND_SCALE)
     shown.append(figures("comparison_figures.trend", vehicle.compared, components))
     return Section(vehicle.name, shown, Where.PAGE)
 
 
-def _speed_of_sound(vehicles: tuple[VehicleHistory, ...]) -> Section:
-    rows: list[tuple[str | Cell, ...]] = []
-    for each in vehicles:
-        own = [day for day in each.days if day.shown[SCALE]]
-        if own:
-            low, high = (pick(own, key=lambda day: day.scale) for pick in (min, max))
-            cells = [
-                Cell(
-                    f"{number(SET_SPEED / (1.0 + day.scale), 0)} m/s",
-                    "",
-                    f"{with_std(100.0 * day.scale, 100.0 * day.std[SCALE])} %, {date(day.first_ns)[:10]}",
-                )
-                for day in (high, low)
-            ]
-            rows.append((each.name, str(len(own)), *cells))
-    note = (
-        "A scale is what a wrong speed of sound looks like: if the instrument was set to "
-        f"{SET_SPEED:.0f} m/s, the water had this speed. Set temperature and salinity first."
-    )
-    return section("Speed of sound", Table(("", "days", "lowest", "highest"), rows, notes=(note,)))
-
-
-def _heading(vehicles: tuple[VehicleHistory, ...]) -> Section:
-    known = [(each.name, each.heading) for each in vehicles if each.heading is not None]
-    rows = [
-        (
-            name,
-            str(heading.recordings),
-            f"{number(largest(heading))}°",
-            *(with_std(value, std) for value, std in zip(heading.value, heading.std, strict=True)),
-        )
-        for name, heading in known
-    ]
-    head = ("", "recordings", "largest", "sin, °", "cos, °", "sin 2, °", "cos 2, °")
-    note = (
-        "Error of the heading reference with the yaw (from east, to the left), ±1σ; a constant is part of the mounting."
-    )
-    return section(
-        "Deviation of the compass",
-        Table(head, rows, notes=(note,), dense=True),
-        figures("fleet_figures.compass", known) if known else None,
-    )
+SPEED_NOTE = (
+    "A scale is what a wrong speed of sound looks like: if the instrument was set to "
+    f"{SET_SPEED:.0f} m/s, the water had this speed. Set temperature and salinity first."
+)
+# Name of a vehicle and its days that show a scale, the smallest scale first
+SPEEDS: Columns[tuple[str, Sequence[Extrinsics]]] = {
+    "": lambda each: each[0],
+    "days": lambda each: str(len(each[1])),
+    **columns_for(
+        {"lowest": -1, "highest": 0},
+        lambda each, at: Cell(
+            f"{number(SET_SPEED / (1.0 + each[1][at].scale), 0)} m/s",
+            "",
+            f"{with_std(100.0 * each[1][at].scale, 100.0 * each[1][at].std[SCALE])} %, "
+            f"{date(each[1][at].first_ns)[:10]}",
+        ),
+    ),
+}
 
 
 def deviation(heading: CompassDeviation, yaw: np.ndarray) -> np.ndarray:

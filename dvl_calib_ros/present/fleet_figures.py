@@ -9,17 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..fleet.history import CompassDeviation
-from .fleet import deviation, largest
-from .style import Picture, legend_above, new_figure, picture
+from .fleet import deviation
+from .style import legend_above, new_figure
 
 
-def compass(known: Sequence[tuple[str, CompassDeviation]]) -> list[Picture]:
+def compass(known: Sequence[tuple[str, CompassDeviation]]) -> Figure:
     """Deviation of the heading against the heading, a line a vehicle."""
-    told = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in known)
-    return [picture("Deviation, °", f"Deviation of the heading by heading: {told}", _draw, known)]
-
-
-def _draw(known: Sequence[tuple[str, CompassDeviation]]) -> Figure:
     figure, axes = new_figure()
     north = np.linspace(0.0, 360.0, 181)
     for name, heading in known:

@@ -12,6 +12,7 @@ from conftest import ROOT
 
 from validation import rooms
 from validation.__main__ import main
+from validation.layout import layout_functions
 
 FOREIGN = ("rclpy", "rosbags", "mcap", "apsw", "lz4", "yaml", "rich", "matplotlib", "jinja2", "joblib")
 
@@ -82,13 +83,21 @@ def test_no_estimator_is_asked_for_by_its_name_outside_its_own_room():
 
 def test_the_size_is_printed_with_arrows(capsys):
     assert main(["size"]) == 0
-    *_, lines, arrows = capsys.readouterr().out.splitlines()
+    *_, lines, arrows, layout = capsys.readouterr().out.splitlines()
     n_modules, n_rooms = len(list(rooms.modules())), len(rooms.ROOMS)
     assert lines.split() == f"{rooms.sizes().total()} lines of code in {n_modules} modules and {n_rooms} rooms".split()
     assert arrows.split() == f"{len(rooms.arrows())} arrows between rooms, 0 up".split()
+    assert layout.split()[:2] == [str(len(list(layout_functions()))), "functions"]
     assert main(["size", "--json"]) == 0
     counts = json.loads(capsys.readouterr().out)
     assert counts["lines"] == rooms.sizes().total() and counts["arrows_up"] == 0
+
+
+def test_a_result_is_laid_out_by_few_functions_and_none_of_them_is_long():
+    """Parts that are tables are declared as columns; a function that lays out a part is for what is no table."""
+    found = list(layout_functions())
+    assert 40 < len(found) < 50, sorted(f"{each.path.name} {each.name}" for each in found)
+    assert max(each.lines for each in found) <= 100
 
 
 def test_blank_lines_comments_and_docstrings_are_no_code():
