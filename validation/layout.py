@@ -11,7 +11,18 @@ from .rooms import PACKAGE
 
 # Where results are laid out, and what of that knows of no result: the words of it, and what renders it
 ROOMS = ("present", "cli", "api")
-OF_NO_RESULT = {"document", "page", "terminal", "terminal_map", "folding", "exploring", "style", "time_axis", "typed"}
+OF_NO_RESULT = {
+    "document",
+    "numbers",
+    "page",
+    "terminal",
+    "terminal_map",
+    "folding",
+    "exploring",
+    "style",
+    "time_axis",
+    "typed",
+}
 PARTS = {
     "Document", "Section", "Item", "Answer", "Sentence", "Table", "Cell", "Number", "Numbers", "Commands", "Facts",
     "Figures", "Picture", "Text", "RenderableType",

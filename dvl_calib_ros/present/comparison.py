@@ -14,19 +14,8 @@ from ..calibration.comparison import ChiSquare, Comparison, Difference
 from ..calibration.comparison_words import date, reasons, remarks
 from ..calibration.extrinsics import MOUNTING, Extrinsics
 from ..calibration.frames import Array, rpy_from_rotation
-from .document import (
-    Answer,
-    Columns,
-    Document,
-    Section,
-    Sentence,
-    Table,
-    Where,
-    columns_for,
-    figures,
-    table_by,
-    with_std,
-)
+from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
+from .numbers import with_std
 
 # Of more pairs than these a terminal shows the neighbours in time.
 MOST_PAIRS = 10

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ..evaluation.bags import CrossCheck
-from .document import Document, Item, Sentence, Table, Where, figures, number, section
+from .document import Document, Item, Sentence, Table, Where, figures, section
+from .numbers import number
 
 ERRORS_NOTE = (
     "rms of the vector, m/s, with the noise of GNSS, which no calibration removes; – nothing to calibrate with, or to "

@@ -35,16 +35,10 @@ from .document import (
     facts_by,
     figure,
     figures,
-    intervals,
-    mm,
-    p_value,
-    quantity,
     section,
-    share,
     table_by,
-    three,
-    with_std,
 )
+from .numbers import intervals, mm, p_value, quantity, share, three, with_std
 
 NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",

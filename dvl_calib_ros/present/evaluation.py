@@ -33,9 +33,9 @@ from .document import (
     Where,
     facts_by,
     figure,
-    number,
     section,
 )
+from .numbers import number
 
 # Deviations from a published figure up to which a cell is coloured so; the last is where there is none
 WITHIN, KINDS = (0.05, 0.25, 0.5, math.inf), ("good", "off", "far", "bad", "")

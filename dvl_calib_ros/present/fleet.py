@@ -27,14 +27,12 @@ from .document import (
     Sentence,
     Where,
     columns_for,
-    counted,
     figure,
     figures,
-    number,
     section,
     table_by,
-    with_std,
 )
+from .numbers import counted, number, with_std
 
 # Speed of sound that instruments are delivered with, m/s
 SET_SPEED = 1500.0

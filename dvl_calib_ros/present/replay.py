@@ -46,10 +46,10 @@ from .document import (
     facts_by,
     figure,
     figures,
-    fitting_unit,
     section,
     table_by,
 )
+from .numbers import fitting_unit
 from .terms import estimate_table
 from .typed import typed
 

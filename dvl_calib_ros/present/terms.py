@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
 from ..calibration.results import Estimate, Result
-from .document import Table, with_std
+from .document import Table
+from .numbers import with_std
 
 
 class Term(NamedTuple):

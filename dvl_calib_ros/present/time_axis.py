@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from ..calibration.frames import Array
-from .document import fitting_unit
 from .exploring import BREAK_MARK, mark_time
+from .numbers import fitting_unit
 
 # Points of a line: more cannot be seen at this width
 LINE_POINTS = 600

@@ -11,7 +11,7 @@ from ..calibration.frames import Array
 from ..diagnosis.series import HeldOutTwin
 from . import diagnosis_figures as figures
 from .diagnosis import twin_errors
-from .document import mm
+from .numbers import mm
 from .style import Picture, picture
 from .time_axis import TimeAxis
 

@@ -12,21 +12,8 @@ from ..unpaired.results import (
     UnpairedComparison,
 )
 from ..verdict.kinds import Severity
-from .document import (
-    Answer,
-    Cell,
-    Columns,
-    Document,
-    Sentence,
-    Table,
-    Where,
-    figures,
-    intervals,
-    mm,
-    p_value,
-    section,
-    table_by,
-)
+from .document import Answer, Cell, Columns, Document, Sentence, Table, Where, figures, section, table_by
+from .numbers import intervals, mm, p_value
 
 SEVERITIES = {
     SimulatorVerdict.NO_DIFFERENCE: Severity.ACCEPT,

@@ -16,20 +16,8 @@ import dvl_calib_ros.api  # noqa: F401  results learn from it how they are laid 
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.present.comparison import comparison
-from dvl_calib_ros.present.document import (
-    Answer,
-    Cell,
-    Document,
-    Section,
-    Sentence,
-    Table,
-    Where,
-    intervals,
-    number,
-    section,
-    table_by,
-    with_std,
-)
+from dvl_calib_ros.present.document import Answer, Cell, Document, Section, Sentence, Table, Where, section, table_by
+from dvl_calib_ros.present.numbers import intervals, number, with_std
 from dvl_calib_ros.present.page import breakable, write_document
 from dvl_calib_ros.present.terminal import shown
 from dvl_calib_ros.verdict.kinds import Severity
