@@ -32,6 +32,7 @@ class CataloguePart:
     vehicle: str
     fingerprint: str
     extrinsics: Mapping[str, Any] | None
+    schema: int = SCHEMA
 
 
 class Catalogue:
@@ -86,15 +87,17 @@ class Catalogue:
         self._save(own, [{**row, "vehicle": vehicle} for row in rows])
 
     def parts(self) -> Iterator[CataloguePart]:
-        """All recordings; what is no part, or damaged, is passed over, and so done again."""
+        """All recordings; what is no part, damaged, or of another schema is passed over, and so done again."""
         from pyarrow import parquet
 
         for path in sorted(self.rows.glob("*.parquet")):
             try:
                 told = json.loads(parquet.read_schema(path).metadata[_KEY])
-                yield CataloguePart(**told)
+                part = CataloguePart(**told)
             except (OSError, KeyError, TypeError, ValueError, self._arrow.ArrowException):
                 continue
+            if part.schema == SCHEMA:
+                yield part
 
     def rows_of(self, recording: str) -> list[Row]:
         """Rows of a recording."""

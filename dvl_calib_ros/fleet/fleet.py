@@ -18,7 +18,7 @@ from ..verdict.answering import Answering
 from .catalogue import PAGE, SCHEMA, Catalogue, CataloguePart
 from .history import Catalogued, NeedsPerson, VehicleHistory, distinct, histories, need_person
 from .one import Task, entry_of, failed
-from .places import StoredRecording, recordings_in, vehicle_pattern
+from .places import StoredRecording, as_text, recordings_in, vehicle_pattern
 
 # Answers of a comparison, the worst first
 WORDS = ("moved", "suspicious", "same")
@@ -79,6 +79,8 @@ def run_fleet(
     default the first folder below a place. Raises InputError for a place that is none, for a catalogue that cannot be
     written, and for workers that cannot be had; what is done is kept.
     """
+    if parameters.initial_calibration:
+        raise InputError("initial_calibration: recordings of a fleet are each calibrated by themselves; leave it out")
     pattern = vehicle_pattern(vehicle_from)
     recordings, notes = recordings_in(places)
     check_outputs({}, [Path(each.where) for each in recordings if not each.is_remote], {"--out": out})
@@ -87,7 +89,7 @@ def run_fleet(
     known = {part.recording: part for part in catalogue.parts()}
     left = []
     for each in recordings:
-        vehicle, part = each.vehicle(pattern), known.get(each.where)
+        vehicle, part = each.vehicle(pattern), known.get(each.name)
         if part is None or part.fingerprint != _fingerprint(each, options):
             left.append(each)
         elif part.vehicle != vehicle:
@@ -97,9 +99,9 @@ def run_fleet(
     for number, (index, entry) in enumerate(outcomes_as_done(entry_of, tasks, workers), start=1):
         each = left[index]
         if isinstance(entry, Lost):
-            entry = failed(each.where, entry.why, is_final=False)
+            entry = failed(each.name, entry.why, is_final=False)
         fingerprint = _fingerprint(each, options) if entry.is_final else ""
-        catalogue.write(CataloguePart(each.where, each.vehicle(pattern), fingerprint, entry.extrinsics), entry)
+        catalogue.write(CataloguePart(each.name, each.vehicle(pattern), fingerprint, entry.extrinsics), entry)
         on_progress(number / len(tasks))
     return _read(catalogue, len(left), len(recordings) - len(left), notes)
 
@@ -135,5 +137,5 @@ def _options(parameters: Parameters, given: Given) -> str:
 
 def _fingerprint(recording: StoredRecording, options: str) -> str:
     """Changes when the recording, the program or the options do."""
-    files = [(each.where, each.size, each.stamp) for each in recording.files]
+    files = [(as_text(each.where), each.size, each.stamp) for each in recording.files]
     return hashlib.sha256(json.dumps([options, files]).encode()).hexdigest()

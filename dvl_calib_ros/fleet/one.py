@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..recordings.recording import open_recording
 from ..replay.checked import checked_replay
 from ..replay.replay import Replayed, extrinsics_of_replay
-from .places import StoredRecording
+from .places import StoredRecording, as_text
 
 _UNITS = {"°": "deg"}
 # `Estimate.heading_deviation`, in degrees; the last by the hour
@@ -60,15 +60,15 @@ class Entry:
 
 def entry_of(task: Task) -> Entry:
     """Calibrate. Whatever goes wrong is the entry's error."""
-    where = task.recording.where
+    where = task.recording.name
     try:
         with task.recording.at_hand() as path:
             try:
                 return _calibrated(task, path)
             except InputError as error:
-                return failed(where, str(error).replace(str(path), where))
+                return failed(where, as_text(str(error).replace(str(path), task.recording.where)))
     except Exception as error:
-        return failed(where, f"{type(error).__name__}: {error}", is_final=False)
+        return failed(where, as_text(f"{type(error).__name__}: {error}"), is_final=False)
 
 
 def failed(where: str, why: str, is_final: bool = True) -> Entry:
@@ -82,7 +82,7 @@ def _calibrated(task: Task, path: Any) -> Entry:
     replayed = checked_replay(
         recording, found.parameters, found.topics, mounting_is_guessed=bool(found.mounting_because)
     )
-    return entry_of_replay(replayed, task.recording.where)
+    return entry_of_replay(replayed, task.recording.name)
 
 
 def entry_of_replay(replayed: Replayed, where: str) -> Entry:

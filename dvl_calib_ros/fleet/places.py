@@ -6,8 +6,10 @@ each .mcap or .db3 file by itself. Object stores are read by fsspec; what is the
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -44,6 +46,11 @@ class StoredRecording:
     files: tuple[StoredFile, ...]
 
     @property
+    def name(self) -> str:
+        """`where` as text: a name on the disk may be none."""
+        return as_text(self.where)
+
+    @property
     def is_remote(self) -> bool:
         """Whether it is copied to be read."""
         return "://" in self.where
@@ -51,17 +58,19 @@ class StoredRecording:
     def vehicle(self, pattern: re.Pattern[str] | None) -> str:
         """Whose it is: what a pattern finds in its place, else the first folder below PLACE, else PLACE itself."""
         if pattern is not None:
-            found = pattern.search(self.where)
+            found = pattern.search(self.name)
             if found is None:
                 return "unknown"
             return next((group for group in found.groups() if group), found[0])
         folders = PurePosixPath(self.inside).parts
-        return folders[0] if len(folders) > 1 else PurePosixPath(self.place).name or self.place
+        return as_text(folders[0] if len(folders) > 1 else PurePosixPath(self.place).name or self.place)
 
     @contextmanager
     def at_hand(self) -> Iterator[Path]:
         """Where it can be read, on this machine."""
         if not self.is_remote:
+            if not os.path.exists(self.where):  # of a worker elsewhere; nothing that is wrong with the recording
+                raise FileNotFoundError(f"{self.where} is not there on {os.uname().nodename}")
             yield Path(self.where)
             return
         with tempfile.TemporaryDirectory(prefix="dvl_calib_fleet_") as folder:
@@ -73,6 +82,11 @@ class StoredRecording:
             for each in self.files:
                 store.get_file(each.where, str(target / PurePosixPath(each.where).name if is_folder else target))
             yield target
+
+
+def as_text(name: str) -> str:
+    """A name on the disk with what is no UTF-8 as escapes."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def vehicle_pattern(text: str | None) -> re.Pattern[str] | None:
@@ -142,8 +156,10 @@ def _local_files(place: str, unread: list[str]) -> _Files:
 
 
 def _local_file(path: str) -> StoredFile:
-    stat = os.stat(path)
-    return StoredFile(path, stat.st_size, str(stat.st_mtime_ns))
+    told = os.stat(path)
+    if not stat.S_ISREG(told.st_mode):
+        raise OSError(errno.EINVAL, "is no file")  # a pipe would be waited for
+    return StoredFile(path, told.st_size, str(told.st_mtime_ns))
 
 
 def _stored(place: str) -> _Files:

@@ -140,6 +140,37 @@ def test_what_failed_by_the_machine_is_tried_again(dives, tmp_path, monkeypatch)
     assert result.calibrated == 3 and result.persons == ()
 
 
+def test_a_recording_whose_name_is_no_text_or_that_is_gone_costs_its_row(dives, tmp_path, monkeypatch):
+    place = tmp_path / "dives"
+    shutil.copytree(dives / "auv1", place / "auv1")
+    os.rename(place / "auv1" / "dive1", os.fsencode(place / "auv1") + b"/dive\xff")
+    found = running.recordings_in
+
+    def then_gone(places):
+        recordings = found(places)
+        shutil.rmtree(place / "auv1" / "dive2", ignore_errors=True)
+        return recordings
+
+    monkeypatch.setattr(running, "recordings_in", then_gone)
+    result = dc.fleet(place, tmp_path / "out", jobs=1)
+    assert result.recordings == 3 and len(result.vehicles[0].days) == 2
+    (person,) = result.persons
+    assert person.recordings == (str(place / "auv1" / "dive2"),) and "is not there" in person.why
+    assert str(place / "auv1" / "dive\\xff") in set(table(tmp_path / "out").recording)
+    assert dc.fleet(place, tmp_path / "out", jobs=1).unchanged == 2
+
+
+def test_a_part_of_another_schema_is_not_read(made, dives, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(made[1], out)
+    part = next((out / "rows").glob("dive0*"))
+    old = parquet.read_table(part)
+    told = json.loads(old.schema.metadata[b"dvl_calib"]) | {"schema": 0, "extrinsics": {}}
+    parquet.write_table(old.replace_schema_metadata({"dvl_calib": json.dumps(told)}), part)
+    result = dc.fleet(dives, out, jobs=1)
+    assert (result.calibrated, result.unchanged) == (1, 4)
+
+
 def test_the_same_data_in_two_places_is_used_once(dives, tmp_path):
     for name in ("a", "b"):
         shutil.copytree(dives / "auv1" / "dive0", tmp_path / "dives" / "auv1" / name)
@@ -202,6 +233,7 @@ def test_the_command_prints_the_answer_and_who_needs_a_person(dives, tmp_path, m
     [
         (("nowhere", "--out", "out"), "nowhere: no such folder"),
         (("file", "--out", "out"), "no recording"),
+        (("recorded", "--out", "out", "-p", "initial_calibration:=file"), "initial_calibration"),
         ((".", "--out", "out", "--jobs", "-1"), "--jobs: -1 is negative"),
         (("recorded", "--out", "file/out"), "file/out"),
         ((".", "--out", "out", "--vehicle-from", "("), "--vehicle-from"),

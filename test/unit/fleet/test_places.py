@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -52,6 +53,15 @@ def test_links_are_followed_and_one_that_leads_back_ends(tmp_path):
     (place / "linked").symlink_to(other)
     (place / "a" / "back").symlink_to(place)
     assert found(place) == {"a/one.mcap": 1, "linked/two.mcap": 1}
+
+
+def test_what_is_no_file_is_said_and_not_waited_for(tmp_path):
+    place = made(tmp_path, "a/one.mcap")
+    os.mkfifo(place / "a" / "pipe.mcap")
+    (place / "a" / "gone.mcap").symlink_to("nowhere")
+    recordings, unread = recordings_in([str(place)])
+    assert [each.inside for each in recordings] == ["a/one.mcap"]
+    assert len(unread) == 2 and "gone.mcap: No such file" in unread[0] and "pipe.mcap: is no file" in unread[1]
 
 
 def test_the_vehicle_is_the_first_folder_below_the_place_or_what_a_pattern_finds(tmp_path):
