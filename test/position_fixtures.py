@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.displacement.legs import Fixes
+from dvl_calib_ros.calibration.samples import DvlSample, ImuSample
+from dvl_calib_ros.messages.drivers import POSE_TYPE
+from dvl_calib_ros.messages.encode import SampleWriter
+
+USBL = "usbl/pose"
 
 
 @dataclass(frozen=True)
@@ -18,7 +26,7 @@ class Truth:
     heading, of its sine and cosine, rad."""
 
     phi: tuple[float, float, float]
-    scale: float
+    scale: float = 0.0
     arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     late_s: float = 0.0
     deviation: tuple[float, float] = (0.0, 0.0)
@@ -82,3 +90,32 @@ def driven(rng, seconds, dvl_hz=5.0, fix_s=1.0, speed=1.5, truth=None, noise=Non
         Rotation.from_euler("ZYX", told[at]).as_quat(),
         Fixes(stamps[fix_at] + round(truth.late_s * 1e9), fixes, variance),
     )
+
+
+def write_positions(path: Path, driven_run, topic: str = USBL) -> Path:
+    """A bag of it, with the fixes as poses."""
+    stamps, velocity, quaternion, fixes = driven_run
+    rotation = Rotation.from_quat(quaternion)
+    rates = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / (1e-9 * np.diff(stamps))[:, None]
+    with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:
+        writer, types = SampleWriter(bag), bag.typestore.types
+        # a fix takes a second through the water and the deck unit
+        rows = heapq.merge(
+            ((int(stamp), 0, row) for row, stamp in enumerate(stamps)),
+            ((int(stamp) + 1_000_000_000, 1, row) for row, stamp in enumerate(fixes.stamps_ns)),
+        )
+        for log_ns, is_fix, row in rows:
+            if not is_fix:
+                rate = rates[min(row, len(rates) - 1)].tolist()
+                writer.imu("imu/data", ImuSample(log_ns, tuple(quaternion[row].tolist()), tuple(rate)))
+                writer.dvl("dvl/twist", DvlSample(log_ns, tuple(velocity[row].tolist())))
+                continue
+            covariance = np.diag([*np.where(np.isnan(fixes.variance[row]), 1e7, fixes.variance[row]), 0.0, 0.0, 0.0])
+            pose = types["geometry_msgs/msg/Pose"](
+                types["geometry_msgs/msg/Point"](*fixes.position[row].tolist()),
+                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            )
+            inner = types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance.ravel())
+            message = types[POSE_TYPE](writer._header(int(fixes.stamps_ns[row]), "map"), inner)
+            bag.message(topic, POSE_TYPE, log_ns, message)
+    return path

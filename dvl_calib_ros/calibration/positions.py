@@ -8,6 +8,9 @@ from .frames import Array
 from .models import WITH_POSITIONS
 from .parameters import ParameterError, Parameters
 
+# Velocities made of positions are of no use from this noise on, m/s.
+NOISY_MPS = 0.3
+
 
 def are_positions(parameters: Parameters) -> bool:
     """Whether the reference is positions."""

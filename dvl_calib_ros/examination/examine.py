@@ -12,6 +12,7 @@ import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
+from ..calibration.positions import NOISY_MPS
 from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
@@ -170,6 +171,7 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
 
 def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:
     dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
+    over_legs = reference is not None and _is_compared_over_legs(reference)
     found: list[Reason] = []
     for topic in streams.values():
         found += checks.stamp_findings(topic) + checks.gap_findings(topic)
@@ -180,8 +182,8 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     if reference is not None:
         if not _has_error(found):  # which would be why
             found += checks.apart_findings(dvl, reference)
-        found += checks.velocity_findings(reference, False)
-        if len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
+        found += [] if over_legs else checks.velocity_findings(reference, False)
+        if not over_legs and len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
             rate_hz = 1.0 / checks.interval_s(reference)
             found.append(finding("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
     if imu is not None and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
@@ -199,14 +201,20 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     ]
     parameters = discovery.parameters
     speed = np.linalg.norm(velocity, axis=1)
-    units = [] if reference is None else _units(dvl, reference)
+    units = [] if reference is None or over_legs else _units(dvl, reference)
     if units:
         found += units
     elif not len(speed) or (speed > parameters.min_speed).mean() < MOVES_SHARE:
         found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
-    elif reference is not None:
+    elif reference is not None and not over_legs:
         found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
     return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
+
+
+def _is_compared_over_legs(reference: Recorded) -> bool:
+    """Whether a reference is positions of which velocities are too noisy to be of use."""
+    is_position = VELOCITY_TYPES[reference.msgtype].position is not None
+    return is_position and len(reference) > 0 and checks.shown_noise(reference.values) > NOISY_MPS
 
 
 def _are_clocks_known(discovery: Discovery) -> bool:

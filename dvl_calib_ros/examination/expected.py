@@ -52,7 +52,9 @@ def expected(
     named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     start_ns, end_ns = recording.span_ns
     share = min(1.0, EXPECTED_FROM_S / max(1e-9 * (end_ns - start_ns), 1e-9))
-    for stretch in recording.stretches(named, MessageDecoder(p), share):
+    decoder = MessageDecoder(p)
+    decoder.on_fix = calibrator.feed_fix
+    for stretch in recording.stretches(named, decoder, share):
         calibrator.feed(stretch.streams)
     calibrator.finish()
     result = calibrator.result()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -12,18 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
-from position_fixtures import Noise, Truth, driven
-from scipy.spatial.transform import Rotation
+from position_fixtures import USBL, Noise, Truth, driven, write_positions
 
-from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample
 from dvl_calib_ros.discovery.discover import discover
+from dvl_calib_ros.examination.examine import examine
 from dvl_calib_ros.files.trajectories import ImportOptions, import_recording
-from dvl_calib_ros.messages.drivers import POSE_TYPE
-from dvl_calib_ros.messages.encode import SampleWriter
 from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.messages.opening import open_bags
 from dvl_calib_ros.recordings.recording import open_recording
@@ -31,7 +26,6 @@ from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay
 
 TRUTH = Truth((0.0, 0.01, 0.03), 0.006, (0.5, 0.0, -0.3), 0.5)
-USBL = "usbl/pose"
 TOPICS = Topics(gnss=USBL)
 
 
@@ -40,37 +34,9 @@ def run(noise=Noise(), seconds=900.0, fix_s=1.0):  # noqa: B008
     return driven(np.random.default_rng(3), seconds, truth=TRUTH, noise=noise, fix_s=fix_s)
 
 
-def write(path: Path, driven_run, topic: str = USBL) -> Path:
-    stamps, velocity, quaternion, fixes = driven_run
-    rotation = Rotation.from_quat(quaternion)
-    rates = (rotation[:-1].inv() * rotation[1:]).as_rotvec() / (1e-9 * np.diff(stamps))[:, None]
-    with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:
-        writer, types = SampleWriter(bag), bag.typestore.types
-        # a fix takes a second through the water and the deck unit
-        rows = heapq.merge(
-            ((int(stamp), 0, row) for row, stamp in enumerate(stamps)),
-            ((int(stamp) + 1_000_000_000, 1, row) for row, stamp in enumerate(fixes.stamps_ns)),
-        )
-        for log_ns, is_fix, row in rows:
-            if not is_fix:
-                rate = rates[min(row, len(rates) - 1)].tolist()
-                writer.imu("imu/data", ImuSample(log_ns, tuple(quaternion[row].tolist()), tuple(rate)))
-                writer.dvl("dvl/twist", DvlSample(log_ns, tuple(velocity[row].tolist())))
-                continue
-            covariance = np.diag([*np.where(np.isnan(fixes.variance[row]), 1e7, fixes.variance[row]), 0.0, 0.0, 0.0])
-            pose = types["geometry_msgs/msg/Pose"](
-                types["geometry_msgs/msg/Point"](*fixes.position[row].tolist()),
-                types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-            )
-            inner = types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance.ravel())
-            message = types[POSE_TYPE](writer._header(int(fixes.stamps_ns[row]), "map"), inner)
-            bag.message(topic, POSE_TYPE, log_ns, message)
-    return path
-
-
 @pytest.fixture(scope="module")
 def usbl(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("usbl") / "bag", run())
+    return write_positions(tmp_path_factory.mktemp("usbl") / "bag", run())
 
 
 def test_auto_takes_legs_of_noisy_positions_and_verifies_them_on_legs_not_seen(usbl):
@@ -91,6 +57,7 @@ def test_auto_takes_legs_of_noisy_positions_and_verifies_them_on_legs_not_seen(u
     assert navigation.after.end < 0.5 * navigation.before.end  # of one fix, noise is less the longer the way
 
 
+@pytest.mark.slow
 def test_a_wrong_calibration_of_positions_is_not_verified(usbl, monkeypatch):
     """Folds that say something else: what is judged is what dead reckoning makes of legs not seen."""
     from dvl_calib_ros.calibration.displacement import filter as of_positions
@@ -108,8 +75,9 @@ def test_a_wrong_calibration_of_positions_is_not_verified(usbl, monkeypatch):
     assert verification.verdict.value == "reject"
 
 
+@pytest.mark.slow
 def test_where_velocities_of_positions_are_good_auto_does_not(tmp_path):
-    bag = write(tmp_path / "bag", run(Noise(0.02)))
+    bag = write_positions(tmp_path / "bag", run(Noise(0.02)))
     result = replay([bag], Parameters(), TOPICS).result
     assert result.selected in ("G1", "G2")
     assert {segment.model for segment in result.segments}.isdisjoint({WITH_POSITIONS})
@@ -117,14 +85,14 @@ def test_where_velocities_of_positions_are_good_auto_does_not(tmp_path):
 
 @pytest.mark.slow
 def test_positions_too_seldom_for_velocities_calibrate(tmp_path):
-    bag = write(tmp_path / "bag", run(fix_s=10.0, seconds=1800.0))
+    bag = write_positions(tmp_path / "bag", run(fix_s=10.0, seconds=1800.0))
     result = replay([bag], Parameters(), TOPICS).result
     assert result.selected == WITH_POSITIONS and "too seldom" in str(result.selected_because)
     assert abs(result.estimate.state[2] - TRUTH.phi[2]) < 3.0 * result.estimate.recording_std[2]
 
 
 def test_live_and_replay_agree_in_state_and_in_when_it_was_chosen(tmp_path):
-    usbl = write(tmp_path / "bag", run(seconds=200.0))
+    usbl = write_positions(tmp_path / "bag", run(seconds=200.0))
     recording = open_recording([usbl], TOPICS)
     parameters = recording.of_types(TOPICS, Parameters())
     with ThreadPoolExecutor(1) as worker:
@@ -143,7 +111,7 @@ def test_live_and_replay_agree_in_state_and_in_when_it_was_chosen(tmp_path):
 
 def test_a_pose_is_discovered_only_where_its_name_says_that_it_was_measured(tmp_path, usbl):
     """All that navigates sends poses, most of them with the DVL in them."""
-    other = write(tmp_path / "bag", run(seconds=300.0), topic="/navigator/pose")
+    other = write_positions(tmp_path / "bag", run(seconds=300.0), topic="/navigator/pose")
     assert discover(open_recording([usbl]), Parameters()).topics.gnss == USBL
     assert discover(open_recording([other]), Parameters()).topics.gnss != "/navigator/pose"
 
@@ -166,6 +134,7 @@ def test_latitude_and_longitude_are_imported_beside_speed_and_course(tmp_path):
     assert fixes[0].position_covariance_type == 0
 
 
+@pytest.mark.slow
 def test_a_boats_positions_alone_tell_what_its_velocities_tell(tmp_path):
     """Lake Caputh, DGPS at 10 Hz."""
     named = os.environ.get("DVL_CALIB_CAPUTH")
@@ -182,3 +151,11 @@ def test_a_boats_positions_alone_tell_what_its_velocities_tell(tmp_path):
     assert math.degrees(by_position.std[2]) <= 0.5
     scale = by_position.state[3] - by_velocity.state[3]
     assert abs(scale) < 2.0 * math.hypot(by_position.recording_std[3], by_velocity.recording_std[3])
+
+
+def test_doctor_says_of_noisy_positions_what_a_replay_gives(usbl):
+    """Velocities made of them are not what is used: neither their unit nor their covariance is held against it."""
+    seen = examine([usbl], Parameters())
+    assert [found.code for found in seen.findings if found.code in ("DOCTOR_UNITS", "DOCTOR_COVARIANCE")] == []
+    yaw = next(each for each in seen.shown if each.name == "yaw")
+    assert yaw.std < 0.5 and not yaw.needs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
@@ -14,15 +15,17 @@ from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, 
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
 from nav_msgs.msg import Odometry
+from position_fixtures import Truth, driven, write_positions
 from ros import refused_at_start, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
+from dvl_calib_ros.messages.drivers import POSE_TYPE, VELOCITY_TYPES
 from dvl_calib_ros.messages.feed import MessageFeed
 from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
@@ -67,6 +70,27 @@ def test_the_node_and_the_replay_agree_on_other_types(world, tmp_path):
         for topic, stream in (("dvl/twist", "dvl"), ("gnss/twist", "reference"), ("imu/data", "imu")):
             until(lambda s=stream, t=topic: diagnosed(diagnostics, f"{s} received") == str(sent[t]), f"all of {topic}")
     assert_agree(load_yaml(saved, "result file"), replay([bag], Parameters(**PATIENT)).result)
+
+
+@pytest.mark.slow
+@pytest.mark.spread(1)
+def test_the_node_takes_noisy_positions_over_legs_as_the_replay_does(world, tmp_path):
+    positions, saved = driven(np.random.default_rng(3), 500.0, truth=Truth((0.0, 0.0, 0.03))), tmp_path / "live.yaml"
+    patient = {"max_latency": 100.0}
+    bag = write_positions(tmp_path / "bag", positions, "gnss/twist")
+    with world.calibration_node(*as_arguments(patient | {"gnss_type": POSE_TYPE}), f"result_file:={saved}"):
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        sent = play(world, bag)
+        for topic, stream in (("dvl/twist", "dvl"), ("gnss/twist", "reference"), ("imu/data", "imu")):
+            until(lambda s=stream, t=topic: diagnosed(diagnostics, f"{s} received") == str(sent[t]), f"all of {topic}")
+        until(lambda: diagnosed(diagnostics, "model") == WITH_POSITIONS, "the node to say so")
+    live, offline = load_yaml(saved, "result file"), replay([bag], Parameters(**patient)).result
+    assert_agree(live, offline)
+    estimate = offline.estimates[WITH_POSITIONS]
+    assert live["model"] == offline.selected == WITH_POSITIONS
+    np.testing.assert_allclose(live["models"][WITH_POSITIONS]["state"], estimate.state, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(live["models"][WITH_POSITIONS]["covariance"], estimate.covariance, rtol=0.0, atol=1e-12)
+    assert live["verification"]["held_out"] is not None
 
 
 def test_a_publisher_of_another_type_is_named_with_the_parameter_to_set(world):

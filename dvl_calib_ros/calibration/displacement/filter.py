@@ -24,7 +24,7 @@ from ..frames import Array
 from ..history import Counts, Numbers, StateTrace
 from ..kalman import GaussianState
 from ..navigation import Navigation
-from ..positions import are_positions
+from ..positions import NOISY_MPS, are_positions
 from ..samples import Index, SampleUse, Stamps
 from ..selection import NO_EVIDENCE, Evidence
 from ..verification import HeldOutError
@@ -35,11 +35,10 @@ from .track import navigated
 
 # The first look, and then as often as the run has grown by a share; s.
 FIRST_LOOK_S, GROWN = 60.0, 1.2
-# From a look's stamp until its outcome takes effect, in stamps; and later than a fix may come.
-SOLVED_WITHIN_NS, LATEST_FIX_NS = 1_000_000_000, 5_000_000_000
-# Velocities made of positions are of no use from this noise on, m/s: one of so much is as large as what they are of.
-NOISY_MPS = 0.3
-# ... or where there are none: fixes further apart than so many windows (fixes.py).
+# From a look's stamp until its outcome takes effect, in stamps.
+SOLVED_WITHIN_NS = 1_000_000_000
+# Velocities made of positions are of no use beyond NOISY_MPS, and there are none of fixes further apart than so many
+# windows (fixes.py).
 LONGEST_WINDOWS = 3.0
 
 
@@ -64,7 +63,7 @@ class Displacements(Estimator):
         self._on_look = given.on_evidence
         self._worker = AtOnce() if given.worker is None else given.worker
         self._is_asked = are_positions(given.parameters)
-        self._reckoning = DeadReckoning(given.parameters.rotation_dvl_from_body)
+        self._reckoning = DeadReckoning(given.parameters.rotation_dvl_from_body, 1e-9 * given.aligner.lag_ns)
         self._n_taken = 0
         self._first_ns: int | None = None
         self._next_ns = self._oriented_ns = 0
@@ -115,7 +114,7 @@ class Displacements(Estimator):
         """Have the legs looked at that are known at a stamp, whatever else has come by now."""
         assert self._first_ns is not None
         legs = self._reckoning.legs()
-        passed_s = 1e-9 * (at_ns - LATEST_FIX_NS - self._first_ns)
+        passed_s = 1e-9 * (at_ns - self._aligner.lag_ns - self._first_ns)  # later ones may still come
         known = legs.part(slice(int(np.searchsorted(legs.seconds, passed_s))))
         parameters, start = self._parameters, self._start
 

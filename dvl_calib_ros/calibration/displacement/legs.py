@@ -14,9 +14,11 @@ from ..frames import Array, rotation_from_quaternion
 from ..heading_states import N_COEFFICIENTS
 from ..samples import Index, Stamps
 
+# No vehicle is so far from where it began, m.
+FARTHEST_M = 1e6
 # Between DVL samples that are further apart, s, the way is not known.
 LONGEST_STEP_S = 3.0
-# So much later than the DVL's samples of its time, s, a fix may come.
+# So much later than the DVL's samples of its time, s, a fix may come at least.
 LATEST_FIX_S = 60.0
 # Fixes that come faster say no more: their errors are alike.
 SHORTEST_FIX_NS = 950_000_000
@@ -95,7 +97,9 @@ _NO_ROWS = _Passed(
 class DeadReckoning:
     """Sums up the way as DVL samples come, and says where fixes found it."""
 
-    def __init__(self, rotation_dvl_from_body: Array) -> None:
+    def __init__(self, rotation_dvl_from_body: Array, latest_fix_s: float = 0.0) -> None:
+        """latest_fix_s: so much later than the DVL's samples of its time a fix may come."""
+        self._latest_s = max(LATEST_FIX_S, latest_fix_s)
         self._body_from_dvl = rotation_dvl_from_body.T
         self._epoch_ns: int | None = None
         self._stretch = 0
@@ -108,8 +112,9 @@ class DeadReckoning:
     def add_fixes(self, fixes: Fixes) -> None:
         """Take fixes; those out of order are left out, and of faster ones so many as say something."""
         kept = []
+        sound = np.asarray((np.abs(fixes.position[:, :2]) < FARTHEST_M).all(axis=1))
         for row, stamp_ns in enumerate(fixes.stamps_ns.tolist()):
-            if stamp_ns >= self._newest_fix_ns + SHORTEST_FIX_NS and np.isfinite(fixes.position[row, :2]).all():
+            if sound[row] and stamp_ns >= self._newest_fix_ns + SHORTEST_FIX_NS:
                 self._newest_fix_ns = stamp_ns
                 kept.append(row)
         if kept:
@@ -165,7 +170,7 @@ class DeadReckoning:
         self._pass_fixes()
         newest_s = self._rows.seconds[-1] if len(self._rows.seconds) else 0.0
         # a fix that is later than this is not waited for
-        kept = max(int(np.searchsorted(self._rows.seconds, newest_s - LATEST_FIX_S)) - 1, 0)
+        kept = max(int(np.searchsorted(self._rows.seconds, newest_s - self._latest_s)) - 1, 0)
         columns: list[Any] = [column[kept:] for column in self._rows]
         self._rows = _Passed(*columns)
         if len(self._done) > 1:

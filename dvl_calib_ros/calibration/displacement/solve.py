@@ -20,7 +20,7 @@ from ..kalman import GaussianState
 from ..parameters import Parameters
 from ..robust import median, robust_std
 from ..samples import Index, Mask
-from .legs import Legs
+from .legs import FARTHEST_M, Legs
 
 N_ERRORS, N_THETA = 4, 13
 SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
@@ -97,8 +97,8 @@ def _prior(errors: GaussianState, parameters: Parameters, span_s: float) -> Gaus
     return GaussianState(np.concatenate([errors.x, np.zeros(len(rest))]), covariance)
 
 
-def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
-    """What all legs tell; None where there are too few. errors: misalignment and scale before them."""
+def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
+    """As `solve`; None where there are too few. errors: misalignment and scale before them."""
     if len(legs.seconds) < ENOUGH_FIXES:
         return None
     prior = _prior(errors, parameters, float(np.ptp(legs.seconds)))
@@ -116,7 +116,7 @@ def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displace
         if used.sum() < ENOUGH_FIXES:
             return None
         state, noise = _fitted(_means(linear, legs, used, (0, 1)), prior)
-        has_height = used & np.isfinite(legs.variance[:, 2]) & np.isfinite(legs.position[:, 2])
+        has_height = used & np.isfinite(legs.variance[:, 2]) & (np.abs(legs.position[:, 2]) < FARTHEST_M)
         if has_height.sum() >= ENOUGH_FIXES:
             state, _ = _fitted(_means(linear, legs, has_height, (2,)), state)
     # nobody knows when a heading that drifts is right; and by a pitch ε that is not known the way is longer by ε²/2
@@ -125,6 +125,15 @@ def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displace
     p[SCALE, SCALE] += 0.75 * float(across @ p[:3, :3] @ across) ** 2
     p[:3, :3] += np.outer(up, up) * (x[DRIFT] ** 2 + p[DRIFT, DRIFT]) * span_s**2 / 12.0
     return DisplacementFit(state, noise, used)
+
+
+def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
+    """What all legs tell; None where they are too few, or numbers run away. errors: misalignment and scale before."""
+    try:
+        fit = _solved(legs, parameters, errors)
+    except np.linalg.LinAlgError:
+        return None
+    return fit if fit is not None and np.isfinite(fit.state.p).all() and np.isfinite(fit.state.x).all() else None
 
 
 def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
@@ -157,21 +166,26 @@ def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
 
 def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
     """θ (13,) by least squares with Huber's weights, noise being white."""
-    own = (legs.stretch[:, None] == np.unique(legs.stretch)).astype(float)
-    n, s = own.shape
-    x = np.zeros((2 * n, N_THETA + 2 * s))
-    for axis in (0, 1):
-        x[axis * n : (axis + 1) * n, :N_THETA] = linear.columns[:, axis]
-        x[axis * n : (axis + 1) * n, N_THETA + axis * s : N_THETA + (axis + 1) * s] = own
-    y = linear.y[:, :2].T.ravel()
-    weight, level = np.ones(2 * n), 1.0
+    _, stretch = np.unique(legs.stretch, return_inverse=True)
+    rows = np.concatenate([linear.y[:, :2, None], linear.columns[:, :2]], axis=2)  # (N, 2, 14)
+    weight, level = np.ones((len(rows), 2)), 1.0
+    theta = np.zeros(N_THETA)
     for _ in range(12):
-        ridge = np.concatenate([(level / std) ** 2, np.full(2 * s, 1e-9)])
-        theta = np.linalg.solve((x.T * weight) @ x + np.diag(ridge), (x.T * weight) @ y)
-        left = np.abs(y - x @ theta)
-        level = max(float(median(left)) * 1.4826, 1e-6)
+        centred = rows - _of_stretches(rows, weight, stretch)[stretch]
+        square = np.einsum("na,nai,naj->ij", weight, centred, centred)
+        theta = np.linalg.solve(square[1:, 1:] + np.diag((level / std) ** 2), square[1:, 0])
+        left = np.abs(centred[..., 0] - centred[..., 1:] @ theta)
+        level = max(float(median(left.ravel())) * 1.4826, 1e-6)
         weight = np.minimum(1.0, HUBER * level / np.maximum(left, 1e-9))
-    return np.asarray(theta[:N_THETA])
+    return theta
+
+
+def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
+    """Weighted means (S, 2, 14) of rows (N, 2, 14), weight (N, 2), by the stretch (N,) that each is of."""
+    sums, total = np.zeros((int(stretch[-1]) + 1, *rows.shape[1:])), np.zeros((int(stretch[-1]) + 1, 2))
+    np.add.at(sums, stretch, rows * weight[..., None])
+    np.add.at(total, stretch, weight)
+    return np.asarray(sums / total[..., None])
 
 
 def _no_outliers(left: Array, stretch: Index) -> Mask:
@@ -203,7 +217,13 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
         return np.asarray(np.add.reduceat(values, first, axis=0)) / weight.reshape(-1, *[1] * (values.ndim - 1))
 
     y, columns = mean(linear.y[at][:, axes]), mean(linear.columns[at][:, axes])
-    return _Blocks(mean(seconds), legs.stretch[at][first], weight, y.T, columns.swapaxes(0, 1))
+    stretch = legs.stretch[at][first]
+    # one block alone says nothing, as its stretch begins anywhere; of very many stretches the longest say enough
+    names, sizes = np.unique(stretch, return_counts=True)
+    longest = np.argsort(-sizes, kind="stable")
+    kept = longest[(sizes[longest] > 1) & (np.cumsum(sizes[longest]) <= max(2 * MOST_BLOCKS, int(sizes.max())))]
+    of_use = np.isin(stretch, names[kept])
+    return _Blocks(mean(seconds)[of_use], stretch[of_use], weight[of_use], y[of_use].T, columns[of_use].swapaxes(0, 1))
 
 
 def _hypotheses(blocks: _Blocks) -> Array:
@@ -222,6 +242,8 @@ def _hypotheses(blocks: _Blocks) -> Array:
 
 def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float]:
     """Posterior by the mixture of all hypotheses, and white noise of one fix, m."""
+    if not len(blocks.seconds):
+        return prior, 0.0
     covariance = _hypotheses(blocks)
     axes, n, _ = blocks.columns.shape
     root = np.linalg.cholesky(covariance)

@@ -135,3 +135,23 @@ def test_rows_one_by_one_give_what_columns_give_whenever_fixes_come():
     assert n > 0.9 * len(one.seconds)
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a[:n], b, rtol=1e-12, atol=1e-9)
+
+
+def test_a_dvl_with_hundreds_of_gaps_and_fixes_of_garbage_are_no_matter():
+    rng = np.random.default_rng(12)
+    truth = Truth((0.0, 0.0, 0.02), 0.003)
+    stamps, velocity, quaternion, fixes = driven(rng, 3600.0, truth=truth)
+    seconds = 1e-9 * (stamps - stamps[0])
+    kept = (seconds % 9.0 > 4.0) | (seconds < 1500.0)
+    fixes.position[40], fixes.position[900] = [1e300, 0.0, 0.0], [np.nan, 1.0, 0.0]
+    fit = fitted((stamps[kept], velocity[kept], quaternion[kept], fixes))
+    error, std = errors_of(fit, truth)
+    assert (np.abs(error) < 3.0 * std).all() and math.degrees(std[0]) < 0.4
+
+
+def test_nothing_is_found_of_too_few_fixes_or_of_fixes_all_alike():
+    stamps, velocity, quaternion, fixes = driven(np.random.default_rng(1), 60.0)
+    assert fitted((stamps, velocity, quaternion, fixes.part(slice(5)))) is None
+    stuck = fixes._replace(position=np.zeros_like(fixes.position))
+    fit = fitted((stamps, velocity, quaternion, stuck))
+    assert fit is None or np.isfinite(fit.errors.p).all()
