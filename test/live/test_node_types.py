@@ -16,6 +16,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
 from nav_msgs.msg import Odometry
 from position_fixtures import Truth, driven, write_positions
+from rclpy.parameter import Parameter
 from ros import refused_at_start, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
 
@@ -166,3 +167,10 @@ def test_topics_are_looked_for_unless_the_dvls_was_named_or_nobody_wants_it(worl
     for options in ({}, {"discover": False}, {"cli_args": ["--ros-args", "-r", "dvl/twist:=/a50/velocity"]}):
         with node_here(world, **options) as node:
             assert (node._discovering is not None) == (not options)
+
+
+def test_the_model_of_positions_is_refused_while_the_reference_is_velocities(world):
+    with node_here(world) as node:
+        (answer,) = node.set_parameters([Parameter("model", value=WITH_POSITIONS)])
+        assert not answer.successful and "goes by positions" in answer.reason
+        assert node._calibrator.selected != WITH_POSITIONS

@@ -11,6 +11,7 @@ from position_fixtures import Noise, Truth, driven
 from dvl_calib_ros.calibration.assembly import prior
 from dvl_calib_ros.calibration.displacement.legs import DeadReckoning
 from dvl_calib_ros.calibration.displacement.solve import solve
+from dvl_calib_ros.calibration.frames import skew
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 
@@ -155,3 +156,16 @@ def test_nothing_is_found_of_too_few_fixes_or_of_fixes_all_alike():
     stuck = fixes._replace(position=np.zeros_like(fixes.position))
     fit = fitted((stamps, velocity, quaternion, stuck))
     assert fit is None or np.isfinite(fit.errors.p).all()
+
+
+@pytest.mark.parametrize("rpy", [(0.0, 0.0, math.pi / 4), (math.pi, 0.0, 0.0), (0.1, -0.2, -2.0)])
+def test_a_dvl_in_any_mounting_is_found_however_far_it_is_turned(rpy):
+    """5° is no small angle: the way is linear in the matrix, not in the angle."""
+    parameters, phi = Parameters(mounting_rpy=rpy), np.array([0.0, 0.0, 0.09])
+    t = parameters.rotation_dvl_from_body
+    stamps, in_body, quaternion, fixes = driven(np.random.default_rng(1), 900.0, truth=Truth((0.0, 0.0, 0.0), 0.006))
+    velocity = in_body @ ((np.eye(3) + skew(phi)) @ t).T
+    x, p = fitted((stamps, velocity, quaternion, fixes), parameters).errors
+    about = t[:, 2]
+    assert abs(about @ (x[:3] - phi)) < 3.0 * math.sqrt(about @ p[:3, :3] @ about) < math.radians(1.0)
+    assert abs(x[3] - 0.006) < 3.0 * math.sqrt(p[3, 3])
