@@ -395,7 +395,7 @@ def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_p
     html = path.read_text()
     assert '<td class="good">0.0300<small>0.0301 ×1.00</small></td>' in html
     assert '<td class="bad">' in html  # M2, far from the 0.10 of the made-up publication
-    last = BY_VELOCITY[-1]
+    last = list(MODELS)[-1]
     assert Page(path).row(last)[2:4] == ["–", "–"]  # no attitude there: neither the set nor the mean
 
 
