@@ -156,13 +156,16 @@ def select(
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
     fitter, fit = _about(fitter, fit, every)
-    told = with_arm(fitter, fit, guesses, effects)
-    fit = with_clocks(fitter, told, guesses, effects, blocks_of(fitter.problem))
-    added = [effect.name for effect in fit.effects if effect not in told.effects]
-    base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
-    selected = [_selected(fitter, fit, base, effect, effects) for effect in fit.effects]
+    fit = with_arm(fitter, fit, guesses, effects)
+    selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), added)
+        selected = _clock_or_arm(fitter, fit, selected, len(effects))
+    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem))
+    clocks = tuple(effect.name for effect in freed.effects if effect not in fit.effects)
+    if clocks:
+        selected = [_or_clocks(each, clocks) if each.effect.name == ARM else each for each in selected]
+    fit = freed
+    base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_either_clock(each) for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
@@ -516,7 +519,7 @@ def blocks_of(problem: Problem) -> NDArray[np.intp]:
     return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)
 
 
-def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
+def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
     One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
@@ -542,14 +545,11 @@ def _selected(fitter: Fitter, fit: Fit, base: Fit, effect: Effect, effects: Mapp
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
         if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * fewer):
             found.append((behind, name))
-    del base
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
-def _clock_or_arm(
-    fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int, added: Sequence[str]
-) -> list[Selected]:
-    """Lever arm and clock as one where each would do without the other. added: clocks as of `with_clocks`."""
+def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int) -> list[Selected]:
+    """Lever arm and clock as one where each would do without the other."""
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
     def is_shown(each: Selected) -> bool:
@@ -559,19 +559,20 @@ def _clock_or_arm(
     arm, clocks = own.get(ARM), [own[name] for name in CLOCKS[:2] if name in own]
     if arm is None or not clocks:
         return selected
-    if not added:
-        clock = min(clocks, key=lambda each: each.log_p)
-        if is_shown(arm) and is_shown(clock):
-            return selected
-        one, others = (arm, [clock]) if is_shown(arm) else (clock, [arm])
-    else:
-        one, others = arm, [own[name] for name in added]
-    rest = [effect for effect in fit.effects if effect not in [each.effect for each in (one, *others)]]
+    clock = min(clocks, key=lambda each: each.log_p)
+    if is_shown(arm) and is_shown(clock):
+        return selected
+    one, other = (arm, clock) if is_shown(arm) else (clock, arm)
+    rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
     without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
     log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
-    equivalent = dict.fromkeys([*(each.effect.name for each in others), *one.equivalent])
-    kept = [each for each in selected if each not in (one, *others)]
-    return [Selected(one.effect, log_p, tuple(equivalent)), *kept]
+    equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
+    return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
+
+
+def _or_clocks(arm: Selected, clocks: tuple[str, ...]) -> Selected:
+    """A lever arm of which clocks would take a part."""
+    return replace(arm, equivalent=tuple(dict.fromkeys((*clocks, *arm.equivalent))))
 
 
 def _either_clock(selected: Selected) -> Selected:

@@ -294,7 +294,9 @@ def _pull(study: ErrorsInVariables) -> Section:
     return section(
         "Noise in the reference pulls the scale",
         Sentence(study.formula),
-        Table(("GNSS σ, m/s", *study.models), rows, notes=("Pull of the scale in %: predicted / measured.",)),
+        Table(
+            ("GNSS σ, m/s", *study.models), rows, dense=True, notes=("Pull of the scale in %: predicted / measured.",)
+        ),
         Legend(study.models, ""),
         figure(
             "evaluation_figures.errors_in_variables",

@@ -147,4 +147,5 @@ def test_on_legs_that_repeat_a_dvl_far_behind_is_found_and_calibrated_with(late,
     assert run.verdict == "accept"
     assert run.replayed.result.parameters["dvl_time_offset"] == pytest.approx(late, abs=0.05 + 0.04 * late)
     (clock,) = (each for each in dc.diagnose(bag).effects if each.name == "dvl_time_offset")
-    assert clock.parameters["seconds"][0] == pytest.approx(late, abs=0.05 + 0.04 * late)
+    found, low, high = clock.parameters["seconds"]  # legs at one speed tell the clock of the reference no better
+    assert low < late < high and found == pytest.approx(late, abs=0.05 + 0.08 * late)
