@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
-from ..effects.base import Effect
+from ..effects.base import ClockEffect, Effect
 from .clock_or_arm import ARM, is_open, with_arm, with_clocks
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
@@ -32,6 +32,7 @@ from .settings import SETTINGS
 from .shown import shown_parts
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
+LAG = "reference_lag"
 START = (ARM, "dvl_time_offset", "reference_time_offset")
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
 # A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
@@ -471,7 +472,8 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         weak = [
             (rest.deviance, rest)
             for effect, rest in rests
-            if _log_p(fit, rest, effect) > threshold or _is_ghost(rest.deviance - fit.deviance, explained, fit.deviance)
+            if _log_p(fit, rest, effect) > threshold
+            or _is_ghost(effect, rest.deviance - fit.deviance, explained, fit.deviance)
         ]
         if not weak:
             return fit
@@ -479,9 +481,14 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def _is_ghost(drop: float, explained: float, left: float) -> bool:
-    """Whether an effect adds next to nothing to what all of them explain, and to the noise that is left."""
-    return drop < SETTINGS.ghost_share * explained and drop < SETTINGS.ghost_of_noise * left
+def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
+    """Whether an effect adds next to nothing to what all of them explain; of an arm, clock or lag, to the noise either.
+
+    Beside an arm of metres a clock is little, and without it the arm is decimetres off; beside a lag so is the arm.
+    """
+    if drop > SETTINGS.ghost_share * explained:
+        return False
+    return not (isinstance(effect, ClockEffect) or effect.name in (ARM, LAG)) or drop < SETTINGS.ghost_of_noise * left
 
 
 def _borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:

@@ -108,7 +108,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     if best[0] + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
         tests += others
         best = min(tests, key=_first)
-    about = min((each for each in tests if each[0] < best[0] + AS_LIKELY), key=lambda each: (each[2].shape[2], each[0]))
+    about = _plainest(tests, best[0])
     log_p = min(best[0], *(each[0] for each in others), 0.0) + looked_at
     whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
     energy = max(*(each - dof for each, dof in whole), *(each.energy - each.dof for each in recoloured), 0.0)
@@ -120,6 +120,12 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     cost = float(chi2_isf(LEVEL / np.exp(looked_at), best[2].shape[2]))
     found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
+
+
+def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
+    """Of those about as likely as the best, at log_p, the one with the fewest columns; -inf is as likely as itself."""
+    likely = (each for each in tests if each[0] <= log_p + AS_LIKELY)
+    return min(likely, key=lambda each: (each[2].shape[2], each[0]))
 
 
 def _first(each: tuple[float, str | float, Array]) -> float:

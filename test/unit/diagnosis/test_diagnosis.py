@@ -24,7 +24,7 @@ from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.unexplained import Unexplained
+from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.recordings.topics import Topics
@@ -586,3 +586,11 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
     effect = FoundEffect("scale_drift", (), {}, 0.7, 1e-9)
     reasons = _reasons(found, gap, [effect], nothing_left, [], 1)
     assert ("REST_FOLLOWS_NOTHING" in {each.code for each in reasons}) == (verdict is DiagnosisVerdict.UNKNOWN)
+
+
+def test_what_is_left_beyond_all_doubt_is_told_by_what_explains_it():
+    """p of 0 was no likelier than itself, and the diagnosis ended in a traceback."""
+    wide, narrow = np.zeros((4, 2, 3)), np.zeros((4, 2, 1))
+    tests = [(-np.inf, "turn rate", wide), (-np.inf, "speed", narrow), (-20.0, "time", narrow[:, :, :0])]
+    assert _plainest(tests, -np.inf)[1] == "speed"
+    assert _plainest(tests[2:], -20.0)[1] == "time"
