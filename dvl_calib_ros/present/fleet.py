@@ -56,7 +56,7 @@ def fleet(result: Fleet) -> Document:
     if not said and result.word == "same":
         said = ["No mounting moved."]
     if not said:
-        said = ["No vehicle has calibrations of two days, so nothing can be compared."]
+        said = ["No vehicle has two days that show the same angle, so nothing can be compared."]
     said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
     sitting = [VehicleNow(each, now(each)) for each in vehicles]
