@@ -32,8 +32,8 @@ from .settings import SETTINGS
 from .shown import shown_parts
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
-LAG = "reference_lag"
 START = (ARM, "dvl_time_offset", "reference_time_offset")
+LAG = "reference_lag"
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
 # A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
 GUESSED_STD_M = 0.2
