@@ -30,7 +30,8 @@ class Ending:
     """
 
     def __init__(self, closed: int | None = None) -> None:
-        self._requested = threading.Event()
+        # no Event: setting one takes a lock, and the signal that comes meanwhile would wait for itself for ever
+        self._requested = False
         self._told: list[Callable[[], object]] = []
         self._closed = closed
 
@@ -57,7 +58,7 @@ class Ending:
     @property
     def requested(self) -> bool:
         """Whether it has been asked for."""
-        return self._requested.is_set()
+        return self._requested
 
     def tell(self, function: Callable[[], object]) -> None:
         """Call a function, from another thread, when it is asked for, and again until `heard`; now, if it has been."""
@@ -70,7 +71,7 @@ class Ending:
         self._told.clear()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._requested.set()
+        self._requested = True
 
     def _watch(self) -> None:
         watched = [self._reading.fileno(), *([] if self._closed is None else [self._closed])]
@@ -85,7 +86,7 @@ class Ending:
             if self._closed in ready:
                 watched.remove(self._closed)
             if self._closed in ready or not set(ENDING).isdisjoint(numbers):
-                self._requested.set()
+                self._requested = True
                 self._tell()
 
     def _tell(self) -> None:

@@ -45,6 +45,30 @@ def test_a_signal_becomes_a_flag_wakes_who_waits_and_raises_nothing(number):
     signal.signal(number, before)
 
 
+IN_THE_MIDST = """
+import signal, sys
+from dvl_calib_ros.node.ending import Ending
+
+def again(frame, event, argument):
+    global left
+    if left and frame.f_code.co_name != "again":
+        left -= 1
+        signal.raise_signal(signal.SIGTERM)
+
+with Ending() as ending:
+    left = 100
+    sys.setprofile(again)
+    signal.raise_signal(signal.SIGINT)
+    sys.setprofile(None)
+    assert ending.requested
+"""
+
+
+def test_a_signal_that_comes_while_another_is_taken_does_not_wait_for_it():
+    """It did, one time in some thousands: both set an Event, whose lock the first one held."""
+    subprocess.run([sys.executable, "-c", IN_THE_MIDST], cwd=ROOT, timeout=PATIENCE_S, check=True)
+
+
 def test_who_is_told_is_told_again_until_it_has_heard(monkeypatch):
     """A wake-up that the middleware loses must not leave a node that waits for ever."""
     monkeypatch.setattr("dvl_calib_ros.node.ending.AGAIN_S", 0.2)
