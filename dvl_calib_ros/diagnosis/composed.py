@@ -181,11 +181,16 @@ class Grid:
         return total / self.per_bin
 
     def true_time(self, injections: Sequence[Injection]) -> Array:
-        """(F,) s at which what is stamped so was measured."""
+        """(F,) s, increasing, at which what is stamped so was measured.
+
+        A leap that is tried where there is none would have samples measured before those that came first; these then
+        follow one another at half the time between their stamps, until they are as late as the leap has them.
+        """
         time = self.stamps
         for _ in range(_PASSES):
             time = self.stamps - late(injections, self.clock, time)
-        return time
+        least = 0.5 * (self.stamps - self.stamps[:1])
+        return time if (np.diff(time - least) > 0.0).all() else np.maximum.accumulate(time - least) + least
 
 
 @dataclass(frozen=True)
@@ -472,15 +477,23 @@ def _measured(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array, 
 def _undone(
     injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn, turned: Array | None
 ) -> tuple[EffectInput, Array]:
-    """The motion before the effects of one stage have acted on it, and what they have added (F, 3)."""
+    """The motion before the effects of one stage have acted on it, and what they have added (F, 3).
+
+    Where an effect is not small against the motion, as of a spike of 7 m/s, a pass may lead further off than the one
+    before; it is not taken there.
+    """
     after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
     if not any(each.effect.acts_on is acts_on for each in injections):
         return motion, added
+    moved_before = np.full(len(after), np.inf)
     for _ in range(_PASSES):
         before, added = added, traces(injections, motion, acts_on)
         added = added if turned is None else _turned(turned, added)
         if np.array_equal(added, before):  # they do not depend on the velocity
             break
+        moved = np.linalg.norm(added - before, axis=1)
+        added = np.where((moved <= moved_before)[:, None], added, before)
+        moved_before = np.minimum(moved, moved_before)
         motion = replace(motion, velocity_body=after - added)
     return motion, added
 

@@ -44,3 +44,28 @@ def test_what_an_effect_adds_at_four_times_its_typical_size_is_taken_off_again(r
     left = np.abs(problem.residual(problem.all_seen(hypothesis))[inside]).max()
     assert added > 1e-3
     assert left < 0.02 * added
+
+
+def test_a_spike_that_an_effect_would_more_than_double_is_not_undone_further_with_every_pass(recording):
+    """0.15 s/m at 8 m/s is 120 per cent: passes of an effect that is to be small led to 1e4 m/s, and a traceback."""
+    effect = EFFECTS["quadratic_scale"]
+    hypothesis = no_effect().with_effects([effect], 1, {effect.name: ({"coefficient_s_per_m": -0.15},)})
+    values = recording.dvl.values.copy()
+    values[600:700, 0] = 8.0
+    far = replace(recording, dvl=Curve(recording.dvl.time, values))
+    problem = make_problem([far], np.eye(3), np.zeros(3), [Offsets()])
+    assert np.abs(problem.residual(problem.all_seen(hypothesis))).max() < 20.0
+
+
+def test_times_stay_in_order_for_a_leap_that_was_not_there(recording):
+    """What filters and differentiates goes by steps of time: backwards it overflowed."""
+    rng = np.random.default_rng(1)
+    dvl = Curve(recording.dvl.time, recording.dvl.values + 0.01 * rng.standard_normal(recording.dvl.values.shape))
+    problem = make_problem([replace(recording, dvl=dvl)], np.eye(3), np.zeros(3), [Offsets()])
+    jump, lag = EFFECTS["time_offset_jump"], EFFECTS["reference_lag"]
+    assert problem.grids[0].clock is jump.acts_on
+    start = {jump.name: ({"seconds": 3.0, "at_s": 60.0},), lag.name: ({"time_constant_s": 0.003},)}
+    (seen,) = problem.all_seen(no_effect().with_effects([jump, lag], 1, start))
+    assert np.diff(seen.motion.time).min() > 0.04
+    assert np.isclose(np.diff(seen.motion.time), 0.1).sum() > 1000  # but for the time of the leap, as measured
+    assert np.abs(seen.error).max() < 10.0
