@@ -26,6 +26,7 @@ import numpy as np
 from ..calibration.frames import FLU_FROM_FRD, Array
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
 from ..errors import InputError
+from ..messages.encode import WaterReading
 from .attitudes import imu_samples
 from .nortek_logs import is_nortek_log, read_nortek_log
 from .pd0_nmea import GENERAL_NMEA, Nmea
@@ -38,6 +39,8 @@ _FIXED_LEADER, _VARIABLE_LEADER, _BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
 _AXES = ("beam", "instrument", "ship", "earth")
 # Of the beams with the vertical, degrees, by the fixed leader's bits; of others it is said elsewhere in it
 _BEAM_ANGLES = {0: 15, 1: 20, 2: 30}
+# Bits of EZ: what comes from a sensor
+_TEMPERATURE_SENSOR, _CONDUCTIVITY_SENSOR = 1, 2
 # A velocity of a beam or axis that could not be measured, mm/s
 _BAD_VELOCITY = -32768
 # forward-left-up from RDI's starboard, forward, up
@@ -47,7 +50,7 @@ _FLU_FROM_RDI: Array = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1
 class DvlLog(NamedTuple):
     """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason.
 
-    references, attitudes: what else the log holds. notes: in sentences, what to know of it.
+    references, attitudes, waters: what else the log holds. notes: in sentences, what to know of it.
     """
 
     samples: list[DvlSample]
@@ -55,6 +58,7 @@ class DvlLog(NamedTuple):
     references: Sequence[ReferenceSample] = ()
     attitudes: Sequence[ImuSample] = ()
     notes: tuple[str, ...] = ()
+    waters: Sequence[WaterReading] = ()
 
 
 def is_dvl_log(path: Path) -> bool:
@@ -84,7 +88,8 @@ def read_dvl_log(path: Path) -> DvlLog:
 
         log = read_ardupilot_log(path)
     elif is_nortek_log(start):
-        log = DvlLog(*read_nortek_log(path.read_bytes()))
+        nortek, left_out, waters = read_nortek_log(path.read_bytes())
+        log = DvlLog(nortek, left_out, waters=waters)
     else:
         log = (_read_json if b'"vx"' in start else _read_pd0)(path, path.read_bytes())
     if not log.samples:
@@ -174,6 +179,7 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
     attitudes: dict[int, tuple[float, float, float]] = {}
     left_out: Counter[str] = Counter()
     nmea = Nmea()
+    waters: list[WaterReading] = []
     for each in _ensembles(content):
         data = dict(each)
         try:
@@ -190,8 +196,10 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
             attitudes[stamp_ns] = attitude
         if sample is not None:
             samples.append(sample)
+        if (water := _pd0_water(stamp_ns, data)) is not None:
+            waters.append(water)
     stamps, rpy, notes = _pd0_attitudes(path, attitudes, nmea)
-    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu_samples(stamps, rpy), notes)
+    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu_samples(stamps, rpy), notes, waters)
 
 
 def _pd0_attitudes(
@@ -225,6 +233,26 @@ def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:
     roll = math.radians(0.01 * tilt_2)
     pitch = math.atan(math.tan(math.radians(0.01 * tilt_1)) * math.cos(roll))
     return roll, pitch, math.radians(0.01 * heading)
+
+
+def _pd0_water(stamp_ns: int, data: dict[int, bytes]) -> WaterReading | None:
+    """The speed of sound (EC) that velocities were counted with; temperature and salinity where sensors measured them
+    (EZ's bits), for what was typed in says nothing of the water."""
+    try:
+        fixed, variable = data[_FIXED_LEADER], data[_VARIABLE_LEADER]
+        (used,) = struct.unpack_from("<H", variable, 14)
+        salinity, temperature = struct.unpack_from("<Hh", variable, 24)
+        sources = fixed[30] & fixed[31]
+    except (struct.error, IndexError, KeyError):
+        return None
+    if not used:
+        return None
+    return WaterReading(
+        stamp_ns,
+        float(used),
+        0.01 * temperature if sources & _TEMPERATURE_SENSOR else math.nan,
+        float(salinity) if sources & _CONDUCTIVITY_SENSOR else math.nan,
+    )
 
 
 def _pd0_stamp(data: dict[int, bytes]) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD
 from ..calibration.samples import DvlSample
+from ..messages.encode import WaterReading
 
 _SYNC, _BOTTOM_TRACK = 0xA5, 0x1B
 # sync, size of the header, ID, family, size of the data, its checksum, the header's own
@@ -36,9 +37,10 @@ def is_nortek_log(start: bytes) -> bool:
     return next(_records(start, whole=False), None) is not None
 
 
-def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str]]:
-    """Samples (forward-left-up), and how many records gave none, by reason."""
+def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str], list[WaterReading]]:
+    """Samples (forward-left-up), how many records gave none, by reason, and what they say of the water."""
     samples: list[DvlSample] = []
+    waters: list[WaterReading] = []
     left_out: Counter[str] = Counter()
     for data in _records(content):
         try:
@@ -50,7 +52,9 @@ def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str]]:
             left_out["without bottom lock"] += 1
         else:
             samples.append(sample)
-    return samples, left_out
+            *_, used, temperature, _ = _LEADER.unpack_from(data)
+            waters.append(WaterReading(sample.stamp_ns, used, temperature, math.nan))
+    return samples, left_out, waters
 
 
 def _records(content: bytes, whole: bool = True) -> Iterator[bytes]:

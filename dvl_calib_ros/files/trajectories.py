@@ -274,9 +274,12 @@ def import_recording(
     else:
         attitudes = _attitudes(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
-        SampleWriter(bag).recording(attitudes, references, fixes, log.samples)
+        writer = SampleWriter(bag)
+        writer.recording(attitudes, references, fixes, log.samples)
+        waters = writer.water(log.waters)
     written = {"dvl/twist": len(log.samples), "gnss/twist": len(references), "imu/data": len(attitudes)}
     written |= {"gnss/fix": len(fixes)} if fixes else {}
+    written |= {"readings of the water": waters} if waters else {}
     written |= {f"reports {reason}, left out": count for reason, count in log.left_out.items()}
     return Imported(written, tuple(notes))
 

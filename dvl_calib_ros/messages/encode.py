@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Sample,
 from .drivers import IMU_TYPE, TWIST_TYPE
 
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+TEMPERATURE_TYPE, NUMBER_TYPE = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
 
 FRAME_IDS = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
 
@@ -23,6 +25,20 @@ class SatelliteFix(NamedTuple):
     stamp_ns: int
     latitude_deg: float
     longitude_deg: float
+
+
+class WaterReading(NamedTuple):
+    """What a DVL says of its water. speed_of_sound: m/s, that it counts with. temperature: °C; salinity: PSU; nan where
+    no sensor measures it."""
+
+    stamp_ns: int
+    speed_of_sound: float
+    temperature: float
+    salinity: float
+
+
+# What is written of each second is enough of what changes slowly
+_WATER_EVERY_NS = 1_000_000_000
 
 
 class SampleWriter:
@@ -80,6 +96,21 @@ class SampleWriter:
             linear_acceleration_covariance=unknown,
         )
         self._bag.message(topic, IMU_TYPE, sample.stamp_ns, message)
+
+    def water(self, readings: Iterable[WaterReading]) -> int:
+        """Write what a DVL says of its water, at most one reading a second; how many were written."""
+        types, last_ns, written = self._types, 0, 0
+        for each in readings:
+            if written and abs(each.stamp_ns - last_ns) < _WATER_EVERY_NS:
+                continue
+            last_ns, written = each.stamp_ns, written + 1
+            if not math.isnan(each.temperature):
+                message = types[TEMPERATURE_TYPE](self._header(each.stamp_ns, "dvl_link"), each.temperature, 0.0)
+                self._bag.message("dvl/temperature", TEMPERATURE_TYPE, each.stamp_ns, message)
+            for name, value in (("sound_speed", each.speed_of_sound), ("salinity", each.salinity)):
+                if not math.isnan(value):
+                    self._bag.message(f"dvl/{name}", NUMBER_TYPE, each.stamp_ns, types[NUMBER_TYPE](value))
+        return written
 
     def _twist(self, sample: DvlSample | ReferenceSample, frame_id: str) -> Any:
         types = self._types

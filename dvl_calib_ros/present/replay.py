@@ -270,6 +270,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
         yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")
+    yield from map(Sentence, run.cause_of_scale)
 
 
 def _paste(run: Replayed) -> Commands:

@@ -22,6 +22,7 @@ from ..bags.reader import BagReader
 from ..calibration.parameters import Parameters
 from ..calibration.register.registration import Registration
 from ..calibration.samples import Stamps, Stream, Streams, no_samples
+from ..calibration.water import Water
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.opening import open_bags
@@ -30,6 +31,7 @@ from .look import Survey, look_of
 from .recorded import Recorded, recorded
 from .streams import Stretch, stretches
 from .topics import Topics
+from .waters import OfWater, WaterCollector, readers, water_of
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 # Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
@@ -46,7 +48,8 @@ class Recording:
     messages. file_spans_ns: of each file that holds a message. notes: what the user should know of what was read
     (damage). columns: of the topics that are kept, a part for each path. transforms: of tf_static; descriptions: of
     robot_description. parts: the recordings that it is made of; none, if it is one. registrations: how its instruments
-    stand, by what it was registered with, for who asks the same again (`register_as`, `registration`).
+    stand, by what it was registered with, for who asks the same again (`register_as`, `registration`). waters: what
+    it says of its water.
     """
 
     paths: tuple[Path, ...]
@@ -60,6 +63,7 @@ class Recording:
     descriptions: tuple[str, ...] = ()
     parts: tuple[Recording, ...] = field(default=(), repr=False)
     registrations: dict[tuple[Topics, Parameters], Registration] = field(default_factory=dict, repr=False)
+    waters: tuple[OfWater, ...] = ()
 
     def register_as(self, found: Registration, topics: Topics, parameters: Parameters) -> None:
         """Keep what a registration with these topics, mounting, frames and clocks found."""
@@ -135,6 +139,10 @@ class Recording:
         }  # fmt: skip
         seen = {topic: look for topic, look in looks.items() if look is not None}
         return Survey(self.types, self.counts, seen, self.transforms, self.descriptions)
+
+    def water(self, topics: Topics) -> Water | None:
+        """What it says of its water, and the speed of sound that the DVL used; None if nothing."""
+        return water_of(self.waters, topics.found_in(self.types).dvl)
 
     def recorded(self, topic: str, parameters: Parameters) -> Recorded:
         """All messages of a topic that is kept, as they are."""
@@ -222,6 +230,18 @@ def together(each: Sequence[Recording]) -> Recording:
         tuple(transform for one in each for transform in one.transforms),
         tuple(dict.fromkeys(text for one in each for text in one.descriptions)),
         tuple(each),
+        waters=_of_all(each),
+    )
+
+
+def _of_all(each: Sequence[Recording]) -> tuple[OfWater, ...]:
+    """Readings of the same topic as one."""
+    found: dict[tuple[str, str], list[OfWater]] = {}
+    for reading in (reading for one in each for reading in one.waters):
+        found.setdefault((reading.topic, reading.kind), []).append(reading)
+    return tuple(
+        own[0]._replace(values=np.concatenate([part.values for part in own]), std=max(part.std for part in own))
+        for own in found.values()
     )
 
 
@@ -262,7 +282,10 @@ def _read(
     if topics is not None:
         found = topics.found_in(types)
         moving, static = moving & {found.dvl, found.gnss, found.imu}, set()
-    one_by_one = static | {topic for topic in moving if not _is_read_in_columns(types[topic])}
+    waters = {topic: WaterCollector(topic, kind) for topic, kind in types.items() if readers(topic, kind)}
+    one_by_one = (
+        static | {topic for topic in moving if not _is_read_in_columns(types[topic])} | (waters.keys() - moving)
+    )
     counts = bag.message_counts
     collectors = {
         topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
@@ -271,9 +294,13 @@ def _read(
     transforms: list[Any] = []
     descriptions: list[str] = []
     start_ns, end_ns = bag.span_ns
-    for window in windows(bag, moving | static, one_by_one):
+    for window in windows(bag, moving | static | waters.keys(), one_by_one):
         for part in window.parts:
             topic = part.channel.topic
+            if topic in waters:
+                waters[topic].take(part)
+                if topic not in collectors:
+                    continue
             if topic in collectors:
                 collectors[topic].take(part)
                 continue
@@ -294,6 +321,7 @@ def _read(
         {topic: (collector.columns(),) for topic, collector in collectors.items()},
         tuple(transforms),
         tuple(dict.fromkeys(descriptions)),
+        waters=tuple(reading for each in waters.values() for reading in each.readings()),
     )
 
 

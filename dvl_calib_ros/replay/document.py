@@ -10,6 +10,7 @@ from .. import __version__
 from ..calibration.comparison_words import comparison_document
 from ..calibration.navigation import navigation_document
 from ..calibration.verification import verification_document
+from ..calibration.water import water_document
 from ..files.result_file import days_document, estimate_document
 from .replay import Replayed
 
@@ -41,4 +42,5 @@ def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]
         "findings": [found.as_dict() for found in replayed.findings],
         "recordings": None if replayed.recordings is None else comparison_document(replayed.recordings),
         "navigation": navigation_document(replayed.navigation),
+        **({} if replayed.water is None else {"water": water_document(replayed.water)}),
     }

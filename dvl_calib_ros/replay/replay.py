@@ -20,12 +20,14 @@ from ..calibration.extrinsics import Extrinsics, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.mounting_pose import scale_and_delay
 from ..calibration.navigation import Navigation, objections
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
+from ..calibration.water import Water, in_words
 from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
@@ -51,7 +53,7 @@ class Replayed:
     recordings: what several recordings say, each for itself; None where they were not looked at so (`checked`).
     pause_s: how much of the time from the first to the last sample is between two recordings.
     navigation: dead reckoning without and with the selected model's correction, on data that it had not seen; None
-    without a reference.
+    without a reference. water: what the recording says of it; None if nothing.
     """
 
     result: Result
@@ -65,11 +67,20 @@ class Replayed:
     recordings: Comparison | None = None
     pause_s: float = 0.0
     navigation: Navigation | None = None
+    water: Water | None = None
 
     @property
     def dvl_data(self) -> str:
         """Type and axes of the DVL's data, in words."""
         return self.dvl_type + (", turned from forward-right-down to forward-left-up" if self.turned else "")
+
+    @property
+    def cause_of_scale(self) -> tuple[str, ...]:
+        """The scale as what the speed of sound makes of it, in sentences; none where the recording tells nothing."""
+        estimate, parameters = self.result.estimate, Parameters.from_mapping(self.result.parameters)
+        state = GaussianState(estimate.state, estimate.recording_covariance)
+        found = scale_and_delay(MODELS[estimate.model], state, parameters)
+        return () if found.scale_std is None else in_words(self.water, found.scale, found.scale_std)
 
 
 def replay(
@@ -159,6 +170,7 @@ def replay(
         decoder.dvl_type.name,
         decoder.turns_dvl,
         navigation=navigation,
+        water=recording.water(topics),
     )
 
 

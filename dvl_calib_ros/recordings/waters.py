@@ -1,0 +1,138 @@
+"""What a recording says of its water: thermometers, salinity, pressure, and the speed of sound that a DVL used."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..bags.columns import Part
+from ..calibration.frames import Array
+from ..calibration.water import SALINITIES, TEMPERATURES, THERMOMETER, Water
+
+_FLOATS = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
+_PHASED_ARRAY = 1
+# Of a topic that is fast so many messages of each window are read: water changes slowly.
+_OF_WINDOW = 20
+# Words in the name of a thermometer's topic that is in the water, and of one that is not.
+_IN_WATER = {"water", "sea", "ctd", "dvl", "ocean", "outside", "external"}
+_NOT_IN_WATER = {
+    "imu", "air", "cpu", "gpu", "board", "battery", "motor", "esc", "internal", "inside", "hull", "housing",
+}  # fmt: skip
+# Thermometers in the water that differ by more (°C) are not all in the water.
+_AGREE = 1.0
+# Speeds of sound in water, m/s; a DVL whose own moves by more than a share is not set to one.
+_SPEEDS, _STEADY = (1350.0, 1650.0), 0.001
+_SURFACE_PA, _PA_PER_M = 101_325.0, 1025.0 * 9.81
+
+
+class OfWater(NamedTuple):
+    """Of one topic. kind: temperature, salinity, pressure or used. values: (N,) °C, PSU, Pa or m/s. std: of each."""
+
+    topic: str
+    kind: str
+    values: Array
+    std: float = 0.0
+
+
+def _used(field: str) -> Callable[[Any], float]:
+    def read(message: Any) -> float:
+        # the velocities of a phased array along its face do not go by the speed of sound
+        is_phased = getattr(message, "dvl_type", 0) == _PHASED_ARRAY
+        return math.nan if is_phased else float(getattr(message, field))
+
+    return read
+
+
+_OF_TYPES: Mapping[str, Mapping[str, Callable[[Any], float]]] = {
+    "sensor_msgs/msg/Temperature": {"temperature": attrgetter("temperature")},
+    "sensor_msgs/msg/FluidPressure": {"pressure": attrgetter("fluid_pressure")},
+    "ds_sensor_msgs/msg/Ctd": {"temperature": attrgetter("temperature"), "salinity": attrgetter("salinity")},
+    "marine_acoustic_msgs/msg/Dvl": {"used": _used("sound_speed")},
+    "ds_sensor_msgs/msg/Dvl": {"used": _used("speed_sound")},
+}
+
+
+def readers(topic: str, msgtype: str) -> Mapping[str, Callable[[Any], float]]:
+    """What is read of a topic's messages, by kind; nothing of most. A plain number tells by its topic's name."""
+    if msgtype not in _FLOATS:
+        return _OF_TYPES.get(msgtype, {})
+    *places, name = topic.lower().split("/")
+    if name == "salinity":
+        return {"salinity": attrgetter("data")}
+    return {"used": attrgetter("data")} if name in ("sound_speed", "speed_of_sound") and "dvl" in places else {}
+
+
+class WaterCollector:
+    """Collects one topic's readings as its messages are read."""
+
+    def __init__(self, topic: str, msgtype: str) -> None:
+        self._topic, self._readers = topic, readers(topic, msgtype)
+        self._values: dict[str, list[float]] = {kind: [] for kind in self._readers}
+        self._variance = 0.0
+
+    def take(self, part: Part) -> None:
+        """Read some messages of a window."""
+        for message, _ in islice(part.messages(), _OF_WINDOW):
+            if message is None:
+                continue
+            for kind, read in self._readers.items():
+                self._values[kind].append(read(message))
+            self._variance = max(self._variance, float(getattr(message, "variance", 0.0)))
+
+    def readings(self) -> list[OfWater]:
+        """Of each kind, where there is one that is a number."""
+        std = math.sqrt(self._variance) if math.isfinite(self._variance) else 0.0
+        found = {kind: np.array(values)[np.isfinite(values)] for kind, values in self._values.items()}
+        return [OfWater(self._topic, kind, values, std) for kind, values in found.items() if len(values)]
+
+
+def water_of(readings: Sequence[OfWater], dvl: str) -> Water | None:
+    """What is known of the water, with the speed of sound that the DVL of topic `dvl` used; None if nothing is.
+
+    A thermometer counts whose topic says that it is in the water, or that is the only one and does not say where else.
+    Nothing is said where several contradict each other.
+    """
+    by_kind: dict[str, list[OfWater]] = {}
+    for reading in readings:
+        by_kind.setdefault(reading.kind, []).append(reading)
+    known: dict[str, Any] = {}
+    wet = _in_water(by_kind.get("temperature", []))
+    if wet is not None:
+        low, middle, high = np.percentile(wet.values, (5.0, 50.0, 95.0)).tolist()
+        known |= {"temperature": middle, "source": wet.topic}
+        known["temperature_error"] = max(THERMOMETER, 2.0 * wet.std) + 0.5 * (high - low)
+    salinity = _middle([each for each in by_kind.get("salinity", []) if each.values.any()])  # 0 all along: not filled
+    if SALINITIES[0] <= salinity <= SALINITIES[1] + 5.0:
+        known["salinity"] = salinity
+    pressure = _middle(by_kind.get("pressure", []))
+    if not math.isnan(pressure):
+        known["depth"] = max(0.0, (pressure - _SURFACE_PA) / _PA_PER_M)
+    own = [each for each in by_kind.get("used", []) if each.topic == dvl] or by_kind.get("used", [])
+    used = _middle(own)
+    if _SPEEDS[0] <= used <= _SPEEDS[1] and np.ptp(own[0].values) <= _STEADY * used:
+        known["used"] = used
+    return Water(**known) if "temperature" in known or "used" in known else None
+
+
+def _middle(readings: Sequence[OfWater]) -> float:
+    """The median where one topic tells, else nan."""
+    return float(np.median(readings[0].values)) if len(readings) == 1 else math.nan
+
+
+def _in_water(readings: Sequence[OfWater]) -> OfWater | None:
+    words = [set(re.split("[^a-z]+", each.topic.lower())) for each in readings]
+    maybe = [(each, own) for each, own in zip(readings, words, strict=True) if not own & _NOT_IN_WATER]
+    named = [each for each, own in maybe if own & _IN_WATER]
+    chosen = named or [each for each, _ in maybe]
+    if not chosen or (len(chosen) > 1 and not named):
+        return None
+    middles = [float(np.median(each.values)) for each in chosen]
+    if max(middles) - min(middles) > _AGREE or not TEMPERATURES[0] <= middles[0] <= TEMPERATURES[1]:
+        return None
+    return chosen[0]

@@ -1,0 +1,155 @@
+"""Temperature, salinity and speed of sound of a recording, from its messages to the report."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import succeed
+from conftest import ROOT
+from io_fixtures import write_bag
+from log_fixtures import nortek, pd0
+
+import dvl_calib_ros as dc
+from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.water import speed_of_sound
+from dvl_calib_ros.messages.encode import SampleWriter, WaterReading
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
+from dvl_calib_ros.recordings.waters import OfWater, water_of
+from dvl_calib_ros.simulation.scenario import Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+SCHEMA = json.loads((ROOT / "docs" / "json_schema.json").read_text())["$defs"]["replay"]
+TEMPERATURE, SALINITY = 12.1, 35.0
+USED = 1.0062 * speed_of_sound(TEMPERATURE, SALINITY)
+
+
+def dive(scale: float = 0.0062):
+    errors = DvlErrors((0.01, -0.01, 0.02), (scale,) * 3, beam_std=0.003)
+    made = simulate(
+        Scenario(seconds=240.0, seed=1, errors=errors, gnss_std=0.02, gnss_frame=VelocityFrame.BODY, imu_rate=10.0)
+    )
+    return made.imu, made.gnss, made.dvl
+
+
+def with_water(path: Path, temperature: float, salinity: float) -> Path:
+    imu, gnss, dvl = dive()
+    with BagWriter(path) as bag:
+        writer = SampleWriter(bag)
+        writer.recording(imu, gnss, dvl)
+        writer.water(WaterReading(each.stamp_ns, USED, temperature, salinity) for each in dvl)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    return with_water(tmp_path_factory.mktemp("waters") / "bag", TEMPERATURE, SALINITY)
+
+
+def test_a_replay_says_the_scale_in_its_cause_and_what_to_set(bag, tmp_path, capsys):
+    said, _ = succeed(capsys, "replay", bag, "--json", tmp_path / "out.json")
+    told = " ".join(said.split())
+    assert (
+        f"the DVL used a speed of sound of {USED:.1f} m/s; water of 12.1 °C (dvl/temperature) and 35.0 PSU has 149"
+        in told
+    )
+    assert "That explains the scale: set the speed of sound to 149" in told
+    written = json.loads((tmp_path / "out.json").read_text())
+    assert written["water"]["dvl_speed_of_sound"] == pytest.approx(USED)
+    assert written["water"].keys() == SCHEMA["properties"]["water"]["properties"].keys()
+
+
+def test_an_unknown_salinity_is_said_as_a_range(tmp_path, capsys):
+    bag = with_water(tmp_path / "bag", TEMPERATURE, float("nan"))
+    said, _ = succeed(capsys, "replay", bag)
+    told = " ".join(said.split())
+    assert "and unknown salinity (0 to 40 PSU)" in told and "if the salinity is" in told
+
+
+def test_a_recording_without_water_says_nothing(tmp_path):
+    imu, gnss, dvl = dive()
+    bag = write_bag(tmp_path / "bag", sorted((*imu, *gnss, *dvl), key=lambda sample: sample.stamp_ns))
+    run = dc.replay(bag, history=False)
+    assert run.replayed.water is None and "water" not in run.document()
+
+
+def test_several_recordings_have_one_water(bag):
+    water = open_recording([bag, bag]).water(Topics())
+    assert (water.temperature, water.salinity, water.used) == pytest.approx((TEMPERATURE, SALINITY, USED))
+
+
+def told(ensemble: bytes, sensors: int) -> bytes:
+    """An ensemble of `pd0` with EC 1500 m/s, ES 35, ET 12.1 °C, the last two from these sensors."""
+    body = bytearray(ensemble[:-2])
+    fixed, variable = struct.unpack_from("<2H", body, 6)
+    body[fixed + 30 : fixed + 32] = bytes([sensors, 0x3F])
+    struct.pack_into("<H", body, variable + 14, 1500)
+    struct.pack_into("<Hh", body, variable + 24, 35, 1210)
+    return bytes(body) + struct.pack("<H", sum(body) & 0xFFFF)
+
+
+@pytest.mark.parametrize(("sensors", "temperature", "salinity"), [(0x7D, 12.1, np.nan), (0x7F, 12.1, 35.0)])
+def test_pd0_tells_what_it_measured_and_what_it_counted_with(sensors, temperature, salinity, tmp_path, capsys):
+    """A salinity that somebody typed in is none that the water has."""
+    path = tmp_path / "dive.pd0"
+    path.write_bytes(b"".join(told(pd0(i, 4500 + 10 * i, 200, -300), sensors) for i in range(40)))
+    said, _ = succeed(capsys, "import", path, "-o", tmp_path / "bag")
+    assert "4 readings of the water" in said
+    water = open_recording([tmp_path / "bag"]).water(Topics())
+    found = (water.temperature, water.salinity, water.used)
+    assert found == pytest.approx((temperature, salinity, 1500.0), nan_ok=True)
+    assert water.source == "dvl/temperature"
+
+
+def test_a_temperature_that_was_typed_in_is_none_of_the_water(tmp_path, capsys):
+    path = tmp_path / "dive.pd0"
+    path.write_bytes(b"".join(told(pd0(i, 4500, 200, -300), 0x3C) for i in range(40)))
+    succeed(capsys, "import", path, "-o", tmp_path / "bag")
+    water = open_recording([tmp_path / "bag"]).water(Topics())
+    assert np.isnan(water.temperature) and water.used == 1500.0
+
+
+def test_nortek_tells_its_thermometer_and_speed_of_sound(tmp_path, capsys):
+    path = tmp_path / "dive.ad2cp"
+    path.write_bytes(b"".join(nortek(i, (1.5, 0.1, 0.0, 0.0)) for i in range(40)))
+    succeed(capsys, "import", path, "-o", tmp_path / "bag")
+    water = open_recording([tmp_path / "bag"]).water(Topics())
+    assert (water.temperature, water.used) == (8.0, 1500.0)
+
+
+def reading(topic: str, value: float, kind: str = "temperature") -> OfWater:
+    return OfWater(topic, kind, np.array([value]))
+
+
+@pytest.mark.parametrize(
+    ("topics", "source"),
+    [
+        ({"/temperature": 12.0}, "/temperature"),
+        ({"/imu/temperature": 35.0, "/sea_water/temperature": 12.0}, "/sea_water/temperature"),
+        ({"/imu/temperature": 35.0}, None),
+        ({"/one/temperature": 12.0, "/two/temperature": 12.0}, None),
+        ({"/ctd/temperature": 12.0, "/dvl/temperature": 12.4}, "/ctd/temperature"),
+        ({"/ctd/temperature": 12.0, "/dvl/temperature": 19.0}, None),
+        ({"/water/temperature": 285.0}, None),
+    ],
+)
+def test_a_thermometer_counts_that_is_in_the_water(topics, source):
+    water = water_of([reading(topic, value) for topic, value in topics.items()], "/dvl")
+    assert (None if water is None else water.source) == source
+
+
+def test_a_speed_of_sound_that_follows_the_water_is_no_setting():
+    steady = OfWater("/dvl/sound_speed", "used", np.array([1500.0, 1500.4]))
+    assert water_of([steady], "/dvl").used == pytest.approx(1500.2)
+    assert water_of([steady._replace(values=np.array([1500.0, 1506.0]))], "/dvl") is None
+
+
+def test_pressure_is_a_depth_below_the_surface():
+    readings = [reading("/temperature", 10.0), reading("/pressure", 101_325.0 + 1025.0 * 9.81 * 50.0, "pressure")]
+    assert water_of(readings, "/dvl").depth == pytest.approx(50.0)
+    assert water_of([*readings[:1], reading("/pressure", 99_000.0, "pressure")], "/dvl").depth == 0.0
