@@ -18,13 +18,12 @@ import numpy as np
 import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.register.registration import is_beyond_doubt
-from dvl_calib_ros.diagnosis.results import Diagnosis, FoundEffect
+from dvl_calib_ros.diagnosis.results import Diagnosis
 from dvl_calib_ros.discovery.discover import Discovery
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
-from dvl_calib_ros.unpaired.results import UnpairedComparison
 
 CLOCKS = {"reference": "reference_time_offset", "dvl": "dvl_time_offset"}
 LATE_S = (0.1, 0.8, 2.5, 5.0, 7.5, 30.0)
@@ -112,12 +111,10 @@ def _of_replay(replayed: dc.Calibration) -> Said:
     return {name: each for name, each in said.items() if each[0]}
 
 
-def _of_diagnosis(diagnosed: Diagnosis | UnpairedComparison) -> Said:
+def _of_diagnosis(diagnosed: object) -> Said:
     """Of clocks that no other one could stand in for."""
     said: Said = {}
-    for each in diagnosed.effects:
-        if not isinstance(each, FoundEffect):
-            continue
+    for each in diagnosed.effects if isinstance(diagnosed, Diagnosis) else ():
         if each.name in CLOCKS.values() and not {*each.equivalent_to} & {*CLOCKS.values()}:
             value, low, high = each.parameters["seconds"]
             said[each.name] = value, (high - low) / 3.92

@@ -31,9 +31,9 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "replay": (*_READ, "files"),
     "fleet": (*_READ, "parallel", "disk", "files", "discovery", "replay"),
     "diagnosis": (*_READ, "effects"),
-    "unpaired": (*_READ, "effects", "diagnosis"),
     "export": (*_CORE, "disk", "files", "effects"),
     "simulation": (*_READ, "effects", "export"),
+    "unpaired": (*_READ, "disk", "effects", "diagnosis", "export", "simulation"),
     "evaluation": (*_READ, "parallel", "files", "replay", "simulation"),
     "present": (
         *_READ, "disk", "files", "effects", "discovery", "examination", "replay", "fleet", "diagnosis", "unpaired",

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from ..files.trajectories import Imported
     from ..fleet.fleet import Fleet
     from ..unpaired.results import UnpairedComparison
+    from ..unpaired.rounds import ClosedGap
 
 __all__ = [
     "Calibration",
@@ -284,12 +285,14 @@ def diagnose(
     bags: Bags,
     *,
     simulator: Bags | None = None,
+    rounds: int | None = None,
+    keep: StrPath | None = None,
     dvl_topic: str | None = None,
     gnss_topic: str | None = None,
     imu_topic: str | None = None,
     params: StrPath | None = None,
     **parameters: Any,
-) -> Diagnosis | UnpairedComparison:
+) -> Diagnosis | UnpairedComparison | ClosedGap:
     """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``.
 
     Parameters
@@ -298,6 +301,10 @@ def diagnose(
         As of `replay`.
     simulator
         Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
+    rounds
+        With simulator: so many times at most its DVL is put right, simulated on its motion and compared again, 1 .. 9.
+    keep
+        With rounds: a folder, which must not exist, that keeps each round's DVL (round_1.json, for `export`) and bag.
     dvl_topic, gnss_topic, imu_topic
         As of `replay`.
     params
@@ -307,8 +314,9 @@ def diagnose(
 
     Returns
     -------
-    Diagnosis or UnpairedComparison
-        ``verdict``, ``effects`` with 95 % intervals, ``noise``, and what could not be told. The second with simulator.
+    Diagnosis, UnpairedComparison or ClosedGap
+        ``verdict``, ``effects`` with 95 % intervals, ``noise``, and what could not be told. The second with simulator;
+        the third, with rounds, has one for each of its ``rounds`` and says which is ``best``.
 
     Raises
     ------
@@ -321,11 +329,13 @@ def diagnose(
         for each in ([bags] if simulator is None else [bags, simulator])
     ]
     if simulator is not None:
-        from ..unpaired.compare import compare as against
         from ..unpaired.logs import RecordedSide
+        from ..unpaired.rounds import against
 
         real, made = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
-        return against(real, made)
+        return against(real, made, rounds, None if keep is None else Path(keep))
+    if rounds is not None or keep is not None:
+        raise InputError("rounds, keep: only with simulator")
     from ..diagnosis.diagnose import diagnose as run
 
     ((recording, discovery),) = sides

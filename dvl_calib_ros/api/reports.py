@@ -50,6 +50,7 @@ def _plain(result: Any) -> Callable[[], Any]:
     from ..evaluation.documents import evaluation_document
     from ..evaluation.results import Evaluation
     from ..unpaired.results import UnpairedComparison, unpaired_document
+    from ..unpaired.rounds import ClosedGap, closed_gap_document
 
     if isinstance(result, Evaluation):
         return lambda: evaluation_document(result)
@@ -57,6 +58,8 @@ def _plain(result: Any) -> Callable[[], Any]:
         return lambda: cross_check_document(result)
     if isinstance(result, UnpairedComparison):
         return lambda: unpaired_document(result)
+    if isinstance(result, ClosedGap):
+        return lambda: closed_gap_document(result)
     raise InputError(
         f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
     )

@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.simulator:
         unpaired.run(arguments, DEFAULTS)
         return
+    unpaired.check_without(arguments)
     from ..diagnosis.compensation import compensated, parameter_file
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.recordings import recording_names

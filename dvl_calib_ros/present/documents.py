@@ -12,6 +12,7 @@ from ..evaluation.results import Evaluation
 from ..examination.examine import Examination
 from ..fleet.fleet import Fleet
 from ..unpaired.results import UnpairedComparison
+from ..unpaired.rounds import ClosedGap
 from .comparison import comparison
 from .cross_check import cross_check
 from .diagnosis import diagnosis
@@ -22,6 +23,7 @@ from .fleet import fleet
 from .unpaired import unpaired
 
 DOCUMENTS: Mapping[type, Callable[[Any], Document]] = {
+    ClosedGap: unpaired,
     Comparison: comparison,
     CrossCheck: cross_check,
     Diagnosis: diagnosis,

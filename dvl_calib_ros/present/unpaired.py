@@ -1,4 +1,4 @@
-"""What a comparison of a simulator's DVL with that of the vehicle says."""
+"""What a comparison of a simulator's DVL with that of the vehicle says, once or round by round."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from ..unpaired.results import (
     SimulatorVerdict,
     UnpairedComparison,
 )
+from ..unpaired.rounds import ClosedGap, Round
 from ..verdict.kinds import Severity
 from .document import Answer, Cell, Columns, Document, Sentence, Table, Where, figures, section, table_by
 from .numbers import intervals, mm, p_value
@@ -48,6 +49,18 @@ RUNGS_NOTE = (
     "distance: between windows of recorded and simulated velocity, each less that of an ideal DVL, by their means and "
     "scatter on the axes."
 )
+ROUNDS: Columns[tuple[int, Round]] = {
+    "round": lambda each: str(each[0]),
+    "the simulator's DVL has": lambda each: ", ".join(each[1].effects) or ("nothing" if each[0] else "as recorded"),
+    "still differs in": lambda each: ", ".join(each[1].claims) or "nothing",
+    "error, mm/s": lambda each: mm(each[1].error_mps),
+    "energy distance": lambda each: f"{each[1].comparison.rungs[0].distance:.2f}",
+    "alike: below": lambda each: f"{each[1].comparison.rungs[0].null95:.2f}",
+}
+ROUNDS_NOTE = (
+    "Error: recorded less simulated on the vehicle's own motion, held out; noise of {} mm/s stays in it. In each round "
+    "effects, noise and rate are changed by as much as they differed in the one before. What follows is of round {}."
+)
 NOISE: Columns[ComparedNoise] = {
     "property": lambda each: each.name,
     "": lambda each: Cell(each.status.words, CELLS.get(each.status, "")),
@@ -59,8 +72,13 @@ NOISE: Columns[ComparedNoise] = {
 }
 
 
-def unpaired(c: UnpairedComparison) -> Document:
-    """What the simulator's DVL lacks, how far the gap shrinks with it, and what could not be told."""
+def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
+    """What the simulator's DVL lacks, how far the gap shrinks with it, and what could not be told; of rounds the gap by
+    round before that, which then is of the best."""
+    closed = found if isinstance(found, ClosedGap) else ClosedGap((Round(found),))
+    c, reasons = closed.rounds[closed.best].comparison, found.reasons
+    compared = [each for each in enumerate(closed.rounds) if each[1].comparison.rungs]
+    by_round = table_by(ROUNDS, compared, (ROUNDS_NOTE.format(mm(c.floor_mps), closed.best),), words=3)
     effects = table_by(EFFECTS, c.effects, (EFFECTS_NOTE,), words=len(EFFECTS))
     rungs = table_by(RUNGS, c.rungs, (RUNGS_NOTE.format(mm(c.floor_mps)),))
     levels = [(name, *map(mm, both)) for name, both in c.levels.items()]
@@ -70,9 +88,10 @@ def unpaired(c: UnpairedComparison) -> Document:
     return Document(
         title="The DVL of a simulator against that of the vehicle",
         subtitle="; ".join(f"{side}: {', '.join(name for name, _ in d.recordings)}" for side, d in sides.items()),
-        answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [each.full_sentence for each in c.reasons]),
+        answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [each.full_sentence for each in reasons]),
         warnings=c.notes,
         sections=[
+            section("The gap by round", by_round if isinstance(found, ClosedGap) else None),
             section(
                 "Effect by effect",
                 effects,

@@ -21,7 +21,7 @@ from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_tim
 from ..diagnosis.folds import fitted_without, stretch_of
 from ..diagnosis.selection import EffectSelection
 from ..diagnosis.settings import SETTINGS
-from ..diagnosis.twin import simulated
+from ..diagnosis.twin import simulated, with_quiet_reference
 from ..effects.base import Effect
 from .logs import Log
 from .results import ComparisonStatus, Rung
@@ -109,7 +109,7 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
         for index, (a, b) in enumerate(zip(truth, everything, strict=True))
     ]
     # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
-    of_reference = _reference_noise(problem, selection.base.hypothesis, rng)
+    of_reference = _reference_noise(with_quiet_reference(problem), selection.base.hypothesis, rng)
     drawn = [_drawn(simulator.residuals, a, None, rng) + b for a, b in zip(truth, of_reference, strict=True)]
     recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
     rungs, errors = [], {}
@@ -159,10 +159,12 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     bins = stretch_of(problem.time) % SETTINGS.folds
     sample_folds = [_fold_of(problem, index) for index in range(n)]
     predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
+    # at the times that a delay looks at, a reference's noise is another: taken twice it would be too much
+    quiet = with_quiet_reference(problem)
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
         for index in range(n):
             at = sample_folds[index] == fold
-            predicted[index][at] = simulated(problem, fitted, index)[at]
+            predicted[index][at] = simulated(quiet, fitted, index)[at]
     return predicted
 
 

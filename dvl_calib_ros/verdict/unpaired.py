@@ -33,6 +33,26 @@ UNPAIRED = (
         severity=Severity.ACCEPT,
     ),
     _Said(
+        "SIMULATOR_ROUNDS",
+        "after round {round} the simulator's error on the vehicle's own motion is {after:.1f} mm/s instead of "
+        "{before:.1f}, held out; noise alone makes {floor:.1f}",
+        "In each round the simulator's DVL was put right, simulated on the simulator's motion and compared again.",
+        severity=Severity.ACCEPT,
+    ),
+    _Said(
+        "SIMULATOR_ROUNDS_IN_VAIN",
+        "put right, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
+        "held out; noise alone makes {floor:.1f}",
+        "No round differs in less, or has a smaller error, than the simulator as it was recorded.",
+        severity=Severity.MARGINAL,
+    ),
+    _Said(
+        "SIMULATOR_NO_ROUNDS",
+        "nothing differs that could be put right, so no round was made",
+        "The loop ends where the comparison claims no difference.",
+        severity=Severity.ACCEPT,
+    ),
+    _Said(
         "SIMULATOR_NOT_SHOWN",
         "these recordings show no difference in effects, and could not have shown some that matter",
         "One side's motion shows too few effects.",

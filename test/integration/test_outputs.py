@@ -47,6 +47,10 @@ COMMAND = {
         f"diagnose bag --simulator {LOOSE} --simulator-params params.yaml",
         ("bag", "bag/bag.mcap", LOOSE, "params.yaml"), ("--json", "--report"),
     ),
+    "diagnose in rounds": Command(
+        f"diagnose bag --simulator {LOOSE} --rounds 1", ("bag", "bag/bag.mcap", LOOSE), ("--json", "--report"),
+        ("--keep",),
+    ),
     "doctor": Command(
         "doctor bag --params params.yaml", ("bag", "bag/bag.mcap", "params.yaml"), ("--json", "--report"),
     ),

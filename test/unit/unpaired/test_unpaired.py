@@ -5,17 +5,23 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from conftest import ROOT
 from report_fixtures import Page
 
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import Stream, sample_block
+from dvl_calib_ros.calibration.samples import Stream, VelocityFrame, sample_block
 from dvl_calib_ros.diagnosis.recordings import make_recording, zeros_while_moving
+from dvl_calib_ros.diagnosis.results import diagnosis_document
+from dvl_calib_ros.disk.json_files import write_json
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
+from dvl_calib_ros.export.description import load_description
+from dvl_calib_ros.present.documents import DOCUMENTS
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
@@ -25,6 +31,7 @@ from dvl_calib_ros.unpaired.compare import compare
 from dvl_calib_ros.unpaired.logs import RecordedSide, is_copied
 from dvl_calib_ros.unpaired.noise import Scatter, at_one_motion, block_levels, slopes_of
 from dvl_calib_ros.unpaired.results import ComparisonStatus, SimulatorVerdict, unpaired_document
+from dvl_calib_ros.unpaired.rounds import close_gap, closed_gap_document, put_right
 from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, two_samples
 from dvl_calib_ros.unpaired.sizes import Size, is_there, p_alike
 from dvl_calib_ros.unpaired.stream_facts import facts_of
@@ -158,6 +165,81 @@ def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags,
 @pytest.mark.parametrize("option", ["--apply", "--twin"])
 def test_what_is_of_one_vehicle_is_refused_beside_a_simulator(bags, tmp_path, capsys, option):
     assert option in fail(capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], option, tmp_path / "x")
+
+
+# ------------------------------------------------------------------ round by round
+
+
+@pytest.fixture(scope="module")
+def closed(bags, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rounds")
+    return close_gap(source(bags["vehicle"]), source(bags["simulator"]), 2, folder), folder
+
+
+@pytest.mark.slow
+def test_put_right_the_simulator_has_the_arm_and_the_noise_of_the_vehicle(closed):
+    found, folder = closed
+    assert [each.claims for each in found.rounds] == [("lever_arm", "level_y", "level_z", "level_x"), ()]
+    assert found.best == 1 and found.rounds[1].effects == ("lever_arm",)
+    assert found.rounds[1].error_mps < 0.5 * found.rounds[0].error_mps
+    assert [each.code for each in found.reasons] == ["SIMULATOR_ROUNDS", "SIMULATOR_ALIKE"]
+    assert sorted(each.name for each in folder.iterdir()) == ["round_1", "round_1.json"]
+    assert load_description(folder / "round_1.json").lever_arm[0] == pytest.approx(0.8, abs=0.1)
+
+
+@pytest.mark.slow
+def test_rounds_are_written_as_the_schema_says_and_laid_out(closed, tmp_path):
+    found, _ = closed
+    write_json(tmp_path / "out.json", closed_gap_document(found))
+    schema = json.loads((ROOT / "docs" / "json_schema.json").read_text())
+    document = json.loads((tmp_path / "out.json").read_text())
+    jsonschema.Draft202012Validator(schema | {"$ref": "#/$defs/diagnose_rounds"}).validate(document)
+    rows = DOCUMENTS[type(found)](found).sections[0].items[0].rows
+    assert [tuple(row[:3]) for row in rows] == [
+        ("0", "as recorded", "lever_arm, level_y, level_z, level_x"),
+        ("1", "lever_arm", "nothing"),
+    ]
+
+
+def test_a_round_changes_sizes_noise_and_rate_by_as_much_as_they_differ(compared):
+    document = diagnosis_document(compared.vehicle)
+    document["effects"] = []
+    right = put_right(document, compared)
+    (arm,) = right["effects"]
+    said = compared.missing[0]
+    assert arm["parameters"]["x_m"]["value"] == pytest.approx(said.vehicle["x_m"][0] - said.simulator["x_m"][0])
+    level = next(each for each in compared.noise if each.name == "level_x")
+    before, after = document["dvl"]["noise_std_mps"][0], right["dvl"]["noise_std_mps"][0]
+    assert after == pytest.approx(before * level.vehicle[0] / level.simulator[0])
+    assert document["effects"] == [] and put_right(right, compared)["dvl"]["rate_hz"] == document["dvl"]["rate_hz"]
+
+
+@pytest.mark.slow
+def test_where_nothing_differs_no_round_is_made(bags, tmp_path):
+    found = close_gap(source(bags["simulator"]), source(bags["simulator"]), 2, tmp_path)
+    assert len(found.rounds) == 1 and found.reasons[-1].code == "SIMULATOR_NO_ROUNDS"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--simulator", "simulator", "--rounds", "0"], "rounds: 0 is outside 1 .. 9"),
+        (["--simulator", "simulator", "--keep", "new"], "keep works only with rounds"),
+        (["--simulator", "simulator", "--rounds", "1", "--keep", "vehicle"], "exists already"),
+        (["--rounds", "1"], "--rounds works only with --simulator"),
+        (["--keep", "new"], "--keep works only with --simulator"),
+    ],
+)
+def test_options_of_rounds_that_cannot_be_are_refused_in_one_line(bags, tmp_path, capsys, options, says):
+    words = [str(bags.get(each, tmp_path / each if each == "new" else each)) for each in options]
+    assert says in fail(capsys, "diagnose", bags["vehicle"], *words)
+
+
+def test_a_simulator_without_attitude_has_no_motion_to_simulate_on(bags, tmp_path, capsys):
+    made = bag(tmp_path / "sim", gnss_rate=10.0, gnss_std=0.0, gnss_frame=VelocityFrame.BODY, imu_rate=0.0)
+    assert "rounds have no motion to simulate on" in fail(
+        capsys, "diagnose", bags["vehicle"], "--simulator", made, "--rounds", "1"
+    )
 
 
 # ------------------------------------------------------------------ its parts
