@@ -16,6 +16,9 @@ from .registered import FirstGuess
 from .settings import SETTINGS
 
 ARM = "lever_arm"
+ARM_PARAMETERS = "x_m", "y_m", "z_m"
+# A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
+GUESSED_STD_M = 0.2
 # A part of the arm is a clock's as well if, with clocks free, it is known so many times worse, and not to so many σ.
 WORSE, SHOWN = 2.0, 2.0
 CLOCKS = ("dvl_time_offset", "reference_time_offset")
@@ -39,6 +42,21 @@ def is_open(guesses: Sequence[FirstGuess]) -> bool:
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
 
 
+def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
+    """The lever arm to start from, as most recordings have it: what is not shown of it only where it is known.
+
+    A height of 5 m for one of 1 turns the rest of the arm. effects: with what of each is shown.
+    """
+    shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
+    stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
+    known = np.min(stds, axis=0) < GUESSED_STD_M if stds else np.zeros(3, dtype=bool)
+    arm = np.median([guess.lever_arm for guess in guesses], axis=0)
+    return {
+        name: value if name in shown or is_known else 0.0
+        for name, value, is_known in zip(ARM_PARAMETERS, arm.tolist(), known.tolist(), strict=True)
+    }
+
+
 def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> Fit:
     """The fit with clocks as registration tells them, and the lever arm beside, where that is left open.
 
@@ -54,8 +72,7 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
         return fit
     rest = [effect for effect in fit.effects if effect.name not in (*CLOCKS, ARM)]
     start: dict[str, tuple[Values, ...]] = {
-        ARM: tuple(dict(zip(("x_m", "y_m", "z_m"), each.lever_arm.tolist(), strict=True)) for each in guesses)[:1]
-        * len(guesses),
+        ARM: (guessed_arm(guesses, effects),) * len(guesses),
         CLOCKS[0]: tuple({"seconds": each.offsets.dvl} for each in guesses),
         CLOCKS[1]: tuple({"seconds": each.offsets.reference} for each in guesses),
     }

@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from ..calibration.parameters import SCHEMA, Parameters
+from .clock_or_arm import ARM_PARAMETERS
 from .results import Diagnosis
 
 OFFSETS = {
@@ -44,7 +45,7 @@ def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | N
                 for name, (value, low, high) in parameter_values.items()
                 if not effect.equivalent_to or low > 0.0 or high < 0.0
             }
-            axes = zip(parameters.lever_arm, ("x_m", "y_m", "z_m"), strict=True)  # a height is not always shown
+            axes = zip(parameters.lever_arm, ARM_PARAMETERS, strict=True)  # a height is not always shown
             values["lever_arm"] = tuple(known + sure.get(axis, 0.0) for known, axis in axes)
         elif effect.name in OFFSETS:
             name = OFFSETS[effect.name]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
-from ..effects.base import ClockEffect, Effect
-from .clock_or_arm import ARM, is_open, with_arm, with_clocks
+from ..effects.base import Effect
+from .clock_or_arm import ARM, guessed_arm, is_open, with_arm, with_clocks
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
@@ -33,10 +33,6 @@ from .shown import shown_parts
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
 START = (ARM, "dvl_time_offset", "reference_time_offset")
-LAG = "reference_lag"
-ARM_PARAMETERS = "x_m", "y_m", "z_m"
-# A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
-GUESSED_STD_M = 0.2
 # Parts of the run at whose ends effects that come and go are tried to begin or end, and how many of these are kept
 WINDOW_STEPS, KEPT_VARIANTS = 10, 2
 # Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
@@ -101,19 +97,8 @@ def started(
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
     effects = shown_parts(effects, problem)
-    lever = np.median([guess.lever_arm for guess in guesses], axis=0)
-    arm = {name: float(value) for name, value in zip(ARM_PARAMETERS, lever, strict=True)}
-    if ARM in effects:
-        shown_of_arm = {spec.name for spec in effects[ARM].parameters}
-        stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
-        std = np.min(stds, axis=0) if stds else np.full(3, np.inf)
-        # what is not shown stays as it is guessed: a height of 5 m for one of 1 turns the rest of the arm
-        arm = {
-            name: value if name in shown_of_arm or own < GUESSED_STD_M else 0.0
-            for (name, value), own in zip(arm.items(), std.tolist(), strict=True)
-        }
     found: dict[str, tuple[Values, ...]] = {
-        ARM: (arm,) * len(guesses),
+        ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
         "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
     }
@@ -164,11 +149,11 @@ def select(
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem))
     clocks = tuple(effect.name for effect in freed.effects if effect not in fit.effects)
     if clocks:
-        selected = [_or_clocks(each, clocks) if each.effect.name == ARM else each for each in selected]
+        selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
     fit = freed
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
-        selected = [_either_clock(each) for each in selected]
+        selected = [_or_else(each, CLOCKS[:2]) if each.effect.name in CLOCKS[:2] else each for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
     return EffectSelection(ordered, base, fit, fitter, guesses, effects)
 
@@ -482,13 +467,10 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
 
 
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
-    """Whether an effect adds next to nothing to what all of them explain; of an arm, clock or lag, to the noise either.
-
-    Beside an arm of metres a clock is little, and without it the arm is decimetres off; beside a lag so is the arm.
-    """
+    """Whether an effect adds next to nothing to what all of them explain; of what bends an arm, nor to the noise."""
     if drop > SETTINGS.ghost_share * explained:
         return False
-    return not (isinstance(effect, ClockEffect) or effect.name in (ARM, LAG)) or drop < SETTINGS.ghost_of_noise * left
+    return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
 
 
 def _borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
@@ -577,17 +559,10 @@ def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects:
     return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
 
 
-def _or_clocks(arm: Selected, clocks: tuple[str, ...]) -> Selected:
-    """A lever arm of which clocks would take a part."""
-    return replace(arm, equivalent=tuple(dict.fromkeys((*clocks, *arm.equivalent))))
-
-
-def _either_clock(selected: Selected) -> Selected:
-    """A clock that is off, where it does not show which of the two it is."""
-    if selected.effect.name not in CLOCKS[:2]:
-        return selected
-    (other,) = {*CLOCKS[:2]} - {selected.effect.name}
-    return replace(selected, equivalent=tuple(dict.fromkeys((other, *selected.equivalent))))
+def _or_else(selected: Selected, names: Sequence[str]) -> Selected:
+    """An effect for which others could stand in as well."""
+    others = (name for name in (*names, *selected.equivalent) if name != selected.effect.name)
+    return replace(selected, equivalent=tuple(dict.fromkeys(others)))
 
 
 __all__ = ["EffectSelection", "Offsets", "Selected", "blocks_of", "log_p_value", "select"]

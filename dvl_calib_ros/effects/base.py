@@ -168,13 +168,15 @@ class Effect(AnyEffect, ABC):
 
     remedy: what to do about it where it is found, as part of a sentence. manoeuvre: what to fly to see it and tell it
     from what it is confounded with. of_the_day: whether its size is another in every recording; else it belongs to the
-    vehicle. relative_to_first: whether it is a change against the first of several recordings.
+    vehicle. relative_to_first: whether it is a change against the first of several recordings. bends_arm: whether
+    little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres.
     """
 
     remedy: ClassVar[str] = ""
     manoeuvre: ClassVar[str]
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
+    bends_arm: ClassVar[bool] = False
 
     def without(self, names: Collection[str]) -> Effect:
         """The same, without some parameters, which stay at their defaults of 0."""
@@ -205,6 +207,7 @@ class ClockEffect(Effect):
     """A systematic effect on the stamps of one stream."""
 
     of_the_day = True
+    bends_arm = True
 
     @abstractmethod
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
