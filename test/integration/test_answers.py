@@ -32,6 +32,7 @@ def vehicle(told: Told, frame: str = "map", antenna=(0.0, 0.0, 0.0), std: float 
         told.say(stamp, "/gps/vel", TWIST, told.make.velocity(TWIST, sample, frame))
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("frame", ["map", "gps"])
 def test_that_there_is_no_imu_is_the_first_sentence_of_doctor_and_replay(tmp_path, capsys, frame):
     told = Told()
@@ -117,6 +118,7 @@ def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(t
         assert run.verdict == "marginal" and "LEVER_ARM_CONTRADICTED" in run.codes
 
 
+@pytest.mark.spread(1)
 @pytest.mark.parametrize("claimed", [None, 0.015])
 def test_the_noise_of_a_reference_that_claims_none_or_far_too_little_is_measured(tmp_path, claimed):
     """By a claim of a third most samples were outliers (combinations 326, 372)."""
@@ -189,6 +191,7 @@ def test_what_is_right_is_not_rejected_for_what_noise_and_compass_make(tmp_path,
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
 
 
+@pytest.mark.slow
 def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_path):
     """Survey 23032: 73 degrees of roll were found where there are none, and the pitch came out 2.6 degrees off."""
     write_survey(draw(23032), tmp_path / "bag")
@@ -196,6 +199,7 @@ def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_pat
     np.testing.assert_allclose(np.abs(found.parameters.mounting_rpy), (0.0, 0.0, math.pi), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", few((25036, 32046, 38456), (32046,)))
 def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, seed):
     """By the model that takes it as known yaw was off by 1.9 degrees and claimed to 0.3: on a circle one looks like the
@@ -206,6 +210,7 @@ def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, s
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "yaw_deg"),
     [(26062, 45.0), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((27044, 45.0), (26234, 32.0)))],

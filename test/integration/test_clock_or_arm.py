@@ -36,6 +36,7 @@ def test_of_all_runs_together_the_compass_is_named_and_nothing_of_the_height_is_
     assert observed["yaw"] and not (observed["roll"] or observed["pitch"] or observed["lever arm z"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", few(RUNS, RUNS[:1]))
 def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
     """It was -0.46 m ± 0.05; by differences of velocities it is 0.0 ± 0.1."""

@@ -53,6 +53,7 @@ def test_what_differs_by_some_three_sigma_is_suspicious_and_exit_code_3(place, t
     assert "suspicious" in page.read_text()
 
 
+@pytest.mark.slow
 def test_a_bag_is_calibrated_to_be_compared(place, capsys):
     assert main(["compare", str(place / "a.yaml"), str(place / "b")]) == 0
     assert main(["compare", str(place / "a"), str(place / "c")]) == 1

@@ -101,6 +101,7 @@ def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path, la
     assert calibration.replayed.result.estimate.gated >= 20
 
 
+@pytest.mark.slow
 def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path, monkeypatch):
     drawn(monkeypatch)  # the page is read, its pictures are not
     calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.2, 0.0), -2.2))
@@ -113,6 +114,7 @@ def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path, monkeypatch):
     assert re.search(r"<span>lever arm, up</span><b>.*not shown by this data", page)
 
 
+@pytest.mark.slow
 def test_a_reference_that_claims_no_noise_is_not_suspected_for_being_better_than_the_parameters_say(tmp_path):
     calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.0, 0.0), 0.0, claimed=None), history=False)
     assert calibration.model == "G2" and calibration.verdict == "accept", calibration.reasons

@@ -24,6 +24,7 @@ def bags(tmp_path_factory) -> list[Path]:
     return [folder / "monday", folder / "tuesday"]
 
 
+@pytest.mark.slow
 def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_delay(
     bags, tmp_path, monkeypatch, capsys
 ):

@@ -40,6 +40,7 @@ def test_the_bridge_takes_the_topic_that_the_settings_name_in_types_that_are_rea
     assert set(recorded.split()[5:]) == set(BRIDGE)
 
 
+@pytest.mark.slow
 def test_what_the_bridge_makes_of_those_settings_gives_the_exported_mounting_back(settings, tmp_path):
     """The bridge's messages, with the altitude of -1 that it leaves; Gazebo itself is not here."""
     dvl = READERS["gazebo"](settings)

@@ -42,6 +42,7 @@ def said(command, bag, tmp_path, capsys, *options):
     return " ".join(capsys.readouterr().out.split()), json.loads((tmp_path / f"{command}.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "late",
     [

@@ -26,6 +26,7 @@ LOOKED_FOR = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("effects", "trajectory", "code"),
     [

@@ -67,6 +67,7 @@ def test_a_command_opens_and_reads_each_recording_once(words, bags, passes, tmp_
     assert passes == expected
 
 
+@pytest.mark.slow
 def test_a_replay_from_an_initial_calibration_reads_once_though_it_runs_twice(bags, passes, tmp_path, capsys):
     saved = tmp_path / "saved.yaml"
     succeed(capsys, "replay", bags["BAG"], "--save", saved)

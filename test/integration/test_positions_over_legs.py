@@ -91,6 +91,7 @@ def test_positions_too_seldom_for_velocities_calibrate(tmp_path):
     assert abs(result.estimate.state[2] - TRUTH.phi[2]) < 3.0 * result.estimate.recording_std[2]
 
 
+@pytest.mark.slow
 def test_live_and_replay_agree_in_state_and_in_when_it_was_chosen(tmp_path):
     usbl = write_positions(tmp_path / "bag", run(seconds=200.0))
     recording = open_recording([usbl], TOPICS)

@@ -53,6 +53,7 @@ def test_recordings_of_one_mounting_are_averaged_and_the_night_is_no_dropout(pla
     assert checked.result.verifications["G1"].verdict is plain.result.verifications["G1"].verdict
 
 
+@pytest.mark.slow
 def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(place, capsys, tmp_path):
     bags = [place / "wednesday", place / "monday", place / "tuesday"]  # in any order
     out, _ = succeed(capsys, "replay", *bags, "--json", tmp_path / "r.json", "--save", tmp_path / "r.yaml")

@@ -97,6 +97,7 @@ def assert_mounting_and_lever_arm_are_those_of_the_transforms(found: Discovery, 
     assert min(np.abs(begun - each).max() for each in (nominal, nominal @ FLU_FROM_FRD)) < 1e-9
 
 
+@pytest.mark.slow
 def test_rtk_positions_alone_give_the_yaw_to_a_few_hundredths_of_a_degree(bags):
     found, replayed = answered(bags["rtk_positions_only"])
     assert "reference /rtk/fix (NavSatFix, enu, 5 Hz)" in found.found[0]

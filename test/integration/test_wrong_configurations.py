@@ -181,6 +181,7 @@ def test_a_right_configuration_is_not_rejected_and_nothing_else_is_said_to_fit(s
     assert result.suggestion is None
 
 
+@pytest.mark.slow
 def test_what_the_node_saves_of_a_wrong_configuration_is_refused_too(tmp_path, capsys):
     document = result_document(live(write_bag(tmp_path / "bag", run(YAW[45])), Parameters()).result())
     saved, launch = tmp_path / "result.yaml", tmp_path / "tf.launch.xml"

@@ -34,6 +34,7 @@ def said(messages) -> dict[str, str]:
     return {item.key: item.value for message in messages[-1:] for item in message.status[0].values}
 
 
+@pytest.mark.slow
 def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_late(world, tmp_path):
     bag, saved = tmp_path / "bag", tmp_path / "live.yaml"
     scenario = Scenario(

@@ -352,6 +352,7 @@ def test_services_reset_and_save_answer_in_words(world, tmp_path, monkeypatch):
         assert not answer.success and "could not be written" in answer.message
 
 
+@pytest.mark.slow
 def test_after_a_stall_no_topic_runs_ahead_of_another(world, bag):
     """The bag comes while the node stands still, far longer than max_latency of it."""
     with stalled_node(world) as (node, run):

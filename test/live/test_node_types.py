@@ -62,6 +62,7 @@ def test_what_is_missing_is_named_as_it_was_remapped(world):
         assert "ros2 topic hz" in silent["dvl"].remedy and "/a50/velocity" in silent["dvl"].remedy
 
 
+@pytest.mark.slow
 def test_the_node_and_the_replay_agree_on_other_types(world, tmp_path):
     bag, saved = write_driver_bag(tmp_path / "bag", run(), ODOMETRY, TWIST_STAMPED), tmp_path / "live.yaml"
     types = as_arguments(PATIENT | {"dvl_type": ODOMETRY, "gnss_type": TWIST_STAMPED})

@@ -175,6 +175,7 @@ def odometry(motion, i: int, stamp: int) -> Odometry:
     return message
 
 
+@pytest.mark.slow
 def test_a_simulator_that_is_reset_begins_anew(world):
     motion, _ = motion_of(scenario(3.0))
     publisher = world.node.create_publisher(Odometry, "odom", DEEP)
@@ -192,6 +193,7 @@ def test_a_simulator_that_is_reset_begins_anew(world):
     assert stamp_ns(second[0].header.stamp) == start_ns - 100_000_000_000
 
 
+@pytest.mark.slow
 def test_a_request_that_ros_itself_cannot_read_ends_no_simulator(world):
     unknown = ParameterMessage(name="use_sim_time", value=ParameterValue(type=77))
     with simulator(world, "--trajectory", "box") as process:

@@ -32,6 +32,7 @@ def test_a_wrong_call_is_refused_in_one_line(capsys, wrong):
     assert said.out == "" and said.err.startswith("python -m validation: ") and said.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_is_counted_and_its_log_kept(tmp_path, monkeypatch, capsys):
     suite = tmp_path / "test_two.py"
     suite.write_text("def test_good(): pass\ndef test_bad(): assert 'here' == 'there'\n")
@@ -77,6 +78,7 @@ def test_only_a_test_that_fails_kills_a_mutant(tmp_path, text, failed, said):
     assert by == failed and (said in output if said else output == "")
 
 
+@pytest.mark.slow
 def test_a_mutant_that_survives_is_said_by_the_exit_code_and_the_copy_alone_is_changed(monkeypatch, capsys):
     path = "dvl_calib_ros/errors.py"
     before = (ROOT / path).read_text()
@@ -108,6 +110,7 @@ def test_the_judge_of_stacks_sees_an_angle_a_position_and_a_delay_that_are_wrong
     assert [each.split()[0] for each in errors] == ["yaw", "late"]
 
 
+@pytest.mark.slow
 def test_a_survey_is_the_same_for_a_seed_and_its_judge_sees_what_is_wrong(tmp_path):
     drawn, judge = surveys.draw(7), surveys.SURVEYS
     assert drawn == surveys.draw(7) != surveys.draw(8)

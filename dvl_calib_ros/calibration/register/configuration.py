@@ -86,7 +86,8 @@ def fitting_configuration(
         fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
         # the mountings that have a name, and whichever fits
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
-        each = [nearest(fit, rotation) for rotation in likely]
+        of_use = FITS_BELOW * fit.speed / math.sqrt(3.0)
+        each = [nearest(fit, rotation, most=of_use) for rotation in likely]
         if (turned := each[1]) is not None and misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
             also_turned.add(frame)
         if some := [one for one in each if one is not None]:
@@ -100,9 +101,15 @@ def fitting_configuration(
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
 
-def nearest(fit: MotionFit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM) -> Fitted | None:
-    """The best with a DVL that is late by no more than a calibration finds; None without any."""
-    each = (fit(0.0, late, rotation_body_from_dvl, held) for late in LATE_S)
+def nearest(
+    fit: MotionFit,
+    rotation_body_from_dvl: Array | None,
+    held: Sequence[Array] = WITHOUT_ARM,
+    most: float = math.inf,
+) -> Fitted | None:
+    """The best with a DVL that is late by no more than a calibration finds; None without any. most: m/s, of which what
+    is left may be, to be of use."""
+    each = (fit(0.0, late, rotation_body_from_dvl, held, most=most) for late in LATE_S)
     found = [one for one in each if one is not None and np.isfinite(one.x).all()]
     return min(found, key=lambda one: one.level, default=None)
 
@@ -148,7 +155,7 @@ def _flipped(
     fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
 
     def fitted(rotation: Array, held: Sequence[Array], most: float = math.inf) -> Fitted | None:
-        near = nearest(quick, rotation, held)
+        near = nearest(quick, rotation, held, most)
         return None if near is None or near.level > most else fit(0.0, near.dvl_late, rotation, held)
 
     turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM, FAR_WORSE * registered.spread)
@@ -177,7 +184,7 @@ def _mirrored(
     Then the sway of turns is the other way round, which at one speed is a lever arm of the other sign.
     """
     other = replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * MIRRORED))
-    near = nearest(MotionFit(other, lever_arm, curves.mirrored(), FEW_ROWS), nominal, (REFERENCE,))
+    near = nearest(MotionFit(other, lever_arm, curves.mirrored(), FEW_ROWS), nominal, (REFERENCE,), registered.spread)
     if near is None or near.level > registered.spread:
         return None
     held = (REFERENCE,)

@@ -43,6 +43,9 @@ MOST_ROWS, FEW_ROWS = 4000, 800
 ROUNDS, SETTLED_S = 12, 5e-4
 # A delay moves no further in one round, s: slopes hold that far.
 FARTHEST_S = 0.7
+# After so many rounds, what leaves so many times the most that is of use, and hardly less than the round before, is
+# given up.
+ROUNDS_TO_FALL, FAR_ABOVE, HARDLY_LESS = 3, 2.0, 0.9
 # Samples so many times further off than usual count by half.
 HALF_AT = 3.0
 # Slower, nothing is compared, m/s. Fewer rows tell nothing.
@@ -124,7 +127,8 @@ class _Rows(NamedTuple):
 class MotionFit:
     """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
 
-    times: (J,) s of the references that are looked at. dvl_noise: variance of the DVL's white noise, (m/s)².
+    times: (J,) s of the references that are looked at; speed: their RMS, m/s. dvl_noise: variance of the DVL's white
+    noise, (m/s)².
     """
 
     def __init__(self, motion: MotionStreams, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
@@ -136,6 +140,7 @@ class MotionFit:
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self.times, self._velocity = m.reference_times[moving], m.reference[moving]
+        self.speed = math.sqrt(float((self._velocity**2).sum()) / max(len(moving), 1))
         # where hardly anything changes, what seems to is its noise
         self.dvl_noise = float(white_noise(m.dvl.velocity))
 
@@ -146,8 +151,9 @@ class MotionFit:
         rotation_body_from_dvl: Array | None,
         in_time: Sequence[Array] = (),
         among: Fitted | None = None,
+        most: float = math.inf,
     ) -> Fitted | None:
-        """From ρ and δ (s) on; None where too little can be compared.
+        """From ρ and δ (s) on; None where too little can be compared, or more is left than the most (m/s) of use.
 
         rotation_body_from_dvl: (3, 3), about which turns are likely; None to find it. in_time: clocks that are in time,
         `DVL` and `REFERENCE`, or `BOTH_ALIKE`; without an attitude that turns it, the reference's is.
@@ -162,12 +168,16 @@ class MotionFit:
         solved = None
         if not self.is_turned:
             in_time = (*in_time, REFERENCE)
-        for _ in range(ROUNDS):
+        left = math.inf
+        for number in range(ROUNDS):
             rows = self._rows(x, rotation, among)
             if rows is None:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
-            step = solved[0]
+            step, _, level, _ = solved
+            if number >= ROUNDS_TO_FALL and level > max(FAR_ABOVE * most, HARDLY_LESS * left):
+                return None
+            left = level
             far = float(np.abs(step[[APART, LATE]]).max())
             step = step * min(1.0, FARTHEST_S / max(far, 1e-9))
             x = x + step
@@ -263,14 +273,15 @@ class MotionFit:
         h = rows.jacobian.reshape(-1, N)
         w = np.repeat(weight, axes) / level2
         prior = LIKELY**-2.0
-        information = (h * w[:, None]).T @ h + np.diag(prior)
+        weighted = (h * w[:, None]).T
+        information = weighted @ h + np.diag(prior)
         # what is known of δ beside all else: more than that taken off, and it would be less than nothing
         told = 1.0 / float(np.linalg.inv(information)[APART, APART])
         information[APART, APART] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * told)
         away = x.copy()
         away[TURN] = turn_between(nominal, rotation)
         away[[APART, LATE]] = 0.0
-        vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * away
+        vector = -weighted @ rows.residual.ravel() - prior * away
         for row in in_time:
             information += HELD_STD_S**-2.0 * np.outer(row, row)
             vector -= HELD_STD_S**-2.0 * row * float(row @ x)

@@ -86,6 +86,7 @@ def test_a_dvl_that_was_put_elsewhere_is_said_by_its_lever_arm():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 5])
 def test_what_only_chance_makes_differ_is_the_same_in_95_of_100_and_has_never_moved(n):
     rng = np.random.default_rng(n)

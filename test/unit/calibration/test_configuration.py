@@ -110,6 +110,7 @@ def straight_in_waves(late_s, dvl=SAME):
     return calibrate(samples, PARAMETERS, verified=True).verification("G1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", few([-2.5, 2.5], [2.5]))
 def test_a_dvl_that_is_late_by_half_a_wave_is_not_taken_for_one_that_points_down(late_s):
     found = {each.code for each in causes(straight_in_waves(late_s))}

@@ -238,6 +238,7 @@ def spoilt(samples, seed):
         yield sample
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", few(range(4), (0,)))
 def test_blocks_that_are_gathered_see_no_more_than_each_by_itself(seed):
     """Neighbours hold margins of each other: a sample that is a spike in one is none in another."""
@@ -266,6 +267,7 @@ def in_waves(samples):
         yield sample
 
 
+@pytest.mark.slow
 def test_blocks_that_are_gathered_gate_and_learn_the_heave_as_each_by_itself():
     """Which rows are used depends on those before them, and what is learnt of heave on both."""
     samples = list(in_waves(late(0.0, duration=300.0)))
@@ -280,6 +282,7 @@ def test_blocks_that_are_gathered_gate_and_learn_the_heave_as_each_by_itself():
     np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_delays_that_have_lost_are_left_out_after_the_same_blocks_however_these_are_gathered(monkeypatch):
     samples = late(-1.4, duration=200.0)
     alone, together, with_all = (Calibrator(NOISE, block_size=size, models=AUTO) for size in (128, 4096, 4096))

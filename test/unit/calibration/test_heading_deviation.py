@@ -64,6 +64,7 @@ def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
     assert said.code == "HEADING_DEVIATION" and "with the heading" in said.says and "compass first" not in said.remedy
 
 
+@pytest.mark.slow
 @pytest.mark.spread(1)
 @pytest.mark.parametrize("legs, every", [(16, math.pi / 4.0), (16, math.pi)], ids=["all around", "to and fro"])
 @pytest.mark.parametrize("size", few([0.0, 0.5, 2.0], [2.0]))

@@ -94,6 +94,7 @@ def test_what_g1_knows_of_two_days_is_what_either_alone_tells_of_the_vehicle():
     np.testing.assert_allclose(np.diag(both.p)[:5], np.diag(p)[:5], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_how_samples_are_gathered_changes_nothing_about_days():
     one, other = found(), calibrate(two_days(), NOISE, block_size=40, verified=True)
     for name in ("G1", "G2", "F1", "A1"):

@@ -272,6 +272,7 @@ def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
     assert (errors["F1"] < 0.8 * errors["M7"]).all()
 
 
+@pytest.mark.slow
 def test_a_faster_dvl_does_not_make_the_models_of_motion_surer():
     run = MatchedRun("box", 300.0, dvl_std=0.01)
     slow, fast = (calibrate(make_samples(replace(run, dvl_every=every))) for every in (100, 10))

@@ -66,6 +66,7 @@ def check(data: SensorData, parameters: Parameters):
     return variants
 
 
+@pytest.mark.slow
 @searched(15)
 @given(
     options=st.fixed_dictionaries(

@@ -287,6 +287,7 @@ def test_it_does_not_write_over_what_it_reads(diagnosis, capsys):
     assert "no-such" in fail(capsys, "export", "gazebo", diagnosis, "-o", diagnosis.parent / "no-such" / "dvl.sdf")
 
 
+@pytest.mark.slow
 def test_the_diagnosis_of_a_bag_says_what_the_export_needs(tmp_path, capsys):
     succeed(capsys, "simulate", tmp_path / "bag", "--trajectory", "free", "--duration", "200", "--gnss-std", "0.02",
             "--waves", "0.3", "5", "--scale", "0.8", "--effect", "lever_arm:x_m=1.5", "--seed", "2")  # fmt: skip

@@ -101,6 +101,7 @@ def test_adding_the_missing_effect_shrinks_error_and_distance_on_held_out_stretc
     assert rungs[NOISE].distance < min(0.5 * rungs[AS_IT_IS].distance, 1.5 * rungs[NOISE].null95)
 
 
+@pytest.mark.slow
 def test_a_noisier_dvl_is_told_axis_by_axis_and_nothing_else_of_the_stream(compared):
     told = {each.name for each in compared.noise if each.status.is_claim}
     assert told == {"level_x", "level_y", "level_z"}
