@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +17,15 @@ from numpy.typing import NDArray
 from ..calibration.clocks import Clocks
 from ..calibration.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ..calibration.parameters import Parameters
+from ..calibration.positions import NOISY_MPS
+from ..calibration.register.fine import white_noise
 from ..calibration.register.registration import Registration
 from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ..calibration.screening import SMALLEST_VARIANCE
 from ..effects.base import EffectNeeds
 from ..errors import InputError
 from ..messages.decode import MessageDecoder
+from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.check import check_topics, missing_imu
 from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording as Opened
@@ -260,12 +264,29 @@ def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) ->
     check_topics(opened, chosen, found)
     decoder = MessageDecoder(opened.of_types(chosen, parameters))
     streams = opened.streams(chosen, decoder)
+    usable = streams.reference.values[streams.reference.refused == 0]
+    usable = usable[np.isfinite(usable).all(axis=1)]
+    unfit = _unfit_positions(path, opened.types.get(chosen.gnss, ""), chosen.gnss, usable)
+    if unfit and not len(usable):
+        raise InputError(unfit[0])
     if not len(streams.reference):
         raise InputError(
             f"{path}: no reference velocity to compare the DVL with: no messages on {topics.gnss}; set --gnss-topic"
         )
     found += missing_imu(opened, chosen, decoder.frame_of_reference)
-    return streams, [*opened.notes, *map(str, found), *map(str, decoder.problems.values())]
+    return streams, [*opened.notes, *unfit, *map(str, found), *map(str, decoder.problems.values())]
+
+
+def _unfit_positions(path: Path, msgtype: str, topic: str, velocities: Array) -> list[str]:
+    """What to do with positions whose velocities (N, 3) m/s are too noisy to be compared; nothing about others."""
+    kind = VELOCITY_TYPES.get(msgtype)
+    is_noisy = not len(velocities) or math.sqrt(white_noise(velocities)) > NOISY_MPS
+    if kind is None or kind.position is None or not is_noisy:
+        return []
+    return [
+        f"{path}: the positions on {topic} are too noisy, or too seldom, for the velocities that a diagnosis compares "
+        "with the DVL's; dvl-calib replay calibrates with them (model D1)"
+    ]
 
 
 def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[str]) -> RecordedStreams:

@@ -17,6 +17,7 @@ from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
+from ..messages.fixes import SELDOM_S
 from ..recordings.look import Look
 from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording, open_recording
@@ -212,9 +213,10 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
 
 
 def _is_compared_over_legs(reference: Recorded) -> bool:
-    """Whether a reference is positions of which velocities are too noisy to be of use."""
+    """Whether a reference is positions that are too noisy, or too seldom, for velocities to be of use."""
     is_position = VELOCITY_TYPES[reference.msgtype].position is not None
-    return is_position and len(reference) > 0 and checks.shown_noise(reference.values) > NOISY_MPS
+    is_noisy = len(reference) > 0 and checks.shown_noise(reference.values) > NOISY_MPS
+    return is_position and (is_noisy or checks.interval_s(reference) > SELDOM_S)
 
 
 def _are_clocks_known(discovery: Discovery) -> bool:

@@ -20,6 +20,8 @@ from ..calibration.frames import Array, Vector
 SEMI_MAJOR_M, ECCENTRICITY_SQUARED = 6_378_137.0, 6.694_379_990_141e-3
 # Two positions further apart than so many windows are on two sides of an outage.
 LONGEST_WINDOWS = 3.0
+# Positions that come more seldom (s), as of a USBL, are differenced from one to the next where they are looked at.
+SELDOM_S = 3.0
 # A receiver above so many fixes per window is thinned by the window alone.
 MOST_FIXES = 2000
 

@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from ..discovery.discover import Discovery
     from .recorder import TopicRecorder
 
-# So long is recorded, s; longer, where a topic that has a publisher brings nothing yet.
-LISTEN_S, MOST_S = 20.0, 60.0
+# So long is recorded, s; longer, where a topic that has a publisher has not brought so many messages yet: a USBL gives
+# a position each 5 to 10 s.
+LISTEN_S, MOST_S, ENOUGH = 20.0, 60.0, 3
 
 
 class _Running(NamedTuple):
@@ -82,7 +83,7 @@ class Discovering:
         if recorder.look() and time.monotonic() < began + LISTEN_S:
             began = time.monotonic()  # what has turned up late is listened to for as long
             self._recording = self._recording._replace(began=began)
-        waits_for = LISTEN_S if all(recorder.counts[topic] for topic in recorder.topics) else MOST_S
+        waits_for = LISTEN_S if all(recorder.counts[topic] >= ENOUGH for topic in recorder.topics) else MOST_S
         if time.monotonic() < began + waits_for:
             return None
         self._recording = None

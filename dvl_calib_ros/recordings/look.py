@@ -22,7 +22,7 @@ from ..calibration.robust import median
 from ..calibration.samples import Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.fixes import FixDifference, PositionType
+from ..messages.fixes import SELDOM_S, FixDifference, PositionType
 from .columns import TopicColumns, stamped, turning
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
@@ -98,7 +98,11 @@ def look_of(
     messages, and no bursts.
     """
     topic, msgtype = parts[0].topic, parts[0].msgtype
-    numbers = _Numbers(msgtype)
+    seconds = 1e-9 * sum(end - start for start, end in spans_ns)
+    every_s = seconds / count if count else 0.0
+    is_seldom = every_s > SELDOM_S and is_position(msgtype)
+    numbers = _Numbers(msgtype, every_s if is_seldom else 1.0)
+    whole = whole or is_seldom
     taken = np.sort(np.concatenate([part.arrivals[0] for part in parts])) if whole else in_bursts(parts, spans_ns)
     for part in parts:
         numbers.add_columns(part, _places(part.laid.arrival, taken))
@@ -111,7 +115,6 @@ def look_of(
     if found is None:
         return None
     stamps_ns, log_ns, values, beside, kept = found
-    seconds = 1e-9 * sum(end - start for start, end in spans_ns)
     ahead_s = 1e-9 * float(median(np.asarray(stamps_ns - log_ns, dtype=float)))
     stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
     rate_hz = count / seconds if seconds else 0.0
@@ -161,11 +164,18 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
     return arrival[taken]
 
 
+def is_position(msgtype: str) -> bool:
+    """Whether messages of a type hold positions, of which velocities are made."""
+    kind = VELOCITY_TYPES.get(msgtype)
+    return kind is not None and kind.position is not None
+
+
 class _Numbers:
     """Collects what a look is made of: of each message arrival, log time, stamp and numbers."""
 
-    def __init__(self, msgtype: str) -> None:
-        self._msgtype, self._kind = msgtype, VELOCITY_TYPES.get(msgtype)
+    def __init__(self, msgtype: str, window_s: float) -> None:
+        """window_s: over which positions become velocities."""
+        self._msgtype, self._kind, self._window_s = msgtype, VELOCITY_TYPES.get(msgtype), window_s
         self._rows: list[tuple[Stamps, Stamps, Stamps, Array, Array]] = []
         self._names: list[tuple[int, str]] = []
         self.world = ""
@@ -201,7 +211,7 @@ class _Numbers:
     def add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
         """Arrival, log time (ns) and message of each."""
         if self._kind is not None and self._kind.position is not None:
-            messages = _differences(messages, self._kind.position)
+            messages = _differences(messages, self._kind.position, self._window_s)
         for arrival, log_ns, message in messages:
             with suppress(*UNREADABLE):
                 values, beside = self._of(message)
@@ -233,7 +243,9 @@ class _Numbers:
         if given is None or self._kind.lacks_covariance(message):
             return math.nan
         flat = np.asarray(given, dtype=float).ravel()
-        return float(flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]].mean())
+        variance = flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]]
+        # of positions without a height the vertical is claimed to be anywhere
+        return float(median(variance) if self._kind.position else variance.mean())
 
     def in_order(self) -> tuple[Stamps, Stamps, Array, Array, Index] | None:
         """Stamps, log times, values, what is beside; which of them are of use, in order of stamps."""
@@ -250,9 +262,11 @@ class _Numbers:
         return stamps_ns, log_ns, values, beside, order[whole[order]]
 
 
-def _differences(messages: Iterable[tuple[int, int, Any]], kind: PositionType) -> list[tuple[int, int, Any]]:
+def _differences(
+    messages: Iterable[tuple[int, int, Any]], kind: PositionType, window_s: float
+) -> list[tuple[int, int, Any]]:
     """Positions as the velocities between them, at the middle of each window."""
-    difference = FixDifference(between=kind.between)
+    difference = FixDifference(window_s, kind.between)
     found = []
     for arrival, log_ns, message in messages:
         at_ns = stamped(message, log_ns)

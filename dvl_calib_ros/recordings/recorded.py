@@ -15,7 +15,7 @@ from ..calibration.samples import Codes, Stamps
 from ..calibration.screening import NOT_MEASURED_VARIANCE, screen_columns
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.fixes import FixDifference, PositionType
+from ..messages.fixes import SELDOM_S, FixDifference, PositionType
 from .columns import Laid, TopicColumns, stamped
 from .look import FASTEST
 
@@ -134,17 +134,19 @@ def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Para
 
 def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType, parameters: Parameters) -> list[_Row]:
     """Positions as the velocities between them."""
-    difference = FixDifference(parameters.position_window, kind.between)
+    log_ns = np.array([log_ns for _, log_ns, message, _ in singly if message is not None], dtype=np.int64)
+    every_s = 1e-9 * float(np.median(np.diff(log_ns))) if len(log_ns) > 1 else 0.0
+    difference = FixDifference(every_s if every_s > SELDOM_S else parameters.position_window, kind.between)
     rows = []
-    for arrival, log_ns, message, _ in singly:
+    for arrival, at_log_ns, message, _ in singly:
         if message is None or not kind.is_valid(message):
             continue
-        at_ns = stamped(message, log_ns)
+        at_ns = stamped(message, at_log_ns)
         found = difference(at_ns, *kind.place(message), kind.covariance(message))
         if found is not None:
             variances = np.full(3, np.nan) if found.covariance is None else np.diag(found.covariance)
             # by the log time of the middle of its window, as if it had been measured then
-            rows.append(_Row(arrival, log_ns - (at_ns - found.stamp_ns), found.stamp_ns, found.velocity, variances))
+            rows.append(_Row(arrival, at_log_ns - (at_ns - found.stamp_ns), found.stamp_ns, found.velocity, variances))
     return rows
 
 

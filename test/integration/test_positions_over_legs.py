@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import fail
 from conftest import ROOT
 from position_fixtures import USBL, Noise, Truth, driven, write_positions
 
+import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
@@ -115,6 +117,27 @@ def test_a_pose_is_discovered_only_where_its_name_says_that_it_was_measured(tmp_
     other = write_positions(tmp_path / "bag", run(seconds=300.0), topic="/navigator/pose")
     assert discover(open_recording([usbl]), Parameters()).topics.gnss == USBL
     assert discover(open_recording([other]), Parameters()).topics.gnss != "/navigator/pose"
+
+
+@pytest.mark.parametrize("fix_s", [5.0, 10.0])
+def test_a_usbl_that_gives_a_position_each_5_to_10_s_is_discovered_and_calibrated_with(fix_s, tmp_path, capsys):
+    bag = write_positions(tmp_path / "bag", run(seconds=900.0, fix_s=fix_s))
+    found = dc.replay(bag, history=False)
+    result = found.replayed.result
+    assert found.discovery.topics.gnss == USBL and result.selected == WITH_POSITIONS
+    assert abs(result.estimate.state[2] - TRUTH.phi[2]) < 3.0 * result.estimate.recording_std[2]
+    examined = dc.doctor(bag)
+    assert not {"DOCTOR_TOO_FEW", "DOCTOR_SLOW_REFERENCE"} & {each.code for each in examined.findings}
+    assert "dvl-calib replay calibrates with them (model D1)" in fail(capsys, "diagnose", bag)
+
+
+def test_half_a_minute_of_a_slow_usbl_which_a_live_node_looks_through_is_enough_to_find_it(tmp_path):
+    bag = write_positions(tmp_path / "bag", run(seconds=32.0, fix_s=10.0))
+    assert discover(open_recording([bag]), Parameters()).topics.gnss == USBL
+
+
+def test_a_diagnosis_of_noisy_positions_says_what_to_do(usbl):
+    assert any("replay calibrates with them (model D1)" in each for each in dc.diagnose(usbl).notes)
 
 
 def test_the_model_of_positions_is_refused_where_there_are_velocities():

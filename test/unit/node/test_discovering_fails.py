@@ -56,3 +56,21 @@ def test_a_full_disk_ends_the_search(monkeypatch):
         search.step()
     search.close()
     assert search._recording is None
+
+
+@pytest.mark.parametrize(("heard", "after", "is_enough"), [(3, 21.0, True), (2, 21.0, False), (2, 61.0, True)])
+def test_a_topic_that_brings_something_each_10_s_is_listened_to_for_longer(monkeypatch, heard, after, is_enough):
+    """As a USBL: of two positions there is one difference, of one none."""
+    now = 100.0
+    monkeypatch.setattr("dvl_calib_ros.node.discovering.time", SimpleNamespace(monotonic=lambda: now))
+    search = searching("/dvl")
+    search.step()
+    recorder = search._recording.recorder
+    search._recording = search._recording._replace(began=now)
+    monkeypatch.setattr(recorder, "look", lambda: False)
+    monkeypatch.setattr(type(recorder), "topics", property(lambda _: ["/dvl", "/usbl"]))
+    recorder.counts.update({"/dvl": 100, "/usbl": heard})
+    now += after
+    search.step()
+    assert (search._recording is None) == is_enough
+    search.close()
