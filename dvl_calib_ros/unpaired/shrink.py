@@ -104,13 +104,10 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
     windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
     ideal = _held_out(selection, SimulatedModel("", (), {}))
     everything = _held_out(selection, ladder[-1])
-    own = [
-        _drawn([a - b], a, _fold_of(problem, index), rng)
-        for index, (a, b) in enumerate(zip(truth, everything, strict=True))
-    ]
+    own = [turned_over(a - b, rng) for a, b in zip(truth, everything, strict=True)]
     # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
     of_reference = _reference_noise(with_quiet_reference(problem), selection.base.hypothesis, rng)
-    drawn = [_drawn(simulator.residuals, a, None, rng) + b for a, b in zip(truth, of_reference, strict=True)]
+    drawn = [_drawn(simulator.residuals, a, rng) + b for a, b in zip(truth, of_reference, strict=True)]
     recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
     rungs, errors = [], {}
     for model in ladder:
@@ -189,16 +186,23 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
     ]
 
 
-def _drawn(pool: Sequence[Array], like: Array, folds: Array | None, rng: np.random.Generator) -> Array:
-    """(N, 3) m/s: noise put together of stretches of residuals; with folds, of another fold than a sample's own."""
+def turned_over(residual: Array, rng: np.random.Generator) -> Array:
+    """(N, 3) m/s: a residual with stretches of it turned over by chance, so as loud in every turn as it is there.
+
+    Drawn from elsewhere, it would be too loud where the vehicle goes straight on, and windows were told apart by that.
+    """
+    n = len(residual)
+    signs = np.repeat(rng.choice([-1.0, 1.0], -(-n // STRETCH)), STRETCH)[:n]
+    return np.asarray(np.nan_to_num(residual - np.nanmedian(residual, axis=0)) * signs[:, None])
+
+
+def _drawn(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Array:
+    """(N, 3) m/s: noise put together of stretches of residuals."""
     joined = np.concatenate(list(pool))
     joined = joined - np.nanmedian(joined, axis=0)
     n = len(like)
     starts = rng.integers(0, max(len(joined) - STRETCH, 1), -(-n // STRETCH))
     at = (starts[:, None] + np.arange(STRETCH)).ravel()[:n] % len(joined)
-    if folds is not None and len(joined) == n:
-        same = folds[at] == folds
-        at[same] = (at[same] + n // 2 + 1) % n
     return np.asarray(np.nan_to_num(joined[at]))
 
 

@@ -32,7 +32,7 @@ from dvl_calib_ros.unpaired.logs import RecordedSide, is_copied
 from dvl_calib_ros.unpaired.noise import Scatter, at_one_motion, block_levels, slopes_of
 from dvl_calib_ros.unpaired.results import ComparisonStatus, SimulatorVerdict, unpaired_document
 from dvl_calib_ros.unpaired.rounds import close_gap, closed_gap_document, put_right
-from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, two_samples
+from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, turned_over, two_samples
 from dvl_calib_ros.unpaired.sizes import Size, is_there, p_alike
 from dvl_calib_ros.unpaired.stream_facts import facts_of
 
@@ -340,3 +340,14 @@ def test_velocities_of_zero_under_way_are_dropouts_and_at_rest_are_velocities():
     zeros[[50, 150]] = 0.0
     found = np.flatnonzero(zeros_while_moving(sample_block(Stream.DVL, stamps, zeros), stopped))
     assert found.tolist() == [50]
+
+
+def test_noise_that_is_turned_over_stays_as_loud_where_it_is_and_loses_what_lasts():
+    rng = np.random.default_rng(5)
+    loud = np.where(np.arange(4000) < 2000, 0.01, 0.04)[:, None]
+    residual = loud * rng.standard_normal((4000, 3)) + 0.02
+    made = turned_over(residual, rng)
+    for half in (slice(0, 2000), slice(2000, 4000)):
+        assert made[half].std() == pytest.approx(residual[half].std(), rel=0.05)
+        assert np.abs(made[half].mean(axis=0)).max() < 0.2 * 0.02
+    assert np.abs(np.corrcoef(made[:, 0], residual[:, 0])[0, 1]) < 0.2
