@@ -94,8 +94,9 @@ def test_a_misalignment_is_no_difference_of_effects_since_calibration_takes_it_i
 def test_adding_the_missing_effect_shrinks_error_and_distance_on_held_out_stretches(compared):
     rungs = {rung.name: rung for rung in compared.rungs}
     assert list(rungs) == [AS_IT_IS, "with lever_arm", NOISE]
-    assert rungs[NOISE].error_mps < 0.85 * rungs[AS_IT_IS].error_mps
-    assert rungs[NOISE].error_mps == pytest.approx(compared.floor_mps, rel=0.2)
+    assert rungs[NOISE].error_mps < 0.3 * rungs[AS_IT_IS].error_mps
+    # what is slow of the reference's noise stays in it, beyond the floor from sample to sample
+    assert compared.floor_mps < rungs[NOISE].error_mps < 1.5 * compared.floor_mps
     assert rungs[AS_IT_IS].distance > rungs[AS_IT_IS].null95
     # not p: in 200 s the held-out calibration itself is some 8 mm/s off, which the statistic sees
     assert rungs[NOISE].distance < min(0.5 * rungs[AS_IT_IS].distance, 1.5 * rungs[NOISE].null95)
