@@ -39,7 +39,8 @@ def physics_path() -> Path:
 
 
 @cache
-def _physics() -> Any:
+def load_physics() -> Any:
+    """The shared folder's module."""
     spec = importlib.util.spec_from_file_location("traps_phys", physics_path())
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -181,7 +182,7 @@ DEFECTS: tuple[tuple[str, Callable[[Recording, Random], Size]], ...] = (
 
 def write_combination(seed: int, path: Path) -> dict[str, Any]:
     """Write the bag of a seed to a new folder; returns its truth in degrees and percent, and what was drawn."""
-    rng, physics = np.random.default_rng(SEED_OF_ALL + seed), _physics()
+    rng, physics = np.random.default_rng(SEED_OF_ALL + seed), load_physics()
 
     def one_of(*values: float) -> float:
         return float(rng.choice(values))

@@ -18,7 +18,8 @@ from .cases import Drawn, draw
 from .motion import Floats, Motion
 from .plan import Case
 from .scored import RECORDING
-from .strength import Scene
+from .strength import Scene, Yardstick
+from .truth import Truth
 from .vehicle import (
     Faults,
     attitude_state,
@@ -45,6 +46,20 @@ class Recorded:
 
     bags: tuple[Path, ...]
     drawn: Drawn
+
+    @property
+    def truth(self) -> Truth:
+        """To be sealed."""
+        return self.drawn.truth
+
+    @property
+    def mounting_rpy(self) -> tuple[float, float, float]:
+        """How the DVL is said to be mounted, rad."""
+        return self.drawn.scene.vehicle.mounting_rpy
+
+    def left_mps(self, said: Faults) -> float:
+        """Error (rms) beyond calibration and noise that is left if some faults are said."""
+        return Yardstick(self.drawn.scene).error_mps(self.drawn.faults, said)
 
 
 def record(case: Case, seed: int, folder: Path) -> Recorded:

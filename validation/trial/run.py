@@ -13,10 +13,10 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.disk.atomic import save_text
@@ -25,15 +25,44 @@ from dvl_calib_ros.parallel import outcomes_on_cores
 
 from .cases import NotDrawnError
 from .generator import record
-from .plan import Case
 from .scored import parameters_of
-from .strength import Yardstick
-from .truth import seal
+from .truth import Truth, seal
 from .vehicle import FAULTS, Faults
 
 Document = dict[str, Any]
 Answerer = Callable[[Sequence[Path], Parameters], Document]
 """Bags of one vehicle, and what is known of its mounting -> the diagnosis as in its JSON."""
+
+
+class Identified(Protocol):
+    """A case, as far as a trial has to know it: its id, by which its answer is found again."""
+
+    @property
+    def id(self) -> str:
+        """Says nothing about the case."""
+
+
+class Recording(Protocol):
+    """A recorded case: its bags, its truth, how the DVL is said to be mounted."""
+
+    @property
+    def bags(self) -> tuple[Path, ...]:
+        """One per recording."""
+
+    @property
+    def truth(self) -> Truth:
+        """To be sealed."""
+
+    @property
+    def mounting_rpy(self) -> tuple[float, float, float]:
+        """rad."""
+
+    def left_mps(self, said: Faults) -> float:
+        """Error (rms) that is left if some faults are said; NaN where that cannot be told."""
+
+
+Recorder = Callable[[Any, int, Path], Recording]
+"""A case, a seed and a folder that does not exist yet -> the case, recorded there."""
 
 # When a fault is there, of which an answer does not say
 AT_ANY_TIME = {
@@ -55,13 +84,18 @@ def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial in a folder. jobs: processes, 0: one per core. keep_bags: leave the bags in the folder."""
+    """A trial in a folder. jobs: processes, 0: one per core. keep_bags: leave the bags in the folder.
+
+    beside: others that are asked of the same bags, by name; their answers stand beside the one. recorder: of the cases.
+    """
 
     folder: Path
     seed: int = 0
     jobs: int = 0
     keep_bags: bool = False
     answerer: Answerer = diagnose_bags
+    beside: Mapping[str, Answerer] = field(default_factory=dict)
+    recorder: Recorder = record
 
     @property
     def sealed(self) -> Path:
@@ -75,7 +109,7 @@ class Trial:
 
     def run(
         self,
-        cases: Sequence[Case],
+        cases: Sequence[Identified],
         on_progress: Callable[[float], None] = lambda _: None,
         seconds: float = math.inf,
     ) -> dict[str, Document]:
@@ -96,7 +130,7 @@ class Trial:
                 on_progress(number / len(cases))
         return {case.id: done[case.id] for case in cases if case.id in done}
 
-    def _answered(self, cases: Sequence[Case], until: float) -> Iterator[Document]:
+    def _answered(self, cases: Sequence[Identified], until: float) -> Iterator[Document]:
         work = partial(_answer, trial=self)
         begun = itertools.takewhile(lambda _: time.monotonic() < until, cases)
         return map(work, begun) if self.jobs == 1 else outcomes_on_cores(work, begun, self.jobs)
@@ -117,23 +151,30 @@ class Trial:
             raise InputError(f"{path}: holds a trial of {found}, not {header}; give another folder or the same seed")
 
 
-def _answer(case: Case, trial: Trial) -> Document:
+def _answer(case: Identified, trial: Trial) -> Document:
     """Record a case, seal its truth, and ask."""
     bags = trial.folder / "bags" / case.id
     shutil.rmtree(bags, ignore_errors=True)  # half written when the trial was stopped
     try:
-        recorded = record(case, trial.seed, bags)
+        recorded = trial.recorder(case, trial.seed, bags)
     except NotDrawnError as error:
+        shutil.rmtree(bags, ignore_errors=True)
         return {"id": case.id, "document": {"verdict": "not_drawn", "message": str(error)}, "cpu_s": 0.0}
-    drawn = recorded.drawn
-    seal(drawn.truth, trial.sealed)
-    began = time.process_time()
-    document = _asked(trial.answerer, recorded.bags, Parameters(mounting_rpy=drawn.scene.vehicle.mounting_rpy))
-    seconds = time.process_time() - began
+    seal(recorded.truth, trial.sealed)
+    answer = {"id": case.id, **_of(trial.answerer, recorded)}
+    if trial.beside:
+        answer["beside"] = {name: _of(answerer, recorded) for name, answerer in trial.beside.items()}
     if not trial.keep_bags:
         shutil.rmtree(bags)
-    left_mps = Yardstick(drawn.scene).error_mps(drawn.faults, said(document))
-    return {"id": case.id, "document": document, "cpu_s": round(seconds, 2), "left_mps": left_mps}
+    return answer
+
+
+def _of(answerer: Answerer, recorded: Recording) -> Document:
+    """What one says, CPU s that it took, and the error that it leaves."""
+    began = time.process_time()
+    document = _asked(answerer, recorded.bags, Parameters(mounting_rpy=recorded.mounting_rpy))
+    seconds = time.process_time() - began
+    return {"document": document, "cpu_s": round(seconds, 2), "left_mps": recorded.left_mps(said(document))}
 
 
 def said(document: Document) -> Faults:
