@@ -14,8 +14,9 @@ from scipy import stats
 
 from dvl_calib_ros.calibration.parameters import Parameters
 
-from .forward import CLOCKS, COLUMNS, LINEAR, N_PARTS, Clock, Floats, Forward, read_streams
+from .forward import CLOCKS, COLUMNS, LINEAR, N_PARTS, Clock, Forward
 from .search import ALWAYS, Fitted, Search, Whitening, residual_of_all, sizes_of, solved, step_of
+from .streams import Floats, read_streams
 
 Document = dict[str, Any]
 

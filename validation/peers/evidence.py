@@ -20,9 +20,10 @@ from scipy.linalg import cho_factor, cho_solve
 from dvl_calib_ros.calibration.parameters import Parameters
 
 from .answers import EXPECTED, Document, Found, answer, is_seeing, named, parameters_from, searched, times_of
-from .forward import CLOCKS, COLUMNS, EFFECTS, N_PARTS, Floats
+from .forward import CLOCKS, COLUMNS, EFFECTS, N_PARTS
 from .needed import needed
 from .search import Fitted, Search, residual_of_all
+from .streams import Floats
 
 # Chance before anything was seen of none, one and two effects, and of something that is no effect
 PRIOR = (0.5, 0.35, 0.15)

@@ -15,8 +15,9 @@ import numpy as np
 from dvl_calib_ros.calibration.parameters import Parameters
 
 from .answers import slope
-from .forward import CLOCKS, COLUMNS, LINEAR, N_CALIBRATION, Clock, Floats, Forward, read_streams
+from .forward import CLOCKS, COLUMNS, LINEAR, N_CALIBRATION, Clock, Forward
 from .search import OFFSETS, Fitted, Search, Whitening, residual_of_all, solved
+from .streams import Floats, read_streams
 
 WORTH_A_SHIFT = 0.8
 SLOPED = tuple(name for name in CLOCKS if name != "time_offset_jump")

@@ -24,9 +24,9 @@ from .forward import (
     N_PARTS,
     PLACES,
     Clock,
-    Floats,
     Forward,
 )
+from .streams import Floats
 
 OFFSETS = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 0.01, 0.25)
 GRIDS: dict[str, Floats] = {
@@ -278,13 +278,10 @@ class Search:
             flat = white.reshape(-1, white.shape[2])
             solution, covariance, chi2 = solved(flat[:, :-1], flat[:, -1])
             values = solution
-        sizes = [clock.size(name) for name in clocks]
         names = [f"{each.name}.{p}" for each in members for p in LINEAR.get(each.name, ())]
         names = [*COLUMNS[:N_CALIBRATION], *names, *(f"{name}.{CLOCKS[name]}" for name in clocks)]
         assert values is not None
-        values[len(values) - len(clocks) :] += 0.0
-        moved = Fitted(members, clock, chi2, self.n, values, covariance, tuple(names))
-        return replace(moved, values=values) if not sizes else moved
+        return Fitted(members, clock, chi2, self.n, values, covariance, tuple(names))
 
 
 def step_of(name: str) -> float:

@@ -20,9 +20,10 @@ from validation.peers import needed as libraries
 from validation.peers.asked import PEERS, ask, peers
 from validation.peers.command import generator_cases
 from validation.peers.foreign import foreign_cases, has_physics, record_foreign
-from validation.peers.forward import CLOCKS, LINEAR, Clock, Forward, read_streams
+from validation.peers.forward import CLOCKS, LINEAR, Clock, Forward
 from validation.peers.scores import is_right, sides, tables
 from validation.peers.search import Fitted, Member, Search, Whitening, residual_of_all, sizes_of
+from validation.peers.streams import read_streams
 from validation.trial.generator import record
 from validation.trial.plan import Case, Family
 from validation.trial.run import Trial
