@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from command_line import fail
 from conftest import ROOT
-from position_fixtures import USBL, Noise, Truth, driven, write_positions
+from position_fixtures import USBL, write_positions
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -26,6 +26,7 @@ from dvl_calib_ros.messages.opening import open_bags
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay
+from validation.positions import Noise, Truth, driven
 
 TRUTH = Truth((0.0, 0.01, 0.03), 0.006, (0.5, 0.0, -0.3), 0.5)
 TOPICS = Topics(gnss=USBL)

@@ -15,7 +15,7 @@ from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, 
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
 from nav_msgs.msg import Odometry
-from position_fixtures import Truth, driven, write_positions
+from position_fixtures import write_positions
 from rclpy.parameter import Parameter
 from ros import refused_at_start, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
@@ -33,6 +33,7 @@ from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
 from dvl_calib_ros.replay.replay import replay
+from validation.positions import Truth, driven
 
 
 @pytest.mark.parametrize(
