@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import examples, performance, sea, trials
+from . import examples, performance, positions, sea, trials
 from .registry import MEASUREMENTS
 
-__all__ = ["MEASUREMENTS", "examples", "performance", "sea", "trials"]
+__all__ = ["MEASUREMENTS", "examples", "performance", "positions", "sea", "trials"]
