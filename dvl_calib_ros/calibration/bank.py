@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -21,9 +20,10 @@ import numpy as np
 from . import kalman
 from .assembly import Assembler
 from .block_scatter import BlockScatter
+from .block_terms import BlockTerms, upwards
 from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .frames import Array
-from .heading_states import upwards
+from .heading_states import prior_std
 from .heave import HeaveRows, HeaveSums, with_heave
 from .height import HeightOfLate
 from .history import Counts, Standing
@@ -100,12 +100,10 @@ class Group:
         self._of_day = models[0].of_day
         still = self._assembler.process_rate is None
         # the paper's models are as they are published
-        deviates = self.needs is Needs.REFERENCE and models[0].in_correction_parameters
-        self._up = upwards(parameters.rotation_dvl_from_body, models[0].n_state) * deviates
-        self._scatter_of = partial(
-            BlockScatter, seconds=BLOCK_S, up=self._up, heading_std=parameters.heading_deviation_std
-        )
-        self._scatter = self._scatter_of(self._x, self._p) if still else None
+        self._deviates = self.needs is Needs.REFERENCE and models[0].in_correction_parameters
+        self._up = upwards(parameters.rotation_dvl_from_body, models[0].n_state)
+        self._n_errors = models[0].n_errors
+        self._scatter = self._new_scatter() if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
         self._height = HeightOfLate() if models[0].uses_height else None
         self._states: dict[str, GaussianState] = {}
@@ -118,6 +116,12 @@ class Group:
         self._gated = np.zeros(k, dtype=np.int64)
         self._nis_sum, self._rows_sum = np.zeros(k), np.zeros(k)
         self._restarted = np.zeros(k, dtype=np.int64)
+
+    def _new_scatter(self) -> BlockScatter:
+        """Blocks of time from now on."""
+        terms = BlockTerms(self._up, self._n_errors) if self._deviates else None
+        std = prior_std(self._parameters.heading_deviation_std, self._parameters.dvl_bias_std)
+        return BlockScatter(self._x, self._p, BLOCK_S, terms, std)
 
     def update(
         self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
@@ -133,7 +137,7 @@ class Group:
         process = self._process_noise(stamps_ns)
         cuts = np.zeros(0, dtype=np.intp)
         if self._scatter is not None:
-            cuts = self._scatter.cuts(stamps_ns, seen.earth_in_body)
+            cuts = self._scatter.cuts(stamps_ns, seen.earth_in_body, seen.velocity_dvl, seen.off)
         every, shown = _joined_ends(cuts, ends), _joined_ends(cuts[-1:], ends)
         if self._heave is None:
             after = self._after(data, process, every)
@@ -177,7 +181,7 @@ class Group:
             try:
                 self._scatter.end_day(before, after, self._of_day, self._now())
             except np.linalg.LinAlgError:  # numbers that ran away: it looks at the new day alone
-                self._scatter = self._scatter_of(*after)
+                self._scatter = self._new_scatter()
         if self._folds is not None:
             with suppress(np.linalg.LinAlgError):
                 self._folds.end_day(self._assembler.prior, self._of_day)
@@ -300,6 +304,13 @@ class Group:
             state = self._sound_state(name, found.shift[0], found.more[0]) if found.more.any() else self.state(name)
             self._of_recording[name] = state.raised(found.inflation).turned(self._up, found.drifted)
         return self._of_recording[name]
+
+    def of_bias(self, name: str) -> Array:
+        """(n, n) of `of_recording`'s covariance, what a bias of the DVL makes of it, by one model."""
+        if self._scatter is None:
+            return np.zeros_like(self._p[0])
+        found = self._scatter.found(self.index[name])
+        return GaussianState(found.shift[0], found.of_bias[0]).raised(found.inflation).p
 
     def heading_deviation(self, name: str) -> GaussianState | None:
         """Coefficients of how the heading deviates, as of `HeadingStates`, by one model; None where it has none."""

@@ -1,13 +1,15 @@
-"""Blocks of time of filters that go on sample by sample, and what they say: σ, and how the heading deviates."""
+"""Blocks of time of filters that go on sample by sample, and what they say: σ, heading and bias."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 
 import numpy as np
 
+from .block_terms import BlockTerms, MeanBias, TermsOfBlock, all_told, with_terms
 from .frames import Array
-from .heading_states import BlockTerms, HeadingEvidence, HeadingStates, all_told, heading_states, with_terms
+from .heading_states import HeadingEvidence, HeadingStates, heading_states
 from .kalman import GaussianState
 from .samples import Index, Stamps
 from .time_blocks import TimeBlocks
@@ -22,27 +24,28 @@ class BlockScatter:
     last block, so it depends on stamps alone.
     """
 
-    def __init__(self, x: Array, p: Array, seconds: float, up: Array, heading_std: float) -> None:
+    def __init__(self, x: Array, p: Array, seconds: float, terms: BlockTerms | None, std: Array) -> None:
         """Start from states x (K, n), P (K, n, n).
 
-        seconds: length of a block. up: (n,) as `heading_states.upwards`, zeros for filters without a reference.
+        seconds: length of a block. terms: None for filters that heading and bias are not looked for by. std: (8,) of
+        `heading_states.prior_std`.
         """
         self._blocks = TimeBlocks()
         self._length_ns = round(seconds * 1e9)
-        self._up, self._heading_std = up, heading_std
-        self._terms = BlockTerms() if up.any() and heading_std > 0.0 else None
+        self._terms, self._std = terms, std
+        self._mean = MeanBias(x.shape[-1])
         self._last: int | None = None
         self._state = GaussianState(x, p)
         self._told = self._state.information
         self._found: dict[int, HeadingStates] = {}
 
-    def cuts(self, stamps_ns: Stamps, earth_in_body: Array | None) -> Index:
-        """Take N samples (N,), of references as of `Observations.earth_in_body`.
+    def cuts(self, stamps_ns: Stamps, earth_in_body: Array | None, velocity_dvl: Array, off: Array) -> Index:
+        """Take N samples (N,) as of `BlockTerms.add`.
 
         Returns numbers (E,) of those after which a new block begins.
         """
         if self._terms is not None:
-            self._terms.add(stamps_ns, earth_in_body)
+            self._terms.add(stamps_ns, earth_in_body, velocity_dvl, off)
         first, last = int(stamps_ns[0]) // self._length_ns, int(stamps_ns[-1]) // self._length_ns
         if first == last == (first if self._last is None else self._last):  # as nearly always live
             self._last = last
@@ -57,15 +60,17 @@ class BlockScatter:
 
         last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by.
         """
-        terms = [None] * len(cuts) if self._terms is None else self._terms.upto(cuts)
+        terms: Sequence[TermsOfBlock | None] = [None] * len(cuts) if self._terms is None else self._terms.upto(cuts)
         self._add(terms, x, p, last)
 
-    def _add(self, terms: Iterable[Array | None], x: Array, p: Array, last: GaussianState) -> None:
+    def _add(self, terms: Iterable[TermsOfBlock | None], x: Array, p: Array, last: GaussianState) -> None:
         for own, now in zip(terms, _informations(x, p), strict=True):
             if now is None:
                 continue
             told = now[0] - self._told[0], now[1] - self._told[1]
-            information, vector = told if own is None else with_terms(*told, own, self._up)
+            if own is not None:
+                self._mean.add(own.of_states)
+            information, vector = told if own is None else with_terms(*told, own)
             self._blocks.add(information, vector, 1.0)
             self._told = now
         self._state = last
@@ -85,9 +90,14 @@ class BlockScatter:
         """What blocks say of one filter: by how much σ has to grow, and what is to be added for the deviation."""
         if index not in self._found:
             of_one = GaussianState(*(each[index : index + 1] for each in self._state))
-            self._found[index] = heading_states(
-                [HeadingEvidence.of(self._blocks, of_one, np.array([index]), 0)], self._heading_std
-            )[0]
+            beside = None
+            if self._terms is not None:
+                rows = (each[index : index + 1] for each in self._told)
+                with suppress(np.linalg.LinAlgError):  # numbers that ran away
+                    more = (all_of - own for all_of, own in zip(of_one.information, rows, strict=True))
+                    beside = self._mean.told(*more)
+            seen = HeadingEvidence.of(self._blocks, of_one, np.array([index]), 0, beside)
+            self._found[index] = heading_states([seen], self._std)[0]
         return self._found[index]
 
 

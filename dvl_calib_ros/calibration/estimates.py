@@ -55,6 +55,7 @@ class Estimates:
             recording_covariance=covariance,
             filter_covariance=estimator.filter_covariance,
             left_open=estimator.left_open + self._by_clock(name),
+            of_bias=estimator.of_bias,
             used=used,
             gated=gated,
             mean_nis=mean_nis,
@@ -102,7 +103,9 @@ class Estimates:
         if estimator is None or not estimator.claims or any(self.parameters.lever_arm):
             return found
         other = estimator.of_recording()
-        own, open_arm = np.diag(covariance)[:3], np.diag(other.p)[:3]
+        # a bias of the DVL is there with an arm as without
+        own = np.diag(covariance - self.estimators[name].of_bias)[:3]
+        open_arm = np.diag(other.p - estimator.of_bias)[:3]
         by_arm = open_arm - own
         away = (state - other.x[: len(state)])[:3] ** 2
         is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.maximum(by_arm, 0.0))

@@ -119,6 +119,12 @@ class Estimator(ABC):
         return np.zeros((n, n))
 
     @property
+    def of_bias(self) -> Array:
+        """(n, n) of `of_recording`'s covariance, what a bias of the DVL makes of it."""
+        n = len(self.state().x)
+        return np.zeros((n, n))
+
+    @property
     def registration(self) -> Registration | None:
         """How the instruments stand, by their data alone; None for one that does not look."""
         return None
@@ -256,6 +262,12 @@ class LinearEstimator(Estimator):
         """As `Estimator`."""
         self._update(self._group)
         return self._group.of_recording(self._model.name)
+
+    @property
+    def of_bias(self) -> Array:
+        """As `Estimator`."""
+        self._update(self._group)
+        return self._group.of_bias(self._model.name)
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
         """As `Estimator`."""

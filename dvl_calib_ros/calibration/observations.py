@@ -113,6 +113,13 @@ class Observations:
         return self.velocity_at_reference @ self.rotation_dvl_from_body
 
     @cached_property
+    def off(self) -> Array:
+        """Reference less measured velocity (N, 3) m/s, DVL frame; zeros without a reference."""
+        if self.reference_body is None:
+            return np.zeros_like(self.velocity_dvl)
+        return self.reference.r - self.velocity_dvl
+
+    @cached_property
     def rising(self) -> Array:
         """Measured vertical velocity (N,) m/s, positive up, of a block with attitude."""
         assert self.rotation_enu_from_body is not None

@@ -381,6 +381,15 @@ class Parameters:
         low=0.0,
         high=0.5,
     )
+    dvl_bias_std: float = _parameter(
+        0.0,
+        "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (G1, G2). At one "
+        "speed σ of roll, pitch, yaw and scale includes it; several speeds show its size. 0: the DVL has none. 0.01 "
+        "holds the worst that is known, and makes scale and yaw of several minutes two to four times less certain.",
+        unit="m/s",
+        low=0.0,
+        high=1.0,
+    )
     day_std_heading: float = _parameter(
         math.radians(0.1),
         "Constant error of the heading reference on one day: included in the σ of yaw, which is that of the next "

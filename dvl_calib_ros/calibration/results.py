@@ -27,7 +27,8 @@ class Estimate:
     state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n), of the next
     recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
     more than the filter claims. filter_covariance: (n, n), what the filter alone claims. left_open: (n, n), the part of
-    both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm.
+    both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm. of_bias:
+    (n, n), the part of both that a bias of the DVL makes: of the mounting, not of velocities at the speeds driven.
     used, gated: samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent
     filter. heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw
     and of twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
@@ -39,6 +40,7 @@ class Estimate:
     recording_covariance: Array
     filter_covariance: Array
     left_open: Array
+    of_bias: Array
     used: int
     gated: int
     mean_nis: float
@@ -61,6 +63,11 @@ class Estimate:
     def recording_std(self) -> Array:
         """Standard deviations (n,) of this recording."""
         return np.sqrt(np.diag(self.recording_covariance))
+
+    @property
+    def velocity_covariance(self) -> Array:
+        """(n, n) of this recording, for what velocities are worth that it corrects, at the speeds driven."""
+        return self.recording_covariance - self.of_bias
 
     @property
     def filter_std(self) -> Array:

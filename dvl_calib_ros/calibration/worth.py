@@ -100,7 +100,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     """
     model = MODELS[estimate.model]
     target, rows = parameters.target_drift, _rows(model, parameters)
-    now = predicted_drift(model, estimate.recording_covariance, parameters)
+    now = predicted_drift(model, estimate.velocity_covariance, parameters)
     if now.both <= target:
         return Outlook(is_good_enough(model), None)
     if not estimate.used or motion.speed < parameters.min_speed or motion.speed <= 0.0:
@@ -113,7 +113,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
         for reason, course in _manoeuvres(motion).values()
     ]
     gains = np.array([gain for _, gain in tried])
-    information = np.linalg.pinv(estimate.recording_covariance)
+    information = np.linalg.pinv(estimate.velocity_covariance)
     chosen, seconds = None, 0.0
     for _ in range(MOST):
         left = np.linalg.inv(information + gains)

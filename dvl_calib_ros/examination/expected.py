@@ -66,7 +66,7 @@ def expected(
 def _shown(found: Quantity, estimate: Estimate, parameters: Parameters, share: float) -> Shown:
     """By a calibration with a share of the recording; what is the same however much there is stays as it is."""
     model = MODELS[estimate.model]
-    stays = estimate.covariance - estimate.recording_covariance + estimate.left_open
+    stays = estimate.covariance - estimate.velocity_covariance + estimate.left_open
     if found.name == "scale":
         unit, prior, fine = 100.0, parameters.initial_std_scale, parameters.fine_std_scale
         floor = float(scale_std_ahead(model, stays, parameters)[0])

@@ -138,7 +138,7 @@ class Card:
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
                 self._driven_s[SECTORS[sector]] += now_s - (self._received[-2][0] if len(self._received) > 1 else now_s)
         target, worth = parameters.target_drift, self._worth
-        now = predicted_drift(model, estimate.recording_covariance, parameters)
+        now = predicted_drift(model, estimate.velocity_covariance, parameters)
         drift = worth.look(model.name, now, target, now_s, rejected)
         if rejected:
             found = Outlook(finding("NEXT_REJECTED"), None)

@@ -18,10 +18,11 @@ from functools import reduce
 
 import numpy as np
 
+from ..block_terms import MeanBias, all_told, block_terms, upwards, with_terms
 from ..correction_parameters import PriorOnErrors, to_correction
 from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
 from ..frames import Array, product
-from ..heading_states import HeadingEvidence, all_told, heading_states, heading_terms, upwards, with_terms
+from ..heading_states import HeadingEvidence, heading_states, prior_std
 from ..heave import HeaveRows, HeaveSums, with_heave
 from ..kalman import GaussianState
 from ..parameters import Parameters
@@ -29,7 +30,7 @@ from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
 from .known import After, BlockRows, DayState, Ended, Hypotheses, Known, Likely, Posterior, Sums, Told, parts
-from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_STATE, OF_DAY, STEP_S, STEPS, DelayedRows
+from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_ERRORS, N_STATE, OF_DAY, STEP_S, STEPS, DelayedRows
 from .told import innovation_squared, told_by
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
@@ -84,6 +85,8 @@ class DelayBank:
         self._nis_sum = 0.0
         self.blocks = TimeBlocks()
         self._up = upwards(parameters.rotation_dvl_from_body, N_STATE)
+        self._mean_bias = MeanBias(N_STATE)
+        self._std_beside = prior_std(parameters.heading_deviation_std, parameters.dvl_bias_std)
         self._epoch_ns: int | None = None  # of the first row
         self._folds = FoldInformation(self._start) if verified else None
 
@@ -214,8 +217,10 @@ class DelayBank:
             if self._epoch_ns is None:
                 self._epoch_ns = int(stamps_ns[0])
             seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
-            terms = heading_terms(rows.motion.earth, weight, seconds)
-            self.blocks.add(*with_terms(*told.parts[:2], terms, self._up), told.weight)
+            velocity, off = rows.motion.velocities(rows.body_from_dvl)
+            terms = block_terms(rows.motion.earth, velocity, off, weight, seconds, self._up, N_ERRORS)
+            self._mean_bias.add(terms.of_states.mean(axis=0))
+            self.blocks.add(*with_terms(*told.parts[:2], terms), told.weight)
             if self._folds is not None:
                 for fold, of_fold in told.by_fold:
                     self._folds.add_told(fold, of_fold)
@@ -395,8 +400,16 @@ class DelayBank:
         kept, share = _likely(log_share)
         likely = GaussianState(found.x[kept], found.p[kept])
         place = int(np.searchsorted(kept, best))
-        seen = None if self._process_rate is not None else HeadingEvidence.of(self.blocks, likely, kept, place)
+        seen = None if self._process_rate is not None else self._seen(found, likely, kept, place)
         return Known(likely, kept, share, best, found.information[best], self._regressor_noise, seen)
+
+    def _seen(self, found: Hypotheses, states: GaussianState, numbers: Index, best: int) -> HeadingEvidence:
+        """By blocks of time and by heave, of some hypotheses (M,)."""
+        heave = (
+            found.information[numbers] - self._sums.information[numbers],
+            found.vector[numbers] - self._sums.vector[numbers],
+        )
+        return HeadingEvidence.of(self.blocks, states, numbers, best, self._mean_bias.told(*heave))
 
     def found(self, known: Sequence[Known]) -> list[Likely | None]:
         """What was known at times of this day, with what that makes of the heading; None where numbers ran away."""
@@ -409,7 +422,7 @@ class DelayBank:
 
     def _found(self, known: Sequence[Known]) -> Iterator[Likely]:
         seen = [each.seen for each in known if each.seen is not None]
-        deviations = heading_states(seen, self._parameters.heading_deviation_std)
+        deviations = heading_states(seen, self._std_beside)
         inflations: Array = np.ones((len(known), N_STATE))
         if deviations:
             inflations = np.stack([each.inflation for each in deviations])
@@ -418,11 +431,12 @@ class DelayBank:
         )
         shown = self._shown([each.best for each in known], information, noise, inflations)
         for number, each in enumerate(known):
-            likely, heading, drifted = each.likely, None, 0.0
+            likely, heading, of_bias, drifted = each.likely, None, np.zeros((N_STATE, N_STATE)), 0.0
             if deviations:
-                _, shift, more, drifted, _ = deviations[number]
-                likely, heading = GaussianState(likely.x + shift, likely.p + more), deviations[number].coefficients
-            yield Likely(likely, each.kept, each.share, shown[number], inflations[number], heading, drifted)
+                heading, shift, more, of_each, drifted, _ = deviations[number]
+                likely = GaussianState(likely.x + shift, likely.p + more)
+                of_bias = np.tensordot(each.share, of_each, axes=1)
+            yield Likely(likely, each.kept, each.share, shown[number], inflations[number], heading, of_bias, drifted)
 
     def posteriors(self, found: Sequence[Likely]) -> list[Posterior]:
         """The mixture of all hypotheses, as it was found on this day each time.
@@ -446,14 +460,15 @@ class DelayBank:
     def _posterior(self, found: Likely, errors: GaussianState) -> Posterior:
         state = _one(errors, self.delays_s[found.kept], found.share)
         raised = state.raised(found.inflation).turned(self._up, found.drifted)
-        p = state.p
+        p = state.p - found.of_bias  # which is there with a lever arm as without
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
         by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)
         rest = np.maximum(np.diag(p)[:3] - by_lever_arm, 1e-12)
         turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
         claimed = with_states_of(raised, self.prior, _without(found.shown, _BEYOND))
-        return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest, found.heading)
+        of_bias = GaussianState(state.x, found.of_bias).raised(found.inflation).p
+        return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest, found.heading, of_bias)
 
     def days(self) -> list[DayState]:
         """What the states were on every day but this one, by all data so far, σ raised as it was at the day's end."""
@@ -523,8 +538,8 @@ class DelayBank:
         if self._process_rate is not None:
             return np.ones(N_STATE)
         of_one = np.array([best])
-        seen = HeadingEvidence.of(self.blocks, GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
-        return heading_states([seen], self._parameters.heading_deviation_std)[0].inflation
+        seen = self._seen(found, GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
+        return heading_states([seen], self._std_beside)[0].inflation
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """All hypotheses as one, in the errors."""

@@ -36,7 +36,7 @@ from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .clocks import Rest
 from .hold_out import Terms, ThinnedBlock, ThinnedRecording, held_out_error
 from .known import DayState, Posterior
-from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_STATE
+from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_G1, N_STATE
 from .solver import BlockSolver, Outcome
 from .workers import AtOnce, Solved
 
@@ -187,6 +187,16 @@ class DelayFilter(Estimator):
         """In a result by all data, else as clocks were looked at on the way."""
         told = self._told
         return self._solver.registration() if self._is_settled else told.looked.registration
+
+    @property
+    def of_bias(self) -> Array:
+        """As `Estimator`."""
+        posterior = self.posterior
+        if posterior is not None and self.claims:
+            return posterior.of_bias
+        found = np.zeros((N_STATE, N_STATE))
+        found[:N_G1, :N_G1] = self._base.of_bias
+        return found
 
     @property
     def left_open(self) -> Array:

@@ -41,7 +41,7 @@ LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
 MOST_REACH_S = 3.4
 # How far beyond a block of references the other streams have to be known.
 MARGIN_S = 7.0
-N_G1, N_STATE = 8, 12
+N_ERRORS, N_G1, N_STATE = 5, 8, 12
 LEVER_ARM, DELAY = slice(8, 11), 11
 BEYOND = slice(N_G1, N_STATE)  # what G1 has not
 # What rows say of the DVL's errors and of the delay is another thing for every delay; of the reference's constant error
@@ -180,6 +180,12 @@ class MotionAtReferences(NamedTuple):
     turning: Array
     lever: Array | None
     earth: Array
+
+    def velocities(self, body_from_dvl: Array) -> tuple[Array, Array]:
+        """Of the DVL, and of the reference less that, (K, J, 3) m/s in the DVL's frame."""
+        velocity = self.velocity.transpose(1, 2, 0)
+        beside = self.body if self.lever is None else self.body + self.lever
+        return velocity, beside @ body_from_dvl - velocity
 
     def part(self, at: Mask | slice) -> MotionAtReferences:
         """Of some references."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..frames import Array, rotation_from_quaternion
-from ..heading_states import N_COEFFICIENTS
+from ..heading_states import N_HEADING
 from ..samples import Index, Stamps
 
 # No vehicle is so far from where it began, m.
@@ -75,7 +75,7 @@ class Legs(NamedTuple):
 
 
 # Columns of what is summed up: way, and what a deviation of the heading turns it by.
-N_SUMS = 27 + 3 * N_COEFFICIENTS
+N_SUMS = 27 + 3 * N_HEADING
 _WAY, _DRIFTED = slice(0, 27), slice(27, N_SUMS)
 
 
@@ -161,7 +161,7 @@ class DeadReckoning:
         terms = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), seconds])
         turned = np.column_stack([-north, east, np.zeros(n)])
         return np.concatenate(
-            [way.reshape(n, 27), (turned[:, :, None] * terms[:, None, :]).reshape(n, 3 * N_COEFFICIENTS)], axis=1
+            [way.reshape(n, 27), (turned[:, :, None] * terms[:, None, :]).reshape(n, 3 * N_HEADING)], axis=1
         )
 
     def legs(self) -> Legs:
@@ -198,12 +198,12 @@ class DeadReckoning:
         rotation = rotation_from_quaternion(quaternion[near])
         rate = (rates[after - 1] + share * (rates[after] - rates[after - 1]))[:, _WAY].reshape(n, 3, 3, 3)
         velocity = np.einsum("nabc,bc->na", rate, self._body_from_dvl)
-        way, drifted = found[:, _WAY].reshape(n, 3, 3, 3), found[:, _DRIFTED].reshape(n, 3, N_COEFFICIENTS)
+        way, drifted = found[:, _WAY].reshape(n, 3, 3, 3), found[:, _DRIFTED].reshape(n, 3, N_HEADING)
         self._done.append(Legs(at_s, stretch[after], way, drifted, rotation, velocity, fixes.position, fixes.variance))
 
 
 def _no_legs() -> Legs:
     nothing = np.zeros((0, 3))
-    turned = np.zeros((0, 3, N_COEFFICIENTS))
+    turned = np.zeros((0, 3, N_HEADING))
     none = np.zeros(0, dtype=np.intp)
     return Legs(np.zeros(0), none, np.zeros((0, 3, 3, 3)), turned, np.zeros((0, 3, 3)), nothing, nothing, nothing)

@@ -16,6 +16,7 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.time_blocks import TimeBlocks
+from dvl_calib_ros.calibration.worth import predicted_drift
 from dvl_calib_ros.files.result_file import result_document
 
 # σ of the recording itself, with an exact heading: what another day or a compass makes of it is no matter of noise
@@ -144,6 +145,20 @@ def test_a_reference_worse_than_its_prior_is_in_sigma_where_headings_hardly_show
     samples = level_course(offset, False, wander=0.03)
     estimate = calibrate(samples, CLAIMED, models=("G1",)).estimate("G1")
     assert abs(estimate.state[2]) < 3.0 * estimate.std[2] and abs(estimate.state[3]) < 3.0 * estimate.std[3]
+
+
+def test_at_one_speed_a_bias_of_the_dvl_is_in_sigma_of_the_angles_where_it_is_expected_and_not_in_the_drift():
+    """2 cm/s across 1.5 m/s are 0.76 degrees, to drive with at 1.5 m/s as good as none."""
+    samples = [
+        each._replace(velocity=tuple(np.add(each.velocity, (0.0, 0.02, 0.0)))) if isinstance(each, DvlSample) else each
+        for each in level_course((0.0, 0.0), True)
+    ]
+    expected = CLAIMED.replace(dvl_bias_std=0.01)
+    exact, estimate = (calibrate(samples, each, models=("G1",)).estimate("G1") for each in (CLAIMED, expected))
+    assert abs(exact.state[2]) > 5.0 * exact.std[2] and not exact.of_bias.any()
+    assert abs(estimate.state[2]) < 3.0 * estimate.std[2] < np.radians(1.2)
+    drifts = [predicted_drift(MODELS["G1"], each.velocity_covariance, CLAIMED).side for each in (exact, estimate)]
+    assert drifts[1] == pytest.approx(drifts[0], rel=0.2)
 
 
 def test_on_one_heading_it_is_said_what_a_constant_error_would_be():

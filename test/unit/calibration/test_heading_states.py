@@ -1,4 +1,5 @@
-"""States of the heading's deviation: as a fit with columns of their own, and σ of yaw holds what they leave."""
+"""States of the heading's deviation and of the DVL's bias: as a fit with columns of their own, and σ holds what they
+leave."""
 
 from __future__ import annotations
 
@@ -8,19 +9,17 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration import heading_states as module
-from dvl_calib_ros.calibration.heading_states import (
-    BlockTerms,
-    HeadingEvidence,
-    heading_states,
-    heading_terms,
-    with_terms,
-)
+from dvl_calib_ros.calibration.block_terms import N_BIAS, BlockTerms, MeanBias, TermsOfBlock, block_terms, with_terms
+from dvl_calib_ros.calibration.frames import skew
+from dvl_calib_ros.calibration.heading_states import HeadingEvidence, heading_states, prior_std
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.time_blocks import TimeBlocks
 
 N, ROWS, STD, PRIOR = 4, 30, math.radians(0.5), math.radians(5.0)
 UP = np.array([0.0, 0.0, 1.0, 0.0])
 DRIFT_S = 10.0
+EXACT = prior_std(STD, 0.0)  # of a DVL without a bias
+BIAS = 0.01
 
 
 def earth_in_body(yaw):
@@ -36,6 +35,13 @@ def columns(yaw, seconds, span, centre):
     )
 
 
+def heading_only(yaw, seconds):
+    """TermsOfBlock of a block on one heading, of which no bias is told."""
+    return block_terms(
+        earth_in_body(np.full(ROWS, yaw)), np.zeros((ROWS, 3)), np.zeros((ROWS, 3)), np.ones(ROWS), seconds, UP, N
+    )
+
+
 def blocks_of(headings, rng, truth, noise=1.0, speed=100.0, lasting=0.0):
     """Blocks of rows z = H x + noise, and the same rows with columns of their own: H (R, N), z (R,), (R,) of which.
 
@@ -48,8 +54,8 @@ def blocks_of(headings, rng, truth, noise=1.0, speed=100.0, lasting=0.0):
         h[:, 2] = speed  # so that all blocks tell as much of yaw
         turned = columns(yaw, DRIFT_S * b, span, centre) @ truth
         z = h @ UP * turned + rng.normal(0.0, noise, ROWS) + rng.normal(0.0, lasting)
-        terms = heading_terms(earth_in_body(np.full(ROWS, yaw)), np.ones(ROWS), DRIFT_S * b)
-        blocks.add(*with_terms((h.T @ h)[None], (h.T @ z)[None], terms, UP), ROWS)
+        terms = heading_only(yaw, DRIFT_S * b)
+        blocks.add(*with_terms((h.T @ h)[None], (h.T @ z)[None], terms), ROWS)
         all_h.append(h)
         all_z.append(z)
         number += [b] * ROWS
@@ -67,12 +73,12 @@ def test_it_equals_least_squares_with_columns_of_its_own(rng, monkeypatch):
     monkeypatch.setattr(module, "_LOG_LIKELY", np.zeros(1))
     headings = rng.uniform(-math.pi, math.pi, 7)  # too few for σ to be raised
     blocks, h, z, number = blocks_of(headings, rng, np.radians([1.0, -0.5, 0.2, 0.1, 0.3]))
-    found = heading_states([HeadingEvidence.of(blocks, without_deviation(h, z), np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(blocks, without_deviation(h, z), np.zeros(1, dtype=int), 0)], EXACT)[0]
     span, informed = DRIFT_S * 6.0, np.bincount(number, (h @ UP) ** 2)
     centre = (informed @ (DRIFT_S * np.arange(7))) / informed.sum()
     own = np.array([columns(headings[b], DRIFT_S * b, span, centre) for b in number])
     wide = np.hstack([h, (h @ UP)[:, None] * own])
-    std = np.concatenate([np.full(N, PRIOR), STD * module._SHARE])
+    std = np.concatenate([np.full(N, PRIOR), EXACT[N_BIAS:]])
     p = np.linalg.inv(wide.T @ wide + np.diag(std**-2.0))
     x = p @ (wide.T @ z)
     alone = without_deviation(h, z)
@@ -92,7 +98,7 @@ ONE = np.full(24, math.radians(10.0))
 def yaw_of(headings, rng, truth, **more):
     blocks, h, z, _ = blocks_of(headings, rng, truth, **more)
     alone = without_deviation(h, z)
-    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT)[0]
     x, p = alone.x[0] + found.shift[0], alone.p[0] + found.more[0]
     return x[2], math.hypot(math.sqrt(p[2, 2]) * found.inflation[2], math.sqrt(found.drifted)), found
 
@@ -127,24 +133,25 @@ def test_a_reference_in_the_body_says_nothing_of_the_heading_and_changes_nothing
     blocks, h, z, _ = blocks_of(BOX, rng, np.zeros(5))
     body = TimeBlocks()
     for information, vector in zip(*blocks.kept, strict=True):
-        body.add(*with_terms(information[:, :N, :N], vector[:, :N], np.zeros(module.N_TERMS), UP), ROWS)
-    found = heading_states([HeadingEvidence.of(body, without_deviation(h, z), np.zeros(1, dtype=int), 0)], STD)[0]
+        body.add(*with_terms(information[:, :N, :N], vector[:, :N], TermsOfBlock.none(UP)), ROWS)
+    found = heading_states([HeadingEvidence.of(body, without_deviation(h, z), np.zeros(1, dtype=int), 0)], EXACT)[0]
     assert not found.shift.any() and not found.more.any()
 
 
 def test_terms_of_blocks_are_the_same_however_samples_come(rng):
     yaw, stamps_ns = rng.uniform(-3.0, 3.0, 40), np.arange(40) * 10**9
-    earth = earth_in_body(yaw)
-    at_once, one_by_one = BlockTerms(), BlockTerms()
-    at_once.add(stamps_ns, earth)
+    earth, velocity = earth_in_body(yaw), rng.normal(0.0, 1.0, (40, 3))
+    at_once, one_by_one = BlockTerms(UP, N), BlockTerms(UP, N)
+    at_once.add(stamps_ns, earth, velocity, -velocity)
     expected = at_once.upto(np.array([15, 30]))
     found = []
     for n in range(40):
-        one_by_one.add(stamps_ns[n : n + 1], earth[n : n + 1])
+        one_by_one.add(stamps_ns[n : n + 1], earth[n : n + 1], velocity[n : n + 1], -velocity[n : n + 1])
         if n in (15, 30):
             found.append(one_by_one.upto(np.array([0]))[0])
-    np.testing.assert_allclose(found, expected, rtol=1e-13)
-    np.testing.assert_allclose(at_once.rest(), one_by_one.rest(), rtol=1e-13)
+    for one, other in [*zip(found, expected, strict=True), (at_once.rest(), one_by_one.rest())]:
+        np.testing.assert_allclose(one.of_states, other.of_states, rtol=1e-13)
+        np.testing.assert_allclose(one.pull, other.pull, rtol=1e-13)
 
 
 def test_a_yaw_that_its_prior_does_not_expect_is_no_deviation(rng):
@@ -153,9 +160,74 @@ def test_a_yaw_that_its_prior_does_not_expect_is_no_deviation(rng):
     blocks = TimeBlocks()
     for b in range(len(ONE)):
         own = slice(b * ROWS, (b + 1) * ROWS)
-        terms = heading_terms(earth_in_body(np.full(ROWS, ONE[b])), np.ones(ROWS), DRIFT_S * b)
-        blocks.add(*with_terms((h[own].T @ h[own])[None], (h[own].T @ z[own])[None], terms, UP), ROWS)
+        terms = heading_only(ONE[b], DRIFT_S * b)
+        blocks.add(*with_terms((h[own].T @ h[own])[None], (h[own].T @ z[own])[None], terms), ROWS)
     alone = without_deviation(h, z, math.radians(3.0))
-    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], STD)[0]
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT)[0]
     assert abs(found.shift[0, 2]) < math.radians(0.7)
     assert math.sqrt(alone.p[0, 2, 2] + found.more[0, 2, 2]) < 2.0 * STD
+
+
+def rows_at(velocity):
+    """What misalignment and scale of all axes make of a reference less the DVL's velocity (3,): (3, 4)."""
+    return np.column_stack([skew(velocity), -velocity])
+
+
+def bias_terms(velocity):
+    return block_terms(
+        np.zeros((ROWS, 3, 2)), np.tile(velocity, (ROWS, 1)), np.zeros((ROWS, 3)), np.ones(ROWS), 0.0, UP, N
+    )
+
+
+def test_a_bias_is_to_one_velocity_the_same_as_a_misalignment_and_a_scale(rng):
+    velocity = rng.normal(0.0, 1.0, 3)
+    np.testing.assert_allclose(rows_at(velocity) @ bias_terms(velocity).of_states[:, :N_BIAS], -np.eye(3), atol=1e-12)
+
+
+def biased(speeds, bias, rng, noise=0.03):
+    """x (4,) and σ (4,) of blocks at these speeds ahead (B,) m/s, with a bias (3,) m/s; and the fit without one."""
+    blocks, all_h, all_z = TimeBlocks(), [], []
+    ahead = np.array([1.0, 0.0, 0.0])
+    for speed in speeds:
+        h = np.tile(rows_at(speed * ahead), (ROWS, 1)) / noise
+        z = -np.tile(bias, ROWS) / noise + rng.normal(0.0, 1.0, 3 * ROWS)
+        blocks.add(*with_terms((h.T @ h)[None], (h.T @ z)[None], bias_terms(speed * ahead)), ROWS)
+        all_h.append(h)
+        all_z.append(z)
+    alone = without_deviation(np.concatenate(all_h), np.concatenate(all_z))
+    seen = HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)
+    found = heading_states([seen], prior_std(STD, BIAS))[0]
+    of = GaussianState(alone.x[0] + found.shift[0], alone.p[0] + found.more[0]).raised(found.inflation)
+    return of, found, alone
+
+
+def test_at_one_speed_sigma_holds_the_bias_and_two_speeds_show_it(rng):
+    bias = np.array([0.02, -0.02, 0.02])
+    one, of_one, alone = biased(np.full(24, 1.5), bias, rng)
+    assert abs(alone.x[0, 2]) > 10.0 * math.sqrt(alone.p[0, 2, 2])  # what was claimed before
+    assert abs(one.x[2]) < 3.0 * math.sqrt(one.p[2, 2]) < 3.5 * BIAS / 1.5
+    # known, it would be no matter
+    np.testing.assert_allclose(of_one.more[0], of_one.of_bias[0], rtol=1e-6, atol=1e-9)
+    two, _, _ = biased(np.tile([0.5, 2.0], 12), bias, rng)
+    assert abs(two.x[2]) < 3.0 * math.sqrt(two.p[2, 2]) < 0.8 * BIAS / 1.5
+
+
+def test_what_says_that_a_vehicle_does_not_heave_makes_no_bias_of_trim(rng):
+    speed, trim = 1.5 * np.array([1.0, 0.0, 0.0]), math.radians(4.0)
+    told, h, terms = TimeBlocks(), rows_at(speed) / 0.03, bias_terms(speed)
+    for _ in range(7):
+        told.add(*with_terms((h.T @ h)[None], np.zeros((1, N)), terms), 1.0)
+    # the vertical as of the vehicle, which moves by its trim: as another pitch
+    row, off = h[2], h[2, 1] * trim
+    heave, of_heave = np.outer(row, row)[None], (row * off)[None]
+    total = 7.0 * h.T @ h + heave[0] + np.eye(N) / PRIOR**2
+    p = np.linalg.inv(total)
+    state = GaussianState((p @ of_heave[0])[None], p[None])
+    mean = MeanBias(N)
+    mean.add(terms.of_states)
+    where = np.zeros(1, dtype=int), 0
+    shift = [
+        heading_states([HeadingEvidence.of(told, state, *where, beside)], prior_std(STD, BIAS))[0].shift[0, 1]
+        for beside in (None, mean.told(heave, of_heave))
+    ]
+    assert abs(shift[0]) > math.radians(0.1) > 20.0 * abs(shift[1])

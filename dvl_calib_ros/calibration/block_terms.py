@@ -1,0 +1,182 @@
+"""Terms of blocks of time: what changes with heading, time or velocity as no mounting does, told without a column more.
+
+A block of time told Λ_b, y_b of the states. An error δ of the heading turns a reference in an earth frame as a
+misalignment about the body's vertical u does. A bias b of the DVL is to velocities v that are nearly one another's the
+same as a misalignment v × b / |v|² and a scale v·b / |v|²: large where it is slow, small where it is fast. So what
+either does in a block is what states x = U_b d do, with d the coefficients of the terms and U_b (n, 9) of that block:
+three of the bias, six of the heading. The block tells of states and coefficients together
+
+    | Λ_b       Λ_b U_b     |   | y_b      |
+    | U_bᵀ Λ_b  U_bᵀ Λ_b U_b |   | U_bᵀ y_b |
+
+With a bias free, speeds alone say what is scale; and where they do not change, noise of the DVL's own mean of a block
+does, with as much of it in the error: it would be a scale of 1 and a bias of -v. It pulls y of the bias by
+-w n² / v, w being the information that velocities of the block are known with and n² the squares of what noise of three
+axes leaves of its mean; that is taken off.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from .frames import Array, product, skew
+from .robust import median
+from .samples import Index, Stamps
+from .time_blocks import TimeBlocks
+
+# Terms of a block: three axes of a bias of the DVL; sine and cosine of its heading and of twice that, time (s), and
+# one, where references are of the earth, else zeros.
+N_BIAS, N_TERMS = 3, 9
+# Mean square of velocities that are not zero, (m/s)²; what is so many times further off than usual is an outlier.
+LEAST, OUTLYING = 1e-12, 5.0
+
+
+def upwards(rotation_dvl_from_body: Array, n: int) -> Array:
+    """Of n states, the misalignment first, those that turn about the body's vertical: u (n,)."""
+    u = np.zeros(n)
+    u[:3] = rotation_dvl_from_body[:, 2]
+    return u
+
+
+class TermsOfBlock(NamedTuple):
+    """Of a block. of_states: U (..., n, 9). pull: (..., 3), what noise takes of y of the bias for each unit of
+    information on the yaw. up: (n,) as of `upwards`."""
+
+    of_states: Array
+    pull: Array
+    up: Array
+
+    @staticmethod
+    def none(up: Array) -> TermsOfBlock:
+        """Of a block that has none."""
+        return TermsOfBlock(np.zeros((len(up), N_TERMS)), np.zeros(N_BIAS), up)
+
+
+def block_terms(
+    earth_in_body: Array, velocity_dvl: Array, off: Array, weight: Array, seconds: float, up: Array, n_errors: int
+) -> TermsOfBlock:
+    """Those of a block of N references: `Observations.earth_in_body` (N, 3, 2); velocity of the DVL, and reference less
+    that, (..., N, 3) m/s in the DVL's frame; weight (N,), and its time (s). up: (n,) as of `upwards`. n_errors: of the
+    n, misalignment and scales.
+    """
+    # not by what is an outlier, which no filter takes
+    size = np.abs(off - median(off.swapaxes(0, -2))[..., None, :]).sum(axis=-1)
+    share = weight * (size <= OUTLYING * median(size.swapaxes(0, -1))[..., None])
+    share /= np.maximum(share.sum(axis=-1, keepdims=True), LEAST)
+    mean, off_mean = (_mean(share, each) for each in (velocity_dvl, off))
+    square = np.maximum(_mean(share, velocity_dvl * velocity_dvl).sum(axis=-1), LEAST)
+    # samples that are added and taken off in turn hold as much noise as their mean; that of the DVL is in both
+    in_turn = share * np.where(np.arange(share.shape[-1]) % 2, -1.0, 1.0)
+    moved, off_moved = velocity_dvl - mean[..., None, :], off - off_mean[..., None, :]
+    noise = -(_mean(in_turn, moved) * _mean(in_turn, off_moved)).sum(axis=-1)
+    by_square = mean / square[..., None]
+    terms = np.zeros((*mean.shape[:-1], len(up), N_TERMS))
+    terms[..., :3, :N_BIAS], terms[..., 3:n_errors, :N_BIAS] = skew(by_square), by_square[..., None, :]
+    terms[..., N_BIAS:] = np.outer(up, _heading_terms(earth_in_body, weight, seconds))
+    return TermsOfBlock(terms, (noise / square)[..., None] * by_square, up)
+
+
+def _mean(share: Array, values: Array) -> Array:
+    """Of values (..., N, 3) with shares (..., N)."""
+    found: Array = (share[..., None, :] @ values)[..., 0, :]
+    return found
+
+
+def _heading_terms(earth_in_body: Array, weight: Array, seconds: float) -> Array:
+    ahead = earth_in_body[:, 0]
+    length = np.sqrt((ahead * ahead).sum(axis=1))
+    share = np.where(length > 0.0, weight, 0.0) / max(float(weight.sum()), 1e-300)
+    east, north = (ahead / np.where(length > 0.0, length, 1.0)[:, None]).T
+    one = share.sum()
+    return np.array(
+        [share @ north, share @ east, 2.0 * (share @ (north * east)), share @ (east**2 - north**2), seconds * one, one]
+    )
+
+
+class MeanBias:
+    """What a bias does in the mean of all blocks, for rows that are of no block: heave's (heave.py).
+
+    That a vehicle does not heave is held against the DVL's velocity, with the bias in it. Were that left out, heave and
+    reference would contradict each other where there is one, and where there is trim, one would be invented.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._sum, self._count = np.zeros((n, N_TERMS)), 0
+
+    def add(self, of_states: Array) -> None:
+        """Take U (n, 9) of a block."""
+        self._sum[:, :N_BIAS] += of_states[:, :N_BIAS]
+        self._count += 1
+
+    def told(self, information: Array, vector: Array) -> tuple[Array, Array]:
+        """What Λ (K, n, n), y (K, n) of such rows tell of states and terms."""
+        none = TermsOfBlock.none(np.zeros(len(self._sum)))
+        return with_terms(information, vector, none._replace(of_states=self._sum / max(self._count, 1)))
+
+
+class BlockTerms:
+    """Terms of blocks of time that end where they are said to, from samples in order."""
+
+    def __init__(self, up: Array, n_errors: int) -> None:
+        """up, n_errors: as in `block_terms`."""
+        self._up, self._n_errors = up, n_errors
+        self._epoch_ns: int | None = None
+        self._waiting: list[tuple[Stamps, Array, Array, Array]] = []
+
+    def add(self, stamps_ns: Stamps, earth_in_body: Array | None, velocity_dvl: Array, off: Array) -> None:
+        """Take N samples with stamps (N,), the rest as in `block_terms`."""
+        if self._epoch_ns is None:
+            self._epoch_ns = int(stamps_ns[0])
+        earth = np.zeros((len(stamps_ns), 3, 2)) if earth_in_body is None else earth_in_body
+        self._waiting.append((stamps_ns, earth, velocity_dvl, off))
+
+    def upto(self, cuts: Index) -> list[TermsOfBlock]:
+        """Terms of the E blocks that end after so many (E,) of the samples taken last; zeros without any."""
+        *before, (stamps_ns, earth, velocity, off) = self._waiting
+        parts = [slice(first, end) for first, end in pairwise([0, *cuts.tolist(), len(stamps_ns)])]
+        blocks = [[(stamps_ns[part], earth[part], velocity[part], off[part])] for part in parts]
+        blocks[0] = [*before, *blocks[0]]
+        self._waiting = blocks.pop()
+        return [self._terms(block) for block in blocks]
+
+    def rest(self) -> TermsOfBlock:
+        """Terms of the block that ends with the last sample taken."""
+        block, self._waiting = self._waiting, []
+        return self._terms(block)
+
+    def _terms(self, block: list[tuple[Stamps, Array, Array, Array]]) -> TermsOfBlock:
+        if not sum(len(stamps_ns) for stamps_ns, *_ in block):
+            return TermsOfBlock.none(self._up)
+        assert self._epoch_ns is not None
+        stamps_ns, earth, velocity, off = (np.concatenate(each) for each in zip(*block, strict=True))
+        seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
+        return block_terms(earth, velocity, off, np.ones(len(earth)), seconds, self._up, self._n_errors)
+
+
+def with_terms(information: Array, vector: Array, terms: TermsOfBlock) -> tuple[Array, Array]:
+    """What a block told of K times n states, Λ (K, n, n) and y (K, n), with what it tells of its terms."""
+    k, n = vector.shape
+    both, y = np.empty((k, n + N_TERMS, n + N_TERMS)), np.empty((k, n + N_TERMS))
+    turned = information @ terms.of_states
+    across = terms.of_states.swapaxes(-1, -2)
+    both[:, :n, :n] = information
+    both[:, :n, n:] = turned
+    both[:, n:, :n] = turned.swapaxes(1, 2)
+    both[:, n:, n:] = across @ turned
+    y[:, :n] = vector
+    y[:, n:] = product(across, vector)
+    y[:, n : n + N_BIAS] += ((information @ terms.up) @ terms.up)[:, None] * terms.pull
+    return both, y
+
+
+def all_told(information: Array, vector: Array, blocks: TimeBlocks) -> tuple[Array, Array]:
+    """All that is known of K times n states, Λ (K, n, n) and y (K, n), with what blocks tell of the terms."""
+    n = vector.shape[1]
+    if not blocks.count:
+        return with_terms(information, vector, TermsOfBlock.none(np.zeros(n)))
+    both, y = (each.copy() for each in blocks.total)
+    both[:, :n, :n], y[:, :n] = information, vector
+    return both, y
