@@ -221,12 +221,13 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
 
     # what is left where it may be of any size is noise, and whatever else: the evidence is worth as much less
     as_claimed: Array = np.ones((len(each), N_COEFFICIENTS))
-    of_bias_level, level = (
-        (inflation(np.where(which, _FACTORS[-1], 1.0) * std * as_claimed, as_claimed)[1][:, n:][:, which] ** 2).mean(
-            axis=1
-        )
-        for which in (_BIAS, ~_BIAS)
-    )
+    has_bias = bool(std[_BIAS].any())
+
+    def level_of(which: Mask) -> Array:
+        widest = np.where(which, _FACTORS[-1], 1.0) * std * as_claimed
+        return np.asarray((inflation(widest, as_claimed)[1][:, n:][:, which] ** 2).mean(axis=1))
+
+    level = level_of(~_BIAS)
     # and a constant beside, of any size: a yaw that its own prior does not expect is no deviation for that
     free = np.concatenate([onto, np.broadcast_to(np.eye(N_TERMS)[-1:], (len(each), 1, N_TERMS))], axis=1)
     across = free.swapaxes(1, 2)
@@ -238,11 +239,11 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         size = _size(own_free / level[:, None, None], scores_free / level[:, None], root, which)
         root = np.where(which, size[:, None], 1.0) * root
     # of the heading its size goes by that, and σ grows with what is left; a bias is known before to what it is
-    worth = np.where(_BIAS, of_bias_level[:, None], 1.0)
+    worth = np.where(_BIAS, level_of(_BIAS)[:, None], 1.0) if has_bias else as_claimed
     found, factor = inflation(root, worth)
     every = np.arange(len(owner))
     _, (shift, more) = deviating(root, worth, every)
-    of_bias = more - deviating(np.where(_BIAS, 0.0, root), worth, every)[1].p
+    without = deviating(np.where(_BIAS, 0.0, root), worth, every)[1].p if has_bias else more
     states = []
     for number, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True)):
         at = slice(end - size, end)
@@ -254,7 +255,12 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         of_one = GaussianState(one * in_time, p_one * np.outer(in_time, in_time)).raised(factor[number, n + N_BIAS :])
         states.append(
             HeadingStates(
-                of_one if is_turned else None, shift[at], more[at], of_bias[at], float(drifted), factor[number, :n]
+                of_one if is_turned else None,
+                shift[at],
+                more[at],
+                more[at] - without[at],
+                float(drifted),
+                factor[number, :n],
             )
         )
     return states
