@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,13 +15,15 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.present.document import Table as Shown
 from dvl_calib_ros.present.terminal import rich_table
 
+from ..figures.stored import head
 from .motion import BOAT, HELD_OUT_KINDS, RECORDED, TUNING_KINDS
 from .pairs_run import by_row, figures, misses, run_pairs, score_pair
 from .plan import KINDS, Case, Family, plan
 from .recorded import NO_RECORDINGS, has_boat, has_ins, recordings_folder
 from .run import Trial
 from .scored import join
-from .tables import score
+from .sequential import Sequential
+from .tables import Table, markdown, score
 from .truth import Category, unseal
 
 DEFAULT_CASES = 100
@@ -39,6 +42,10 @@ def main(argv: Sequence[str]) -> int:
     amount.add_argument(
         "--case", action="append", metavar="KEY", help="one case, by its key or id (as in sealed/); may be given again"
     )
+    amount.add_argument(
+        "--plan", action="store_true",
+        help="questions with goals, each asked until it is decided: 900 cases at most, of one commit",
+    )  # fmt: skip
     amount.add_argument("--full", action="store_true", help="all cases (hours)")
     amount.add_argument(
         "--pairs", type=int, metavar="N",
@@ -66,21 +73,16 @@ def main(argv: Sequence[str]) -> int:
     _check(arguments)
     if arguments.pairs is not None:
         _run_pairs(arguments)
+    elif arguments.plan:
+        _run_plan(arguments)
     else:
         _run(arguments)
     return 0
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    kinds = KIND_CHOICES[arguments.kinds]
     errors = common.console(stderr=True)
-    if RECORDED in kinds and not has_ins(recordings_folder()):
-        kinds = tuple(kind for kind in kinds if kind != RECORDED)
-        errors.print(f"[yellow]note:[/] {NO_RECORDINGS}")
-    cases = plan(kinds, [Family(name) for name in arguments.family or FAMILIES])
-    cases = [case for case in cases if case.category.value in (arguments.category or CATEGORIES)]
-    if not has_boat(recordings_folder()):
-        cases = [case for case in cases if case.kind != BOAT]
+    cases = _planned(arguments)
     if arguments.case:
         cases = _chosen(cases, arguments.case)
     elif not arguments.full:
@@ -101,6 +103,30 @@ def _run(arguments: argparse.Namespace) -> None:
         out.print(rich_table(Shown(table.columns, table.rows, table.title)))
     if result.n_failed:
         errors.print(f"[red]{result.n_failed} cases failed[/]; {trial.answers} says how")
+
+
+def _planned(arguments: argparse.Namespace) -> list[Case]:
+    """Cases of the kinds, families and categories that are asked for, as far as their recordings are there."""
+    kinds = KIND_CHOICES[arguments.kinds]
+    if RECORDED in kinds and not has_ins(recordings_folder()):
+        kinds = tuple(kind for kind in kinds if kind != RECORDED)
+        common.console(stderr=True).print(f"[yellow]note:[/] {NO_RECORDINGS}")
+    cases = plan(kinds, [Family(name) for name in arguments.family or FAMILIES])
+    cases = [case for case in cases if case.category.value in (arguments.category or CATEGORIES)]
+    return cases if has_boat(recordings_folder()) else [case for case in cases if case.kind != BOAT]
+
+
+def _run_plan(arguments: argparse.Namespace) -> None:
+    """Ask what is open, print how each question stands, write it to the folder."""
+    trial = Trial(arguments.out, arguments.seed, arguments.jobs, arguments.keep_bags)
+    asked = Sequential(trial, _planned(arguments), head())
+    with common.progress("trial") as on_progress:
+        scored = asked.run(on_progress, 60.0 * arguments.minutes, time.monotonic)
+    cpu_s = sum(case.cpu_s for case in scored)
+    title = f"Trial of {asked.commit}: {len(scored)} cases, seed {arguments.seed}, diagnosis {cpu_s:.0f} s of CPU"
+    shown = Table(title, ("question", "goal", "measured", "95 % bounds", "n", "stands"), tuple(asked.lines(scored)))
+    save_text(arguments.out / "plan.md", markdown(shown) + "\n")
+    common.console().print(rich_table(Shown(shown.columns, shown.rows, shown.title)))
 
 
 def _run_pairs(arguments: argparse.Namespace) -> None:

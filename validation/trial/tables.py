@@ -79,7 +79,7 @@ class Score:
 
     def markdown(self) -> str:
         """The tables, for documentation."""
-        return "\n\n".join(_markdown(table) for table in self.tables) + "\n"
+        return "\n\n".join(markdown(table) for table in self.tables) + "\n"
 
     def page(self, command: str, version: str) -> str:
         """The page of the documentation. command: what has measured it. version: of the software that answered."""
@@ -284,6 +284,7 @@ def _detail_table(scored: Sequence[Scored]) -> Table:
     return Table("Details", ("what", "how often"), tuple(rows))
 
 
-def _markdown(table: Table) -> str:
+def markdown(table: Table) -> str:
+    """A table for a page."""
     lines = [f"**{table.title}**", "", "| " + " | ".join(table.columns) + " |", "|---" * len(table.columns) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in table.rows)])
