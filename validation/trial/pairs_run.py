@@ -12,7 +12,7 @@ import os
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,8 @@ def _answer(number: int, seed: int, folder: Path) -> Document:
 class PairScore:
     """One pair. first: whether what is missing was named first, by its name, and by the set of names; None where
     nothing is missing. claimed: effects claimed to differ, wrong: those that do not. noise_claimed, noise_wrong:
-    likewise. held, intervals: sizes inside their 95 % intervals, of so many.
+    likewise. held, intervals: sizes inside their 95 % intervals, of so many. told_apart: whether the last model of the
+    ladder is told from the recording; None where not all was found.
     """
 
     first: bool | None
@@ -126,9 +127,11 @@ class PairScore:
     held: int
     intervals: int
     failed: bool
+    told_apart: bool | None
 
 
 CLAIMS = ("missing_in_simulator", "other_size", "only_in_simulator")
+TOLD_APART = 0.05
 
 
 def score_pair(truth: Document, answer: Document) -> PairScore:
@@ -149,8 +152,15 @@ def score_pair(truth: Document, answer: Document) -> PairScore:
     noise_wrong = [name for name in noise if not _noise_differs(name, truth["noise"])]
     return PairScore(
         first, in_set, len(claims), tuple(wrong), len(noise), tuple(noise_wrong), held, intervals,
-        document["verdict"] == "failed",
+        document["verdict"] == "failed", _told_apart(document, missing, wrong),
     )  # fmt: skip
+
+
+def _told_apart(document: Document, missing: Set[str], wrong: Sequence[str]) -> bool | None:
+    named = {name for each in document["effects"] if each["status"] == "missing_in_simulator" for name in _names(each)}
+    if wrong or not missing <= named or not document.get("shrinks") or document["vehicle"]["verdict"] == "unknown":
+        return None
+    return bool(document["shrinks"][-1]["p"] < TOLD_APART)
 
 
 def _names(effect: Document) -> set[str]:
@@ -215,6 +225,7 @@ class Figure:
 def figures(scores: Sequence[PairScore]) -> list[Figure]:
     """Of all pairs."""
     missing = [each for each in scores if each.first is not None]
+    all_found = [each for each in scores if each.told_apart is not None]
     return [
         Figure("missing effect named first", sum(bool(s.first) for s in missing), len(missing), ">= 90 %"),
         Figure("the same, by the set of names", sum(bool(s.first_in_set) for s in missing), len(missing), ">= 90 %"),
@@ -225,6 +236,8 @@ def figures(scores: Sequence[PairScore]) -> list[Figure]:
                sum(s.noise_claimed for s in scores), "<= 1 %"),
         Figure("sizes inside their 95 % intervals", sum(s.held for s in scores), sum(s.intervals for s in scores),
                "92 .. 98 %"),
+        Figure("all found, and the last model not told from the recording", sum(not s.told_apart for s in all_found),
+               len(all_found), ">= 95 %"),
         Figure("failed", sum(s.failed for s in scores), len(scores), "0"),
     ]  # fmt: skip
 
