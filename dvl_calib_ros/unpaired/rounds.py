@@ -193,8 +193,8 @@ def put_right(
     by_name = {each["name"]: each for each in corrected["effects"]}
     for compared in (each for each in comparison.effects if each.status.is_claim):
         effect = effects[compared.name]
-        if effect.relative_to_first:  # a change between days, of which a simulator has one
-            continue
+        if effect.relative_to_first or any(" of " in key for key in compared.vehicle):
+            continue  # another size every day, of which a simulator has one
         entry = by_name.get(effect.name)
         if entry is None:
             entry = {"name": effect.name, "equivalent_to": [], "parameters": _parameters(effect.defaults)}
