@@ -1,7 +1,7 @@
 """Speed and memory as ratios against a peer in the same run; about nine minutes for all. Linux.
 
 batch     the batch path against filterpy
-commands  CPU of help, doctor, replay and diagnosis as they are typed, against an interpreter that does nothing
+commands  CPU of help, doctor, replay and diagnosis as they are typed, against reading the same bags with rosbags
 evaluate  the published procedure against a loop with filterpy (set DVL_CALIB_SNAPIR to a folder of trajectories)
 replay    an hour's bag against reading and deserialising it with rosbags
 node      the node's CPU against a subscriber that only republishes

@@ -60,7 +60,8 @@ def work(bag):
             zstd.decompress(file.read(each.compressed_size))
     return summary.statistics.message_count
 """
-_PEER = """
+# What another reader of bags does; `work` returns how many messages it read.
+PEER = """
 from pathlib import Path
 from rosbags.highlevel import AnyReader
 def work(bag):
@@ -92,7 +93,7 @@ def measure(quick: bool = False) -> list[Measurement]:
                 seconds=seconds, dvl_rate=10, gnss_rate=10, imu_rate=100, errors=DvlErrors(beam_std=0.005)
             )
             write_bag(scenario, path, Storage.MCAP, compression)
-        works = (_OURS, long), (_DOCTOR, long), (_PEER, long), (_READING, packed), (_DECOMPRESSING, packed)
+        works = (_OURS, long), (_DOCTOR, long), (PEER, long), (_READING, packed), (_DECOMPRESSING, packed)
         # in turns, best of each: what else the machine does only ever adds
         rounds = [[_run(*each) for each in works] for _ in range(1 if quick else ROUNDS)]
         short_run = _run(_OURS, short)

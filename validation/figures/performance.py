@@ -27,7 +27,7 @@ def take(paths: Sequence[Path]) -> None:
     cost=CHEAP,
     command="python -m benchmarks --json FILE",
     # as `python -m benchmarks --against`; of each only the ratio to its peer is compared
-    tolerances={"ratio.*": "50%"},
+    tolerances={"ratio.*": "100%"},
     partial=True,
 )
 def benchmarks(folder: Path) -> Found:
