@@ -248,8 +248,7 @@ def _cpu_per_sample(commands: list[list[str]], rate: float) -> list[float]:
             used.append((np.array(after) - before) / samples)
         publisher.communicate(timeout=60)
         for process in processes:
-            process.send_signal(signal.SIGINT)
-            process.wait(30)
+            process.kill()  # as above
     return np.min(used, axis=0).tolist()
 
 
