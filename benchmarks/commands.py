@@ -18,7 +18,7 @@ from pathlib import Path
 from . import Measurement
 from .replay import PEER
 
-ROUNDS = 2
+ROUNDS = 3
 # What is over at once is as often disturbed as an interpreter that does nothing, and noise of it that of the ratio
 ROUNDS_OF_HELP = 20
 _DVL_CALIB = ["-m", "dvl_calib_ros.cli.main"]
