@@ -21,6 +21,7 @@ from . import kalman
 from .assembly import Assembler
 from .block_scatter import BlockScatter
 from .block_terms import BlockTerms, upwards
+from .dvl_bias import OfBias
 from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .frames import Array
 from .heading_states import prior_std
@@ -305,12 +306,12 @@ class Group:
             self._of_recording[name] = state.raised(found.inflation).turned(self._up, found.drifted)
         return self._of_recording[name]
 
-    def of_bias(self, name: str) -> Array:
-        """(n, n) of `of_recording`'s covariance, what a bias of the DVL makes of it, by one model."""
+    def of_bias(self, name: str) -> OfBias:
+        """What a bias of the DVL makes of `of_recording`, by one model."""
         if self._scatter is None:
-            return np.zeros_like(self._p[0])
+            return OfBias.none(self._x.shape[1])
         found = self._scatter.found(self.index[name])
-        return GaussianState(found.shift[0], found.of_bias[0]).raised(found.inflation).p
+        return found.of_bias.at(0).raised(found.inflation)
 
     def heading_deviation(self, name: str) -> GaussianState | None:
         """Coefficients of how the heading deviates, as of `HeadingStates`, by one model; None where it has none."""

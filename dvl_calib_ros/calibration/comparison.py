@@ -26,6 +26,7 @@ from .extrinsics import (
     GROUPS,
     LEVER_ARM,
     MOUNTING,
+    N_AXES,
     N_COMPONENTS,
     ONLY_CLOCK,
     ONLY_SCALE,
@@ -77,7 +78,11 @@ class Difference:
         """What takes the first to the second."""
         (value,) = _values([second], first) - _values([first], first)
         compared = first.shown & second.shown
-        covariance = np.where(np.outer(compared, compared), first.covariance + second.covariance, 0.0)
+        both = first.covariance + second.covariance
+        if first.dvl and first.dvl == second.dvl:
+            common = first.by_bias @ second.by_bias.T
+            both = both - common - common.T
+        covariance = np.where(np.outer(compared, compared), both, 0.0)
         return Difference(first, second, np.where(compared, value, np.nan), covariance, compared)
 
     @property
@@ -226,21 +231,34 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     """What several calibrations of one and the same say together: weighted by their information.
 
     Mounting, scale and delay each for themselves, by their marginal covariances: speed of sound and clocks change from
-    day to day, and what is forced to be common where it is not would bend the others.
+    day to day, and what is forced to be common where it is not would bend the others. The bias of one DVL is common to
+    all, so it does not average out: it is a state beside the others, and what is left of it is left in the result.
     """
     if len(several) == 1:
         return several[0]
     base = several[0]
+    if any(not each.dvl or each.dvl != base.dvl for each in several):
+        several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
     shown = np.any([each.shown for each in several], axis=0)
-    covariance, found = np.zeros((N_COMPONENTS, N_COMPONENTS)), np.zeros(N_COMPONENTS)
+    found, by_bias = np.zeros(N_COMPONENTS), np.zeros((N_COMPONENTS, N_AXES))
+    of_groups: list[Array] = []
     values = _values(several, base)
-    each_information = np.array([each.information for each in several])
-    information, vector = each_information.sum(axis=0), np.einsum("nij,nj->i", each_information, values)
-    for group in GROUPS:
-        index = group[shown[group]]
-        at = np.ix_(index, index)
-        covariance[at] = np.linalg.inv(information[at])
-        found[index] = covariance[at] @ vector[index]
+    own, columns = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
+    information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
+    turned = own @ columns
+    groups = [group[shown[group]] for group in GROUPS]
+    for index in groups:
+        # with a bias of σ 1 as a state beside them
+        across = turned[:, index].sum(axis=0)
+        of_bias = np.eye(N_AXES) + np.einsum("nia,nib->ab", columns[:, index], turned[:, index])
+        of_vector = np.einsum("nia,ni->a", turned[:, index], values[:, index])
+        share = across @ np.linalg.inv(of_bias)
+        p = np.linalg.inv(information[np.ix_(index, index)] - share @ across.T)
+        found[index], by_bias[index] = p @ (vector[index] - share @ of_vector), p @ share
+        of_groups.append(p)
+    covariance = by_bias @ by_bias.T
+    for index, p in zip(groups, of_groups, strict=True):
+        covariance[np.ix_(index, index)] = p
     # what nobody has shown stays as the first assumes it
     found = np.where(shown, found, values[0])
     return replace(
@@ -254,6 +272,8 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
         time_offset=float(found[TIME_OFFSET]),
         covariance=covariance,
         shown=shown,
+        dvl=several[0].dvl,
+        by_bias=by_bias,
         used=sum(each.used for each in several),
         remarks=(),
     )

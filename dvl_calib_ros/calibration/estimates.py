@@ -104,8 +104,8 @@ class Estimates:
             return found
         other = estimator.of_recording()
         # a bias of the DVL is there with an arm as without
-        own = np.diag(covariance - self.estimators[name].of_bias)[:3]
-        open_arm = np.diag(other.p - estimator.of_bias)[:3]
+        own = np.diag(covariance - self.estimators[name].of_bias.covariance)[:3]
+        open_arm = np.diag(other.p - estimator.of_bias.covariance)[:3]
         by_arm = open_arm - own
         away = (state - other.x[: len(state)])[:3] ** 2
         is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.maximum(by_arm, 0.0))

@@ -19,6 +19,7 @@ from .bank import Group, ModelCounts
 from .delay.clocks import Rest
 from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
+from .dvl_bias import OfBias
 from .folds import Moments
 from .frames import Array
 from .history import Counts, Numbers, StateTrace
@@ -119,10 +120,9 @@ class Estimator(ABC):
         return np.zeros((n, n))
 
     @property
-    def of_bias(self) -> Array:
-        """(n, n) of `of_recording`'s covariance, what a bias of the DVL makes of it."""
-        n = len(self.state().x)
-        return np.zeros((n, n))
+    def of_bias(self) -> OfBias:
+        """What a bias of the DVL makes of `of_recording`."""
+        return OfBias.none(len(self.state().x))
 
     @property
     def registration(self) -> Registration | None:
@@ -264,7 +264,7 @@ class LinearEstimator(Estimator):
         return self._group.of_recording(self._model.name)
 
     @property
-    def of_bias(self) -> Array:
+    def of_bias(self) -> OfBias:
         """As `Estimator`."""
         self._update(self._group)
         return self._group.of_bias(self._model.name)

@@ -20,12 +20,12 @@ from .frames import Array, quaternion_from_rotation, rotation_vector, skew
 from .kalman import GaussianState
 from .models import Model
 from .observability import OBSERVED_SHARE
-from .parameters import Parameters
+from .parameters import FLU, FRD, Parameters
 
 COMPONENTS = (
     "turn_x", "turn_y", "turn_z", "lever_arm_x", "lever_arm_y", "lever_arm_z", "scale", "time_offset",
 )  # fmt: skip
-N_COMPONENTS = len(COMPONENTS)
+N_COMPONENTS, N_AXES = len(COMPONENTS), 3
 TURN, LEVER_ARM, SCALE, TIME_OFFSET = slice(0, 3), slice(3, 6), 6, 7
 # What differences are told of, each by its marginal covariance: mounting, scale, delay
 MOUNTING, ONLY_SCALE, ONLY_CLOCK = GROUPS = np.arange(SCALE), np.array([SCALE]), np.array([TIME_OFFSET])
@@ -62,6 +62,11 @@ class Extrinsics:
         Samples.
     remarks
         What to know when it is believed, in sentences.
+    dvl
+        Which DVL, by the frame and the axes of its data; '' where that is not known, which is another each time.
+    by_bias
+        (8, 3) by how much `COMPONENTS` are off where that DVL is off by one σ of its bias along each of its axes; zero
+        where `shown` is not. It is in the covariance, and common to all calibrations of that DVL.
     """
 
     name: str
@@ -76,14 +81,17 @@ class Extrinsics:
     shown: NDArray[np.bool_]
     used: int
     remarks: tuple[str, ...] = field(default=())
+    dvl: str = ""
+    by_bias: Array = field(default_factory=lambda: np.zeros((N_COMPONENTS, N_AXES)))
 
     @cached_property
     def information(self) -> Array:
-        """(8, 8) inverse of the covariance of what was shown: of mounting, scale and delay, each for itself."""
-        found = np.zeros((N_COMPONENTS, N_COMPONENTS))
+        """(8, 8) inverse of the covariance of what was shown, were the bias known: of mounting, scale and delay, each
+        for itself."""
+        found, covariance = np.zeros((N_COMPONENTS, N_COMPONENTS)), self.covariance - self.by_bias @ self.by_bias.T
         for group in GROUPS:
             at = np.ix_(group[self.shown[group]], group[self.shown[group]])
-            found[at] = np.linalg.inv(self.covariance[at])
+            found[at] = np.linalg.inv(covariance[at])
         return found
 
     @cached_property
@@ -106,11 +114,14 @@ def extrinsics_of(
     span_ns: tuple[int, int],
     used: int,
     remarks: Sequence[str] = (),
+    dvl: str = "",
+    by_bias: Array | None = None,
 ) -> Extrinsics:
     """What a state (n,) of a model says of the DVL, with the parameters that it was found with.
 
     state: with σ of its recording, by which a component is shown: if that is at most half of what the parameters say is
     known without data, as for observability. span_ns: stamps of the first and last sample.
+    by_bias: (n, 3), `OfBias.columns` of the state.
     """
     found = _components(model, state.x, parameters)
     jacobian = np.empty((N_COMPONENTS, len(state.x)))
@@ -126,6 +137,7 @@ def extrinsics_of(
     covariance += jacobian @ day_covariance(model, parameters) @ jacobian.T
     covariance[~shown] = 0.0
     covariance[:, ~shown] = 0.0
+    common = np.zeros((len(state.x), N_AXES)) if by_bias is None else by_bias
     rotation, rest = found
     return Extrinsics(
         name=name,
@@ -140,7 +152,14 @@ def extrinsics_of(
         shown=shown,
         used=used,
         remarks=tuple(remarks),
+        dvl=dvl,
+        by_bias=np.where(shown[:, None], jacobian @ common, 0.0),
     )
+
+
+def dvl_in_words(frame: str, turned: bool) -> str:
+    """Which DVL: two of a vehicle have frames of their own. turned: from forward-right-down, whose bias is another."""
+    return f"{frame}, {FRD if turned else FLU}"
 
 
 def _components(model: Model, x: Array, p: Parameters) -> tuple[Array, Array]:

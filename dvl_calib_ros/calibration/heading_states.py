@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .block_terms import N_BIAS, N_TERMS
+from .dvl_bias import OfBias
 from .frames import Array, product
 from .kalman import GaussianState
 from .samples import Index, Mask
@@ -54,7 +55,7 @@ class HeadingStates(NamedTuple):
 
     coefficients: x (5,), P (5, 5), of the hypothesis that says how large it is: of sine and cosine of the yaw and of
     twice the yaw, rad, and of time, rad/s; None where no reference is turned by a heading. shift (M, n), more
-    (M, n, n): to be added to x and P. of_bias: (M, n, n), the part of `more` that would not be, were the bias known.
+    (M, n, n): to be added to x and P. of_bias: of M times n states, its covariance part of `more`.
     drifted: rad², to be added to the variance of yaw, as nobody knows when a heading that drifts was right. inflation:
     (n,) by how much σ of that hypothesis has to grow then, as of `TimeBlocks`.
     """
@@ -62,7 +63,7 @@ class HeadingStates(NamedTuple):
     coefficients: GaussianState | None
     shift: Array
     more: Array
-    of_bias: Array
+    of_bias: OfBias
     drifted: float
     inflation: Array
 
@@ -136,8 +137,7 @@ def _none(seen: HeadingEvidence) -> HeadingStates:
     if not seen.has_terms and len(seen.blocks.vector):
         best = slice(seen.best, seen.best + 1)
         factor = inflations([seen.blocks], seen.states.x[best], seen.states.p[best])[0]
-    nothing = np.zeros((m, n, n))
-    return HeadingStates(None, np.zeros((m, n)), nothing, nothing, 0.0, factor)
+    return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), OfBias.none(m, n), 0.0, factor)
 
 
 class _Deviation(NamedTuple):
@@ -242,8 +242,13 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     worth = np.where(_BIAS, level_of(_BIAS)[:, None], 1.0) if has_bias else as_claimed
     found, factor = inflation(root, worth)
     every = np.arange(len(owner))
-    _, (shift, more) = deviating(root, worth, every)
-    without = deviating(np.where(_BIAS, 0.0, root), worth, every)[1].p if has_bias else more
+    of_all, (shift, more) = deviating(root, worth, every)
+    of_bias = OfBias.none(*shift.shape)
+    if has_bias:
+        without = deviating(np.where(_BIAS, 0.0, root), worth, every)[1].p
+        # of a bias of a σ the data take off what they show of it
+        off = turned.swapaxes(1, 2) @ of_all.p[:, :, :N_BIAS] / std[_BIAS]
+        of_bias = OfBias(more - without, off)
     states = []
     for number, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True)):
         at = slice(end - size, end)
@@ -258,7 +263,7 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
                 of_one if is_turned else None,
                 shift[at],
                 more[at],
-                more[at] - without[at],
+                of_bias.at(at),
                 float(drifted),
                 factor[number, :n],
             )

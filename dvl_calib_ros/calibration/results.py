@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..verdict.reasons import Reason
+from .dvl_bias import OfBias
 from .error_model import correct, corrected_mounting
 from .frames import Array
 from .kalman import GaussianState
@@ -28,7 +29,7 @@ class Estimate:
     recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
     more than the filter claims. filter_covariance: (n, n), what the filter alone claims. left_open: (n, n), the part of
     both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm. of_bias:
-    (n, n), the part of both that a bias of the DVL makes: of the mounting, not of velocities at the speeds driven.
+    what a bias of the DVL makes of state and both: of the mounting, not of velocities at the speeds driven.
     used, gated: samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent
     filter. heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw
     and of twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
@@ -40,7 +41,7 @@ class Estimate:
     recording_covariance: Array
     filter_covariance: Array
     left_open: Array
-    of_bias: Array
+    of_bias: OfBias
     used: int
     gated: int
     mean_nis: float
@@ -67,7 +68,7 @@ class Estimate:
     @property
     def velocity_covariance(self) -> Array:
         """(n, n) of this recording, for what velocities are worth that it corrects, at the speeds driven."""
-        return self.recording_covariance - self.of_bias
+        return self.recording_covariance - self.of_bias.covariance
 
     @property
     def filter_std(self) -> Array:

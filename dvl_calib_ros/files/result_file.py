@@ -45,6 +45,7 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
         "covariance": estimate.covariance.tolist(),
         "covariance_of_recording": estimate.recording_covariance.tolist(),
         "covariance_of_filter": estimate.filter_covariance.tolist(),
+        "by_dvl_bias": estimate.of_bias.columns.tolist(),
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
@@ -325,10 +326,9 @@ def _with_new_states(name: str, names: tuple[str, ...], x: Array, p: Array) -> t
 
 def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> GaussianState:
     published = _with_covariance(where, name, saved, "covariance")
-    key = "covariance_of_recording"
-    if key not in saved:  # of before the two were told apart
+    if "covariance_of_recording" not in saved:  # of before the two were told apart
         return published
-    own = _with_covariance(where, name, saved, key)
+    own = _with_covariance(where, name, saved, "covariance_of_recording")
     return own if of_recording else published
 
 

@@ -38,8 +38,8 @@ class Catalogued:
         """From the plain data of a part."""
         if told is None:
             return Catalogued(recording, vehicle, tuple(rows))
-        own = {field.name: told[field.name] for field in fields(Extrinsics)}
-        for name in ("rotation_body_from_dvl", "lever_arm", "covariance"):
+        own = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
+        for name in own.keys() & {"rotation_body_from_dvl", "lever_arm", "covariance", "by_bias"}:
             own[name] = np.array(own[name])
         own["shown"] = np.array(own["shown"], dtype=bool)
         return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**own), np.array(told["covariance_of_recording"]))

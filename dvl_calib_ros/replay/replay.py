@@ -16,7 +16,7 @@ from ..calibration.advice import data_advice, gate_advice, message_advice, refer
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
 from ..calibration.doubts import doubts
-from ..calibration.extrinsics import Extrinsics, extrinsics_of
+from ..calibration.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
@@ -202,6 +202,8 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
         Parameters.from_mapping(result.parameters),
         (result.first_ns, result.last_ns),
         estimate.used,
+        dvl=dvl_in_words(result.parameters["dvl_frame"] or replayed.dvl_frame, replayed.turned),
+        by_bias=estimate.of_bias.columns,
     )
 
 

@@ -68,6 +68,14 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     assert "the mounting differs" in fail(capsys, "apply", tmp_path / "r.yaml", "--launch", tmp_path / "x.xml")
 
 
+def test_a_mounting_that_moved_is_not_hidden_by_the_bias_of_the_dvl(place):
+    """10 mm/s are 0.6° at 1 m/s, on every day the same."""
+    biased = Parameters(dvl_bias_std=0.01)
+    recordings = checked_replay([place / "tuesday", place / "wednesday"], biased).recordings
+    assert recordings is not None and recordings.word == "moved"
+    assert recordings.pairs[0].std[2] < 0.7 * recordings.calibrations[0].std[2]
+
+
 @pytest.mark.slow
 def test_who_asks_to_merge_gets_it_with_a_note(place):
     run = dc.replay([place / "monday", place / "wednesday"], merge=True)

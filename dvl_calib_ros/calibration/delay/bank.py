@@ -20,6 +20,7 @@ import numpy as np
 
 from ..block_terms import MeanBias, all_told, block_terms, upwards, with_terms
 from ..correction_parameters import PriorOnErrors, to_correction
+from ..dvl_bias import OfBias
 from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
 from ..frames import Array, product
 from ..heading_states import HeadingEvidence, heading_states, prior_std
@@ -431,11 +432,11 @@ class DelayBank:
         )
         shown = self._shown([each.best for each in known], information, noise, inflations)
         for number, each in enumerate(known):
-            likely, heading, of_bias, drifted = each.likely, None, np.zeros((N_STATE, N_STATE)), 0.0
+            likely, heading, of_bias, drifted = each.likely, None, OfBias.none(N_STATE), 0.0
             if deviations:
                 heading, shift, more, of_each, drifted, _ = deviations[number]
                 likely = GaussianState(likely.x + shift, likely.p + more)
-                of_bias = np.tensordot(each.share, of_each, axes=1)
+                of_bias = of_each.mixed(each.share)
             yield Likely(likely, each.kept, each.share, shown[number], inflations[number], heading, of_bias, drifted)
 
     def posteriors(self, found: Sequence[Likely]) -> list[Posterior]:
@@ -460,14 +461,15 @@ class DelayBank:
     def _posterior(self, found: Likely, errors: GaussianState) -> Posterior:
         state = _one(errors, self.delays_s[found.kept], found.share)
         raised = state.raised(found.inflation).turned(self._up, found.drifted)
-        p = state.p - found.of_bias  # which is there with a lever arm as without
+        p = state.p - found.of_bias.covariance  # which is there with a lever arm as without
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
         by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)
         rest = np.maximum(np.diag(p)[:3] - by_lever_arm, 1e-12)
         turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
-        claimed = with_states_of(raised, self.prior, _without(found.shown, _BEYOND))
-        of_bias = GaussianState(state.x, found.of_bias).raised(found.inflation).p
+        unclaimed = _without(found.shown, _BEYOND)
+        claimed = with_states_of(raised, self.prior, unclaimed)
+        of_bias = found.of_bias.raised(found.inflation).where(~np.isin(np.arange(N_STATE), unclaimed))
         return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest, found.heading, of_bias)
 
     def days(self) -> list[DayState]:

@@ -20,6 +20,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..assembly import gate_of, prior
 from ..bank import ModelCounts
+from ..dvl_bias import OfBias
 from ..estimator import Estimator, EstimatorSetup
 from ..folds import Moments
 from ..frames import Array
@@ -189,13 +190,13 @@ class DelayFilter(Estimator):
         return self._solver.registration() if self._is_settled else told.looked.registration
 
     @property
-    def of_bias(self) -> Array:
+    def of_bias(self) -> OfBias:
         """As `Estimator`."""
         posterior = self.posterior
         if posterior is not None and self.claims:
             return posterior.of_bias
-        found = np.zeros((N_STATE, N_STATE))
-        found[:N_G1, :N_G1] = self._base.of_bias
+        found, base = OfBias.none(N_STATE), self._base.of_bias
+        found.covariance[:N_G1, :N_G1], found.columns[:N_G1] = base
         return found
 
     @property

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..dvl_bias import OfBias
 from ..frames import Array
 from ..heading_states import HeadingEvidence
 from ..kalman import GaussianState
@@ -100,7 +101,7 @@ class After(NamedTuple):
 class Likely(NamedTuple):
     """What is known at some time: the likely hypotheses x (M, n), P (M, n, n), on ψ and κ, the numbers kept (M,) of
     their delays, and the share (M,) of each; shown, inflation and heading as of `Posterior`;
-    of_bias (n, n), drifted as of `HeadingStates`."""
+    of_bias, drifted as of `HeadingStates`."""
 
     likely: GaussianState
     kept: Index
@@ -108,7 +109,7 @@ class Likely(NamedTuple):
     shown: Mask
     inflation: Array
     heading: GaussianState | None
-    of_bias: Array
+    of_bias: OfBias
     drifted: float
 
 
@@ -120,7 +121,7 @@ class Posterior:
     its standard deviations were raised above the filter's own. turned: (3,) by how much 1 m of lever arm along the
     axis that matters most turns each misalignment, rad; by_lever_arm: (3,) variance of each that comes with what is not
     known of the lever arm, in variances without. heading: coefficients of its deviation, as of `HeadingStates`.
-    of_bias: (n, n) of P, what a bias of the DVL makes of it.
+    of_bias: what a bias of the DVL makes of x and P.
     """
 
     state: GaussianState
@@ -129,7 +130,7 @@ class Posterior:
     turned: Array
     by_lever_arm: Array
     heading: GaussianState | None
-    of_bias: Array
+    of_bias: OfBias
 
 
 class Ended(NamedTuple):

@@ -117,6 +117,51 @@ def test_chi_square_of_a_pair_and_of_each_against_the_rest_is_that_of_the_covari
     assert 0.4 < np.mean(p) < 0.6
 
 
+# What a bias of 10 mm/s makes at 1 m/s, and at three times that
+SLOW = 0.01 * np.array([[0, 0, 0], [0, 0, 1], [0, -1, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0]])
+FAST = SLOW / 3.0
+
+
+def biased(day, rng=None, bias=(0.0, 0.0, 0.0), by=SLOW, turn_deg=(0.0, 0.0, 0.0), dvl="dvl_link, flu") -> Extrinsics:
+    """Of a DVL with a bias, in σ of its prior. rng: None without noise."""
+    e = by @ bias + (rng.normal(0.0, STD) if rng else 0.0)
+    turn = np.add(turn_deg, np.degrees(e[:3]))
+    covariance = np.diag(STD**2) + by @ by.T
+    return extrinsics(day, turn, e[3:6], e[6], e[7], covariance=covariance, by_bias=by, dvl=dvl)
+
+
+def test_a_mounting_that_moved_is_not_hidden_by_the_bias_of_one_dvl():
+    turned = (0.0, 0.0, 0.7)  # at 1 m/s 12 mm/s
+    assert compare([biased(0), biased(1, turn_deg=turned)]).word == "moved"
+    assert compare([biased(0), biased(1, turn_deg=turned, dvl="other, flu")]).word == "same"
+    assert compare([biased(0, dvl=""), biased(1, turn_deg=turned, dvl="")]).word == "same"  # of which nothing is known
+    assert compare([biased(0), biased(1, by=FAST, turn_deg=turned)]).word == "same"  # at another speed it is another
+    (change,) = compare([biased(0), biased(1), biased(2, turn_deg=turned)]).moved
+    assert change.first_after.name == "day2"
+
+
+def test_differences_of_one_dvl_scatter_as_their_sigma_says_at_one_speed_and_at_several():
+    rng = np.random.default_rng(4)
+    chi_squares, speeds = [], (SLOW, FAST, SLOW, FAST)
+    for _ in range(300):
+        bias = rng.normal(size=3)
+        found = compare([biased(day, rng, bias, by) for day, by in enumerate(speeds)])
+        chi_squares.append([*(pair.test().value for pair in found.pairs), found.against_rest[1].test().value])
+    assert np.mean(chi_squares, axis=0) == pytest.approx(8.0, abs=0.8)  # 3 σ of a mean of 300
+
+
+def test_several_at_one_speed_leave_the_bias_as_it_is_and_at_two_speeds_show_it():
+    alone, several = biased(0), [biased(day) for day in range(20)]
+    np.testing.assert_allclose(fused(several).by_bias, SLOW, rtol=0.02)
+    assert fused(several).std[2] == pytest.approx(0.01, rel=0.01)  # not a twentieth's root of it
+    independent = fused([biased(day, dvl="") for day in range(20)])
+    assert independent.std[2] == pytest.approx(alone.std[2] / math.sqrt(20.0))
+    both = fused([*several, *(biased(day, by=FAST) for day in range(20, 40))])
+    assert both.std[2] < 0.2 * alone.std[2]
+    apart = both.covariance - both.by_bias @ both.by_bias.T
+    assert np.linalg.eigvalsh(apart)[0] > 0.0
+
+
 def test_the_turn_sigma_is_worth_what_simulated_states_scatter_by():
     """Of a DVL mounted at an angle, for a model in the DVL's frame: against Monte Carlo through the error model."""
     parameters = Parameters(mounting_rpy=(0.1, -0.2, 0.8), day_std_heading=0.0)

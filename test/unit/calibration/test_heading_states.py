@@ -207,9 +207,21 @@ def test_at_one_speed_sigma_holds_the_bias_and_two_speeds_show_it(rng):
     assert abs(alone.x[0, 2]) > 10.0 * math.sqrt(alone.p[0, 2, 2])  # what was claimed before
     assert abs(one.x[2]) < 3.0 * math.sqrt(one.p[2, 2]) < 3.5 * BIAS / 1.5
     # known, it would be no matter
-    np.testing.assert_allclose(of_one.more[0], of_one.of_bias[0], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(of_one.more[0], of_one.of_bias.covariance[0], rtol=1e-6, atol=1e-9)
     two, _, _ = biased(np.tile([0.5, 2.0], 12), bias, rng)
     assert abs(two.x[2]) < 3.0 * math.sqrt(two.p[2, 2]) < 0.8 * BIAS / 1.5
+
+
+@pytest.mark.parametrize("speeds", [np.full(6, 1.5), np.tile([0.5, 2.0], 3)], ids=["one speed", "two"])
+def test_the_columns_of_a_bias_are_by_how_much_it_takes_the_states_off(speeds):
+    free, of_bias = (biased(speeds, BIAS * np.eye(3)[0] * k, np.random.default_rng(3)) for k in (0.0, 1.0))
+    off = of_bias[0].x - free[0].x
+    columns = free[1].of_bias.columns[0]
+    np.testing.assert_allclose(columns[:, 0], off, rtol=1e-6, atol=1e-9)
+    # all of it at one speed, little where speeds show it
+    covariance = free[1].of_bias.covariance[0]
+    share = (columns @ columns.T)[3, 3] / covariance[3, 3]
+    assert share == pytest.approx(1.0, abs=0.01) if len(set(speeds)) == 1 else share < 0.5
 
 
 def test_what_says_that_a_vehicle_does_not_heave_makes_no_bias_of_trim(rng):

@@ -7,6 +7,7 @@ import math
 import os
 import shlex
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from io_fixtures import estimates, replayed, run, steady_run, write_bag
 from scipy.spatial.transform import Rotation
 from yaml_text import parsed, written
 
+from dvl_calib_ros.calibration.comparison import Difference
 from dvl_calib_ros.calibration.error_model import corrected_mounting
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
@@ -24,6 +26,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.files.extrinsics import load_extrinsics
 from dvl_calib_ros.files.result_file import (
     NothingUsedError,
     load_initial_calibration,
@@ -77,6 +80,41 @@ def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
             p[[6, 7], [6, 7]] = Parameters().reference_offset_std ** 2
         np.testing.assert_array_equal(loaded[name].x, x)
         np.testing.assert_array_equal(loaded[name].p, p)
+
+
+@pytest.fixture(scope="module")
+def of_biased(bag) -> Result:
+    return replayed(bag, model="G1", dvl_bias_std=0.01).result
+
+
+def test_what_a_bias_of_the_dvl_makes_comes_back_and_two_files_of_one_dvl_share_it(of_biased, tmp_path):
+    path = tmp_path / "result.yaml"
+    save_text(path, result_text(result_document(of_biased, dvl_frame="dvl_a50")))
+    found = load_extrinsics(path, "monday")
+    assert found.dvl == "dvl_a50, flu"
+    yaw_by_across = found.by_bias[2, 1]  # at about 1 m/s
+    assert abs(yaw_by_across) == pytest.approx(0.01, rel=0.2)
+    again = Difference.between(found, replace(found, name="tuesday"))
+    other = Difference.between(found, replace(found, dvl="dvl_port, flu"))
+    assert other.covariance[2, 2] - again.covariance[2, 2] > 1.9 * yaw_by_across**2
+
+
+def test_a_file_of_before_the_bias_was_kept_is_read_and_one_that_claims_too_much_of_it_is_not(of_biased, tmp_path):
+    path, document = tmp_path / "result.yaml", result_document(of_biased)
+    for each in document["models"].values():
+        each["by_dvl_bias"] = (10.0 * np.array(each["by_dvl_bias"])).tolist()
+    document["by_dvl_bias"] = copy.deepcopy(document["models"]["G1"]["by_dvl_bias"])
+    save_text(path, result_text(document))
+    with pytest.raises(InputError, match="damaged, its by_dvl_bias is more than its covariance"):
+        load_extrinsics(path, "a")
+    document["by_dvl_bias"], document["models"]["G1"]["by_dvl_bias"] = [[1.0, 2.0]], [[1.0, 2.0]]
+    save_text(path, result_text(document))
+    with pytest.raises(InputError, match="damaged, or of another version"):
+        load_extrinsics(path, "a")
+    for each in (document, *document["models"].values()):
+        del each["by_dvl_bias"]
+    save_text(path, result_text(document))
+    assert not load_extrinsics(path, "a").by_bias.any()
 
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1))

@@ -20,6 +20,8 @@ from report_fixtures import drawn
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.fleet import fleet as running
+from dvl_calib_ros.fleet.catalogue import Catalogue
+from dvl_calib_ros.fleet.history import Catalogued
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -63,6 +65,15 @@ def test_a_row_is_a_recording_and_parameter_with_what_replay_says_of_it(made, di
     assert set(own.drift_after) == {run.replayed.navigation.after.per_km}
     assert set(own.vehicle) == {"auv1"} and len(set(own.day)) == 1
     assert own.unit[["yaw", "scale"]].tolist() == ["deg", "%"]
+
+
+def test_a_part_of_before_the_bias_of_the_dvl_was_kept_is_read(made):
+    (part, *_) = (each for each in Catalogue(made[1]).parts() if each.extrinsics is not None)
+    told = dict(part.extrinsics)
+    assert Catalogued.of("a", "b", [], told).extrinsics.dvl == told["dvl"] == "dvl_link, flu"
+    del told["dvl"], told["by_bias"]
+    old = Catalogued.of("a", "b", [], told).extrinsics
+    assert old.dvl == "" and not old.by_bias.any()
 
 
 def test_a_bad_recording_is_one_row_with_its_error(made, dives):
