@@ -1,4 +1,4 @@
-"""The same work on the cores of this machine (joblib) or on a Dask cluster.
+"""The same work on the cores of this machine (joblib's loky) or on a Dask cluster.
 
 Items are independent and results come back in the order of the items, so that neither the number of workers nor the
 order in which they finish changes anything.
@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
+import os
+import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, TypeVar
 
 from .errors import InputError
@@ -26,6 +29,8 @@ WORKERS_TIMEOUT_S = 10.0
 ALL_WORKERS_LOST_S = 60.0
 # Pieces that are handed to each process of this machine, so that it never waits for the next.
 HANDED_OUT = 2
+# A worker process ends so soon (s) after the process that it works for.
+PARENT_LOOKED_FOR_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,17 +88,18 @@ def _on_cores(
 def outcomes_on_cores(work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int) -> Iterator[Outcome]:
     """`work` of every item in order, each as soon as it and those before it are done. jobs: processes, 0: one per core.
 
-    Exceptions of `work` go through. Raises InputError for a worker that died.
+    An item is taken when a process is about to be free for it. Exceptions of `work` go through. Raises InputError for
+    an item that kills its worker.
     """
-    from joblib import Parallel, delayed, parallel_config
-    from joblib.externals.loky.process_executor import TerminatedWorkerError
-
-    try:
-        # one thread of linear algebra per worker: the matrices are tiny, and the workers fill the cores
-        with parallel_config(backend="loky", inner_max_num_threads=1):
-            yield from Parallel(n_jobs=jobs or -1, return_as="generator")(delayed(work)(item) for item in items)
-    except TerminatedWorkerError as error:
-        raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs") from error
+    early: dict[int, Outcome] = {}
+    following = 0
+    for index, outcome in _as_done_on_cores(work, items, jobs or cores()):
+        if isinstance(outcome, Lost):
+            raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs")
+        early[index] = outcome
+        while following in early:
+            yield early.pop(following)
+            following += 1
 
 
 def outcomes_as_done(
@@ -122,17 +128,17 @@ def cores() -> int:
 
 
 def _as_done_on_cores(
-    work: Callable[[Item], Outcome], items: Sequence[Item], jobs: int
+    work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int
 ) -> Iterator[tuple[int, Outcome | Lost]]:
-    left = deque(enumerate(items))
-    while left:
-        for suspect in (yield from _until_one_dies(work, left, jobs)):
-            if (yield from _until_one_dies(work, deque([suspect]), 1)):
+    left = enumerate(items)
+    while suspects := (yield from _until_one_dies(work, left, jobs)):
+        for suspect in suspects:
+            if (yield from _until_one_dies(work, iter([suspect]), 1)):
                 yield suspect[0], Lost("the process that worked on it was killed, perhaps for want of memory")
 
 
 def _until_one_dies(
-    work: Callable[[Item], Outcome], left: deque[tuple[int, Item]], jobs: int
+    work: Callable[[Item], Outcome], left: Iterator[tuple[int, Item]], jobs: int
 ) -> Generator[tuple[int, Outcome | Lost], None, list[tuple[int, Item]]]:
     """`work` of the items that are left. Returns those that were under way when a process died; none if all is done."""
     from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
@@ -140,12 +146,19 @@ def _until_one_dies(
     under_way: dict[Any, tuple[int, Item]] = {}
     broken: list[tuple[int, Item]] = []
     # one thread of linear algebra per process: the matrices are tiny, and the processes fill the cores
-    executor = ProcessPoolExecutor(jobs, env=dict.fromkeys(_THREADS, "1"))
+    executor = ProcessPoolExecutor(
+        jobs, initializer=_begin, initargs=(os.getpid(), work), env=dict.fromkeys(_THREADS, "1")
+    )
     try:
-        while not broken and (left or under_way):
-            while left and len(under_way) < HANDED_OUT * jobs:
-                under_way[executor.submit(work, left[0][1])] = left[0]
-                left.popleft()
+        while not broken:
+            for item in islice(left, HANDED_OUT * jobs - len(under_way)):
+                try:
+                    under_way[executor.submit(_do, item[1])] = item
+                except BrokenProcessPool:
+                    broken.append(item)
+                    break
+            if not under_way:
+                break
             for future in wait(under_way, return_when=FIRST_COMPLETED).done:
                 item = under_way.pop(future)
                 try:
@@ -154,11 +167,30 @@ def _until_one_dies(
                     broken.append(item)
                 else:
                     yield item[0], outcome
-    except BrokenProcessPool:  # noticed when the next was handed out, which is still among those left
-        pass
     finally:
         executor.shutdown(kill_workers=True)
     return [*broken, *under_way.values()]
+
+
+# What a worker process does with its items, handed to it once
+_work: Callable[[Any], Any]
+
+
+def _begin(parent: int, work: Callable[[Any], Any]) -> None:
+    global _work
+    _work = work
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _do(item: Any) -> Any:
+    return _work(item)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when that one has ended, which may have been killed and so have told nobody."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_LOOKED_FOR_S)
+    os._exit(1)
 
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

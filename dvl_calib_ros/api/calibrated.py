@@ -271,7 +271,8 @@ class Calibration:
         from ..files.result_file import result_document, save_result
 
         target = Path(path)
-        document = result_document(self.replayed.result, self.replayed.dvl_frame, self.replayed.turned)
+        run = self.replayed
+        document = result_document(run.result, run.dvl_frame, run.turned, run.water)
         save_result(target, document, round(self.discovery.parameters.result_backups))
         return target
 

@@ -38,7 +38,7 @@ class Observability(NamedTuple):
 
     std: standard deviation (rad, dimensionless, m or s). observed: the data has halved the prior's. axis: the body axis
     (roll, pitch, yaw) that an angle's uncertainty turns about, scale (across), or the name in words. missing: what to
-    fly, '' once observed. progress: share of the way from the prior's standard deviation (0) to the fine threshold (1),
+    do, '' once observed. progress: share of the way from the prior's standard deviation (0) to the fine threshold (1),
     by its logarithm.
     """
 

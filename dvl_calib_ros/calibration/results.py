@@ -66,6 +66,11 @@ class Estimate:
         return np.sqrt(np.diag(self.recording_covariance))
 
     @property
+    def of_recording(self) -> GaussianState:
+        """State with its covariance of this recording."""
+        return GaussianState(self.state, self.recording_covariance)
+
+    @property
     def velocity_covariance(self) -> Array:
         """(n, n) of this recording, for what velocities are worth that it corrects, at the speeds driven."""
         return self.recording_covariance - self.of_bias.covariance

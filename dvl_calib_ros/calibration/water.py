@@ -8,8 +8,15 @@ face of a phased array. Medwin's equation (J. Acoust. Soc. Am. 58, 1975, p. 1318
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, NamedTuple
+
+from .kalman import GaussianState
+from .models import Model
+from .mounting_pose import scale_and_delay
+from .observability import observability
+from .parameters import Parameters
 
 # Where the equation holds: °C, with the sea's coldest water; m.
 TEMPERATURES, DEEPEST = (-2.0, 35.0), 1000.0
@@ -94,54 +101,127 @@ class Water:
         return Between(max(least, SALINITIES[0]), min(most, SALINITIES[1]))
 
 
-def water_document(water: Water) -> dict[str, float | list[float] | None]:
+# As data, beside the water's own
+_KEYS = {"used": "dvl_speed_of_sound"}
+
+
+def water_document(water: Water) -> dict[str, Any]:
     """Plain data, with None where nothing is known; ranges are least and most."""
-    given = {"temperature": water.temperature, "salinity": water.salinity, "dvl_speed_of_sound": water.used}
     ranges = {"speed_of_sound": water.speed, "scale_explained": water.scale}
     return {
-        **{name: None if math.isnan(value) else value for name, value in given.items()},
+        **{_KEYS.get(name, name): None if each != each else each for name, each in asdict(water).items()},
         **{name: None if each is None else list(each) for name, each in ranges.items()},
     }
 
 
-def in_words(water: Water | None, scale: float, std: float) -> tuple[str, ...]:
-    """The cause of a scale-factor error, and what to set, in sentences; none where the recording tells nothing.
+def water_of_document(document: Mapping[str, Any]) -> Water:
+    """What `water_document` gave. Raises LookupError, TypeError or ValueError for what is none."""
+    told = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
+    source = str(told.pop("source"))
+    return Water(**{name: math.nan if each is None else float(each) for name, each in told.items()}, source=source)
 
-    std: of the recording alone, without what differs from day to day.
+
+class CauseOfScale(NamedTuple):
+    """What a scale-factor error may come from.
+
+    sentence: in full. brief: behind the words "speed of sound", in a line of a terminal. setting: the speed of sound to
+    set, m/s, nan where there is none to say.
     """
-    if water is None:
-        return ()
+
+    sentence: str
+    brief: str
+    setting: float
+
+
+def cause_of_scale(
+    model: Model, state: GaussianState, parameters: Parameters, water: Water | None
+) -> CauseOfScale | None:
+    """What a calibration's scale comes from; None where the recording tells nothing.
+
+    state: of a model, x (n,), P (n, n) of the recording alone, without what differs from day to day.
+    """
+    found = scale_and_delay(model, state, parameters)
+    is_shown = all(each.observed for each in observability(model, state.p, parameters) if each.axis == "scale")
+    if found.scale_std is None or not is_shown:
+        return cause_of_setting(water)
+    return cause(water, found.scale, found.scale_std)
+
+
+def cause_of_setting(water: Water | None) -> CauseOfScale | None:
+    """What the speed of sound that a DVL used makes of a scale that no motion has shown."""
+    if water is None or water.speed is None or water.scale is None:
+        return None
+    said = f"{_used(water)}; {_of_water(water, water.speed)}"
+    if water.scale.least <= 0.0 <= water.scale.most:
+        return CauseOfScale(f"{_begun(said)}. They agree.", f"{water.used:.1f} m/s used, as this water has", math.nan)
+    middle = 0.5 * (water.speed.least + water.speed.most)
+    return CauseOfScale(
+        f"{_begun(said)}. That makes a scale of {_percent(water.scale)}: set the water's speed of sound.",
+        f"{water.used:.1f} m/s used, but this water has {water.speed.least:.1f} to {water.speed.most:.1f}",
+        math.nan if math.isnan(water.salinity) else middle,
+    )
+
+
+def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
+    """What a scale-factor error with this σ comes from, and what to set; None where the recording tells nothing."""
+    if water is None or (water.speed is None and math.isnan(water.used)):
+        return None
     speed, explained = water.speed, water.scale
     found = Between(scale - 2.0 * std, scale + 2.0 * std)
-    first = f"Scale {100.0 * scale:+.2f} ± {200.0 * std:.2f} % (2σ)"
-    used = "" if math.isnan(water.used) else f"the DVL used a speed of sound of {water.used:.1f} m/s"
-    of_water = "" if speed is None else f"{_named(water)} has {speed.least:.1f} to {speed.most:.1f} m/s"
-    said = f"{first}: {'; '.join(filter(None, (used, of_water)))}"
+    parts = ["" if math.isnan(water.used) else _used(water), "" if speed is None else _of_water(water, speed)]
+    said = f"Scale {100.0 * scale:+.2f} ± {200.0 * std:.2f} % (2σ): {'; '.join(filter(None, parts))}"
     new = water.used / (1.0 + scale)
-    if explained is None and speed is None:
-        return (f"{said}. Set to {new:.1f} m/s, it would read right.",) if used else ()
-    if explained is None:
-        assert speed is not None  # else the sentence before
-        was = [each * (1.0 + end) for each, end in zip(speed, found, strict=True)]
-        return (
-            f"{said}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
+    if speed is None:
+        return CauseOfScale(
+            f"{said}. Set to {new:.1f} m/s, it would read right.",
+            f"set to {new:.1f} m/s it would read right (the DVL used {water.used:.1f})",
+            new,
         )
-    share = f"{100.0 * explained.least:+.2f} to {100.0 * explained.most:+.2f} %"
+    if explained is None:
+        was = [each * (1.0 + end) for each, end in zip(speed, found, strict=True)]
+        return CauseOfScale(
+            f"{said}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
+            f"{speed.least:.1f} to {speed.most:.1f} m/s here; what the DVL used is not known",
+            math.nan,
+        )
     if not explained.meets(found):
-        return (
-            f"{said}. That explains {share}; the rest has another cause, such as beam angles or the reference. Set to "
-            f"{new:.1f} m/s, the DVL would read right in this water.",
+        return CauseOfScale(
+            f"{said}. That explains {_percent(explained)}; the rest has another cause, such as beam angles or the "
+            f"reference. Set to {new:.1f} m/s, the DVL would read right in this water.",
+            f"explains {_percent(explained)} of the scale, not the rest",
+            new,
         )
     if found.least <= 0.0 <= found.most:
-        return (f"{said}. The setting agrees with the scale that was found.",)
+        return CauseOfScale(
+            f"{said}. The setting agrees with the scale that was found.",
+            f"the DVL's {water.used:.1f} m/s agrees with the scale",
+            math.nan,
+        )
     condition = ""
     if math.isnan(water.salinity):
         needed = water.salinities(Between(water.used / (1.0 + found.most), water.used / (1.0 + found.least)))
         condition = f" if the salinity is {needed.least:.0f} to {needed.most:.0f} PSU"
-    return (f"{said}. That explains the scale{condition}: set the speed of sound to {new:.1f} m/s.",)
+    return CauseOfScale(
+        f"{said}. That explains the scale{condition}: set the speed of sound to {new:.1f} m/s.",
+        f"{new:.1f} m/s would take the scale out (the DVL used {water.used:.1f})",
+        new,
+    )
 
 
-def _named(water: Water) -> str:
+def _used(water: Water) -> str:
+    return f"the DVL used a speed of sound of {water.used:.1f} m/s"
+
+
+def _of_water(water: Water, speed: Between) -> str:
     salinity = "unknown salinity (0 to 40 PSU)" if math.isnan(water.salinity) else f"{water.salinity:.1f} PSU"
     source = f" ({water.source})" if water.source else ""
-    return f"water of {water.temperature:.1f} °C{source} and {salinity}"
+    named = f"water of {water.temperature:.1f} °C{source} and {salinity}"
+    return f"{named} has {speed.least:.1f} to {speed.most:.1f} m/s"
+
+
+def _percent(scale: Between) -> str:
+    return f"{100.0 * scale.least:+.2f} to {100.0 * scale.most:+.2f} %"
+
+
+def _begun(said: str) -> str:
+    return said[:1].upper() + said[1:]

@@ -102,12 +102,12 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     """Show an instrument's settings; write, and send them, where that is wanted."""
     from ..disk.atomic import save_bytes
     from ..errors import InputError
-    from ..files.instruments import instrument_settings
+    from ..files.instruments import AS_RECORDED, instrument_settings
     from ..files.water_linked import configure
 
     now = _told_settings(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
-    untold = [each.name for each in chosen.settings if each.name not in now]
+    untold = [each.name for each in chosen.settings if each.name not in now and each.now_by != AS_RECORDED]
     if arguments.send and (arguments.instrument != "waterlinked" or untold):
         raise InputError(
             "--send is for waterlinked, and needs to know what it was set to when the data were recorded: "
@@ -149,6 +149,7 @@ def _settings_lines(chosen: InstrumentSettings) -> list[str]:
 def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     import numpy as np
 
+    from ..errors import printable
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
@@ -163,6 +164,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
         f"TF:     {transform}",
         f"scale:  {scale_advice(calibrated)}",
     ]
+    if calibrated.cause_of_scale is not None:
+        lines.append(f"water:  {printable(calibrated.cause_of_scale.sentence)}")
     if any(calibrated.lever_arm):
         found = "found" if calibrated.lever_arm_found else "as lever_arm says"
         lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {found}")

@@ -67,6 +67,8 @@ def rendered(status: Status | None, now_s: float, log: Sequence[str] = (), said:
     is_usable = status.get("usable") != "no"
     lines.append(text("mounting now") if is_usable else text("mounting: not to be used, see above", colour))
     lines += [text("  ".join(_quantity(status, *each) for each in row), "" if is_usable else "dim") for row in MOUNTING]
+    if is_usable and (sound := status.values.get("speed of sound", "")):
+        lines.append(text(f"speed of sound  {sound}"))
     lines.append(text(""))
     lines += [_goal(status, *each) for each in GOALS if f"goal {each[0]} [%]" in status.values]
     lines.append(text(_rose(status)))

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
         common.write_json(path, replay_document(replayed, models) | {"discovery": discovery.document()})
 
     def save(path: Path) -> None:
-        document = result_document(result, replayed.dvl_frame, replayed.turned)
+        document = result_document(result, replayed.dvl_frame, replayed.turned, replayed.water)
         save_result(path, document, round(parameters.result_backups))
 
     common.deliver(

@@ -154,10 +154,18 @@ def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> C
         covariance = "no covariance"
     else:
         constant = " always" if (variances == variances[0]).all() else ""
-        covariance = f"±{math.sqrt(float(np.median(variances.mean(axis=1)))):.2g} m/s{constant}"
+        covariance = f"±{_claimed(variances, topic.window_s)}{constant}"
     name = {"dvl": "DVL", "reference": "reference", "imu": "IMU"}[role]
     frame_id = "" if look is None else look.frame_id
     return Content(name, topic.topic, topic.msgtype, len(topic), rate_hz, frame_id, covariance)
+
+
+def _claimed(variances: Array, window_s: float) -> str:
+    """σ per axis that messages claim, of positions in m. variances: (N, 3), of positions those of `Recorded`."""
+    if not window_s:
+        return f"{math.sqrt(float(np.median(variances.mean(axis=1)))):.2g} m/s"
+    # a velocity is made of two positions; one without a height claims that to be anywhere
+    return f"{window_s * math.sqrt(0.5 * float(np.median(variances))):.2g} m"
 
 
 def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> Array:

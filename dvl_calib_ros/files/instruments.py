@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
-from ..errors import InputError
+from ..errors import InputError, printable
 from .mounting import POSITION_UNKNOWN, CalibratedMounting
 from .urdf import numbers
 
@@ -23,23 +23,27 @@ from .urdf import numbers
 SAID_FROM = math.radians(0.05)
 # An autopilot's orientation is a quarter turn; so far from one (rad) it is none.
 QUARTER, NEAR_QUARTER = 0.5 * math.pi, math.radians(20.0)
+# Where a value comes from that nobody told.
+AS_DELIVERED, AS_RECORDED = "as delivered", "as recorded"
+SPEED_OF_SOUND = "speed_of_sound"
+# A speed of sound (m/s) that is told may be rounded.
+SAME_SPEED = 1.0
 # Delays that an autopilot can be told.
 DELAY_MS = (0, 250)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One value of an instrument. now: None where that is not known; assumed: what it is delivered with, for nobody
-    said it."""
+    """One value of an instrument. now: None where that is not known; now_by: by what it is, where nobody said it."""
 
     name: str
     now: float | None
     new: float
     unit: str = ""
-    assumed: bool = False
+    now_by: str = ""
 
     def __str__(self) -> str:
-        before = "not told" if self.now is None else f"{self.now:g}" + (" (as delivered)" if self.assumed else "")
+        before = "not told" if self.now is None else f"{self.now:g}" + (f" ({self.now_by})" if self.now_by else "")
         return f"{self.name}: {before} -> {self.new:g} {self.unit}".rstrip()
 
 
@@ -94,7 +98,10 @@ def instrument_settings(
                 "it was set to when the data were recorded"
             )
     delivered = {key: holds.delivered for key, holds in instrument.ranges.items() if holds.delivered is not None}
-    settings, text, notes = instrument.settings(calibrated, {**delivered, **told})
+    recorded = _recorded(calibrated, instrument, told)
+    settings, text, notes = instrument.settings(calibrated, {**delivered, **recorded, **told})
+    if calibrated.cause_of_scale is not None:
+        notes.append(printable(calibrated.cause_of_scale.sentence))
     for setting in settings:
         holds = instrument.ranges[setting.name]
         if not holds.least <= setting.new <= holds.most:
@@ -102,29 +109,58 @@ def instrument_settings(
                 f"{setting.name} would be {setting.new:g}, and may be {holds.least:g} to {holds.most:g}; is what it is "
                 "set to now right?"
             )
-    marked = [replace(each, assumed=each.name in delivered and each.name not in told) for each in settings]
+    origins = {**dict.fromkeys(delivered, AS_DELIVERED), **dict.fromkeys(recorded, AS_RECORDED)}
+    marked = [replace(each, now_by="" if each.name in told else origins.get(each.name, "")) for each in settings]
     return InstrumentSettings(name, instrument.document, tuple(marked), text, tuple(notes))
+
+
+def _recorded(calibrated: CalibratedMounting, instrument: Instrument, told: Mapping[str, float]) -> dict[str, float]:
+    """The speed of sound that the DVL used when the data were recorded. Raises InputError where another was told."""
+    used = math.nan if calibrated.water is None else calibrated.water.used
+    holds = instrument.ranges.get(SPEED_OF_SOUND)
+    if holds is None or not holds.least <= used <= holds.most:
+        return {}
+    if abs(told.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
+        raise InputError(
+            f"{SPEED_OF_SOUND}={told[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave it "
+            "out, or calibrate with a recording of that setting"
+        )
+    return {SPEED_OF_SOUND: round(used, 2)}
 
 
 def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
     offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
     turned = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
-    settings, notes = [turned], [*_left(calibrated, swing), *_delay(calibrated)]
-    factor, speed = calibrated.speed_of_sound_factor, now.get("speed_of_sound")
-    if calibrated.model.scale_axes and speed is None:
-        notes.append(
-            f"speed_of_sound: times {factor:.5f}; say what it was set to (--now speed_of_sound=1500), for m/s. "
-            "That is what a wrong speed of sound looks like: set the water's temperature and salinity right first"
-        )
-    elif calibrated.model.scale_axes and speed is not None:
-        new = round(factor * speed, 2)
-        settings.append(Setting("speed_of_sound", speed, new, "m/s"))
-        scale = f"{100.0 * calibrated.scale_ahead:+.2f} %"
-        notes.append(
-            f"scale {scale}: as a speed of sound that is {speed - new:+.1f} m/s off. Other water, another speed"
-        )
+    sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
+    settings, notes = [turned, *sound], [*_left(calibrated, swing), *_delay(calibrated), *of_sound]
     command = {"command": "set_config", "parameters": {each.name: each.new for each in settings}}
     return settings, json.dumps(command) + "\n", notes
+
+
+def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[list[Setting], list[str]]:
+    """What takes the scale out; of a DVL whose setting is not known the water's own, where the recording has that."""
+    factor, scale = calibrated.speed_of_sound_factor, f"{100.0 * calibrated.scale_ahead:+.2f} %"
+    if calibrated.model.scale_axes and now is not None:
+        new = round(factor * now, 2)
+        said = f"scale {scale}: as a speed of sound that is {now - new:+.1f} m/s off. Other water, another speed"
+        return [Setting(SPEED_OF_SOUND, now, new, "m/s")], [said]
+    water = calibrated.water
+    if water is not None and water.speed is not None and not math.isnan(water.salinity):
+        middle, half = 0.5 * (water.speed.most + water.speed.least), 0.5 * (water.speed.most - water.speed.least)
+        why = (
+            "for the calibration holds no scale"
+            if now is not None
+            else f"for what the DVL used is not known; if it is, say so (--now {SPEED_OF_SOUND}=1500)"
+        )
+        said = f"{SPEED_OF_SOUND}: that of the water, ±{half:.1f} m/s, {why}"
+        return [Setting(SPEED_OF_SOUND, now, round(middle, 1), "m/s")], [said]
+    if not calibrated.model.scale_axes:
+        return [], []
+    said = (
+        f"{SPEED_OF_SOUND}: times {factor:.5f}; say what it was set to (--now {SPEED_OF_SOUND}=1500), for m/s. That is "
+        "what a wrong speed of sound looks like: set the water's temperature and salinity right first"
+    )
+    return [], [said]
 
 
 def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
@@ -217,7 +253,7 @@ def _delay(calibrated: CalibratedMounting) -> list[str]:
 INSTRUMENTS: Mapping[str, Instrument] = {
     "waterlinked": Instrument(
         "Water Linked DVL protocol, JSON over TCP, set_config; axes: vehicle frame (docs.waterlinked.com/dvl)",
-        {"mounting_rotation_offset": Range(0.0, 360.0, 0.0), "speed_of_sound": Range(1000.0, 2000.0)},
+        {"mounting_rotation_offset": Range(0.0, 360.0, 0.0), SPEED_OF_SOUND: Range(1000.0, 2000.0)},
         _water_linked,
     ),
     "cerulean": Instrument(

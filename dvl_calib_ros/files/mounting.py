@@ -24,6 +24,7 @@ from ..calibration.models import MODELS, Model
 from ..calibration.mounting_pose import position_in_body, scale_and_delay
 from ..calibration.observability import Convergence, observability
 from ..calibration.parameters import FRD, ParameterError, Parameters
+from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from .parameter_edit import as_yaml, new_file, with_parameters
@@ -53,7 +54,8 @@ class CalibratedMounting:
     where that is not known. scale (3,): δk per DVL axis, 0 where
     not estimated; scale_ahead: of motion ahead. lever_arm (3,): m from the reference point, body frame, and
     dvl_time_offset: s, positive late; as they were found, else as the parameters say. objections: why it should not be
-    applied; doubts: what to know when it is; both in sentences.
+    applied; doubts: what to know when it is; both in sentences. water: what was known of it, and cause_of_scale: what
+    that says of the scale; None where nothing.
     """
 
     path: Path
@@ -69,6 +71,8 @@ class CalibratedMounting:
     lever_arm: tuple[float, ...] = (0.0, 0.0, 0.0)
     dvl_time_offset: float = 0.0
     position: tuple[float, ...] | None = None
+    water: Water | None = None
+    cause_of_scale: CauseOfScale | None = None
 
     @property
     def lever_arm_found(self) -> bool:
@@ -139,6 +143,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         objections, doubts = _judged(content.get("verification"), convergence)
         objections += _said(content, Severity.REJECT)
         doubts += _said(content, Severity.MARGINAL, Severity.WARNING)
+        water = water_of_document(content["water"]) if "water" in content else None
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     except ParameterError as error:
@@ -156,9 +161,14 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         )
     doubts += _unseen(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
+    of_scale = None
+    if water is not None:
+        of_recording = load_result(path, of_recording=True)[1][model.name]
+        of_scale = cause_of_scale(model, of_recording, parameters, water)
     return CalibratedMounting(
-        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, arm, delay, position
-    )
+        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, arm, delay, position, water,
+        of_scale,
+    )  # fmt: skip
 
 
 def _rounded(values: Sequence[float] | Array) -> list[float]:
@@ -172,7 +182,7 @@ def _judged(
     """Objections and doubts from the verdict and the convergence that a result file states."""
     objections, doubts = [], []
     if convergence is Convergence.COLLECTING:
-        objections.append("it has converged in nothing yet (collecting)")
+        objections.append("its data show no angle and no scale yet (collecting)")
     elif convergence is Convergence.COARSE:
         doubts.append(
             "its convergence is coarse: standard deviations are above fine_std_misalignment or fine_std_scale"

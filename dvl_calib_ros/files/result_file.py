@@ -26,6 +26,7 @@ from ..calibration.observability import Convergence
 from ..calibration.parameters import FLU, FRD, Parameters
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
+from ..calibration.water import Water, water_document
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError, printable
@@ -52,11 +53,14 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
     }
 
 
-def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = False) -> dict[str, Any]:
+def result_document(
+    result: Result, dvl_frame: str = "dvl_link", turned: bool = False, water: Water | None = None
+) -> dict[str, Any]:
     """A result as plain data for the result file.
 
-    turned: the driver's data are forward-right-down and were turned. The mounting is that of the forward-left-up axes,
-    as mounting_rpy is; the transform is that of dvl_frame itself, for those who use the driver's data as they come.
+    water: what is known of it. turned: the driver's data are forward-right-down and were turned. The mounting is that
+    of the forward-left-up axes, as mounting_rpy is; the transform is that of dvl_frame itself, for those who use the
+    driver's data as they come.
     """
     estimate = result.estimate
     parameters = result.parameters
@@ -108,6 +112,7 @@ def result_document(result: Result, dvl_frame: str = "dvl_link", turned: bool = 
         **days_document(result),
         "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
+        **({} if water is None else {"water": water_document(water)}),
         "parameters": dict(parameters),
         _END: True,
     }

@@ -20,7 +20,7 @@ from .one import Entry, Row
 
 ROWS, PAGE = "rows", "index.html"
 # Version of the schema: part of what says whether a recording is done
-SCHEMA = 1
+SCHEMA = 2
 _KEY = b"dvl_calib"
 
 

@@ -6,6 +6,7 @@ that of the day is added once. A mounting that moves within a day parts the day.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -25,13 +26,17 @@ DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True)
 class Catalogued:
-    """A recording as the catalogue has it. covariance_of_recording (8, 8): without what differs from day to day."""
+    """A recording as the catalogue has it. covariance_of_recording (8, 8): without what differs from day to day.
+
+    cause_of_scale: what the water says of it, in a sentence, '' for nothing.
+    """
 
     recording: str
     vehicle: str
     rows: tuple[Row, ...]
     extrinsics: Extrinsics | None = None
     covariance_of_recording: Array | None = None
+    cause_of_scale: str = ""
 
     @staticmethod
     def of(recording: str, vehicle: str, rows: Sequence[Row], told: Mapping[str, Any] | None) -> Catalogued:
@@ -42,7 +47,8 @@ class Catalogued:
         for name in own.keys() & {"rotation_body_from_dvl", "lever_arm", "covariance", "by_bias"}:
             own[name] = np.array(own[name])
         own["shown"] = np.array(own["shown"], dtype=bool)
-        return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**own), np.array(told["covariance_of_recording"]))
+        covariance, cause = np.array(told["covariance_of_recording"]), str(told.get("cause_of_scale", ""))
+        return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**own), covariance, cause)
 
     @property
     def error(self) -> str:
@@ -64,15 +70,30 @@ class CompassDeviation(NamedTuple):
     recordings: int
 
 
+class WaterOfRecording(NamedTuple):
+    """first_ns: stamp of the recording's first sample. used: speed of sound that the DVL used, m/s, nan if not known.
+
+    cause_of_scale: what the water says of the scale, in a sentence.
+    """
+
+    first_ns: int
+    used: float
+    cause_of_scale: str
+
+
 @dataclass(frozen=True)
 class VehicleHistory:
-    """A vehicle. days: its calibrations by day. compared: None where there are less than two. heading: None without."""
+    """A vehicle. days: its calibrations by day. compared: None where there are less than two. heading: None without.
+
+    water: of its newest recording that tells of it.
+    """
 
     name: str
     recordings: int
     days: tuple[Extrinsics, ...]
     compared: Comparison | None
     heading: CompassDeviation | None
+    water: WaterOfRecording | None = None
 
 
 class NeedsPerson(NamedTuple):
@@ -137,7 +158,7 @@ def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
     usable = [each for each in entries if each.is_usable]
     aided = [each for each in usable if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
     days = _days(aided or usable)  # what a model without GNSS assumes of currents is no measure of one with
-    return VehicleHistory(name, len(entries), tuple(days), _compared(days), _heading(usable))
+    return VehicleHistory(name, len(entries), tuple(days), _compared(days), _heading(usable), _water(usable))
 
 
 def _compared(several: Sequence[Extrinsics]) -> Comparison | None:
@@ -178,6 +199,16 @@ def _of_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
     covariance = together.covariance + max(of_days, key=np.trace)
     name = own[0][0].name.rpartition("/")[2] if len(own) == 1 else f"{len(own)} recordings"
     return replace(together, name=name, covariance=covariance)
+
+
+def _water(entries: Sequence[Catalogued]) -> WaterOfRecording | None:
+    """Of the newest that tells of it."""
+    found = []
+    for each in entries:
+        if each.extrinsics is not None and each.cause_of_scale:
+            used = next((row["value"] for row in each.rows if row["parameter"] == "dvl_speed_of_sound"), math.nan)
+            found.append(WaterOfRecording(each.extrinsics.first_ns, used, each.cause_of_scale))
+    return max(found, default=None)
 
 
 def _heading(entries: Sequence[Catalogued]) -> CompassDeviation | None:

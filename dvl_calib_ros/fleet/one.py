@@ -17,6 +17,7 @@ from ..calibration.extrinsics import Extrinsics
 from ..calibration.parameters import Parameters
 from ..calibration.quantities import quantities
 from ..calibration.results import Estimate, Result
+from ..calibration.water import Water
 from ..discovery.discover import Given, discover
 from ..errors import InputError
 from ..recordings.recording import open_recording
@@ -120,7 +121,9 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     told = None
     if extrinsics is not None and without_day is not None:
         told = {**_plain(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
-    return Entry([common | each for each in (*_quantities(result), *_heading(estimate))], told)
+        told |= _cause(replayed)
+    rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
+    return Entry([common | each for each in rows], told)
 
 
 def _day(stamp_ns: int) -> date | None:
@@ -167,6 +170,31 @@ def _heading(estimate: Estimate) -> list[Row]:
             {"parameter": name, "unit": unit, "value": factor * float(each), "std_recording": factor * float(own)}
         )
     return rows
+
+
+def _water(water: Water | None) -> list[Row]:
+    """Rows of the water, as far as it is known; of a range its middle and half."""
+    if water is None:
+        return []
+    known = [
+        ("water_temperature", "degC", water.temperature, water.temperature_error),
+        ("water_salinity", "PSU", water.salinity, math.nan),
+        ("dvl_speed_of_sound", "m/s", water.used, math.nan),
+    ]
+    if water.speed is not None:
+        least, most = water.speed
+        known.append(("water_speed_of_sound", "m/s", 0.5 * (least + most), 0.5 * (most - least)))
+    return [
+        {"parameter": name, "unit": unit, "value": value, "std_recording": 0.5 * twice}
+        for name, unit, value, twice in known
+        if not math.isnan(value)
+    ]
+
+
+def _cause(replayed: Replayed) -> dict[str, str]:
+    """What the water says of the scale, by the name under which the catalogue keeps it."""
+    cause = replayed.cause_of_scale
+    return {} if cause is None else {"cause_of_scale": cause.sentence}
 
 
 def _without_day(replayed: Replayed) -> Replayed:

@@ -35,6 +35,7 @@ from ..calibration.mounting_pose import mounting_pose
 from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.positions import check_model
 from ..calibration.samples import DvlSample, VelocityFrame
+from ..calibration.water import Water
 from ..discovery.heading_claim import believed_heading
 from ..discovery.placement import Frames, not_default, placement
 from ..disk.atomic import check_writable
@@ -68,6 +69,7 @@ from .parameters import declare_parameters
 from .pauses import Pauses, steady_s
 from .status import status_name
 from .transforms import Transforms
+from .water import WaterHeard
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
 QUEUE = 5000
@@ -146,6 +148,9 @@ class CalibrationNode(AnsweringNode):
         now_s = self._pauses.running_s(steady_s())
         self._silence, self._recent, self._card = Silence(now_s, topics), RecentCounts(), Card(now_s)
         self._discovering = self._to_discover(parameters, topics)
+        self._water_heard = WaterHeard(self, parameters.discover)
+        self._water: Water | None = None
+        self._newest_dvl: Any = None
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/save", self._on_save)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -329,6 +334,7 @@ class CalibrationNode(AnsweringNode):
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
         self._place(message)
         self._take_off_late_clocks()
+        self._newest_dvl = message
         sample = self._feed.dvl(message, received_ns)
         if sample is not None:
             self._publish_corrected(sample)
@@ -440,17 +446,23 @@ class CalibrationNode(AnsweringNode):
         problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
+        self._hear_water()
         if self._save_problem:
             problems.append(self._save_problem)
         now_s = self._pauses.running_s(steady_s())
         status = diagnose(
             self._calibrator, decoder.dvl_type, problems, self._silence, self._recent, now_s,
-            self._pauses.within(RECENT_S), self._card,
+            self._pauses.within(RECENT_S), self._card, self._water,
         )  # fmt: skip
         status.name = status_name(self.get_fully_qualified_name())
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
+
+    def _hear_water(self) -> None:
+        own = [subscription.topic_name for subscription in self._inputs.values()]
+        dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
+        self._water, self._newest_dvl = self._water_heard.hear(own, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
         type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
@@ -502,7 +514,8 @@ class CalibrationNode(AnsweringNode):
 
     def _result_document(self) -> dict[str, Any]:
         decoder = self._feed.decoder
-        return result_document(self._calibrator.result(), decoder.dvl_frame or "dvl_link", decoder.turns_dvl)
+        frame = decoder.dvl_frame or "dvl_link"
+        return result_document(self._calibrator.result(), frame, decoder.turns_dvl, self._water)
 
     def _check_result_file(self, name: str) -> None:
         if name:

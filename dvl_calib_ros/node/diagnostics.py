@@ -24,6 +24,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.register.arrival import apart
 from ..calibration.results import Estimate
 from ..calibration.samples import Stream
+from ..calibration.water import CauseOfScale, Water, cause_of_scale
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
@@ -131,11 +132,12 @@ def diagnose(
     now_s: float,
     pauses_s: Sequence[float] = (),
     card: Card | None = None,
+    water: Water | None = None,
 ) -> DiagnosticStatus:
     """Status of the running calibration, still without a name.
 
     dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock. pauses_s: how long
-    this process did not run, of late. card: what an operator has to know beside.
+    this process did not run, of late. card: what an operator has to know beside. water: what is known of it.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     grown = recent.grown(counts, now_s)
@@ -166,6 +168,7 @@ def diagnose(
         **_beside_the_pose(estimate, calibrator.parameters),
         **_count_values(estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
+        **_cause_values(cause_of_scale(MODELS[estimate.model], estimate.of_recording, calibrator.parameters, water)),
         **({} if card is None else card.values(calibrator, estimate, counts, now_s, rejected)),
     }
     for number, each in enumerate(found, start=1):
@@ -225,6 +228,17 @@ def _beside_the_pose(estimate: Estimate, parameters: Parameters) -> dict[str, st
     for name, std in zip(values, stds, strict=True):
         words[f"sigma {name}"] = "not estimated" if std is None else f"{std:.4f}"
     return words
+
+
+def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
+    if cause is None:
+        return {}
+    setting = "-" if math.isnan(cause.setting) else f"{cause.setting:.1f}"
+    return {
+        "cause of the scale": cause.sentence,
+        "speed of sound": cause.brief,
+        "speed of sound to set [m/s]": setting,
+    }
 
 
 def _count_values(estimate: Estimate, counts: Counts) -> dict[str, str]:

@@ -28,7 +28,11 @@ class _Waiting:
 
     def __init__(self, node: CalibrationNode, woken: GuardCondition) -> None:
         self.inputs = list(node.inputs)
-        others = [each for each in node.subscriptions if each not in self.inputs]
+        others = [
+            each
+            for each in node.subscriptions
+            if each not in self.inputs and each.callback_group.can_execute(each)  # what is asked for now and then waits
+        ]
         self.guards, self.waitables = list(node.guards), list(node.waitables)
         kinds: list[tuple[str, list[Any]]] = [
             ("subscription", [*self.inputs, *others]),

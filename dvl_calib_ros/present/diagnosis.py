@@ -269,8 +269,8 @@ class Detectable(NamedTuple):
 
 
 DETECTABLE_NOTE = (
-    "The size that this data would show four times in five at the level of the tests; green where that is no more than "
-    "the size worth knowing of."
+    "An effect of this size would be found in four of five recordings like this one. Green: that is no more than the "
+    "size worth knowing of."
 )
 DETECTABLE: Columns[Detectable] = {
     "effect": lambda each: each.effect,

@@ -60,9 +60,14 @@ def fleet(result: Fleet) -> Document:
     said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
     sitting = [VehicleNow(each, now(each)) for each in vehicles]
-    scales = [
-        (each.name, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.scale))
+    speeds = [
+        VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.scale))
         for each in vehicles
+    ]
+    waters = [
+        Sentence(f"{each.name}, {date(each.water.first_ns)[:10]}: {each.water.cause_of_scale}")
+        for each in vehicles
+        if each.water is not None
     ]
     several = any(len(each.recordings) > 1 for each in result.persons)
     compasses = [(each.name, each.heading) for each in vehicles if each.heading is not None]
@@ -80,7 +85,7 @@ def fleet(result: Fleet) -> Document:
                 table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=2),
             ),
             *(_trend(each) for each in sorted(vehicles, key=_by_word)),
-            section("Speed of sound", table_by(SPEEDS, [each for each in scales if each[1]], (SPEED_NOTE,))),
+            section("Speed of sound", table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)), *waters),
             section(
                 "Deviation of the compass",
                 replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True),
@@ -180,22 +185,39 @@ def _trend(vehicle: VehicleHistory) -> Section:
 
 
 SPEED_NOTE = (
-    "A scale is what a wrong speed of sound looks like: if the instrument was set to "
-    f"{SET_SPEED:.0f} m/s, the water had this speed. Set temperature and salinity first."
+    "A scale is what a wrong speed of sound looks like: if that explains all of it, the water had these speeds. Where "
+    f"no recording tells what the DVL was set to, {SET_SPEED:.0f} m/s are assumed."
 )
-# Name of a vehicle and its days that show a scale, the smallest scale first
-SPEEDS: Columns[tuple[str, Sequence[Extrinsics]]] = {
-    "": lambda each: each[0],
-    "days": lambda each: str(len(each[1])),
-    **columns_for(
-        {"lowest": -1, "highest": 0},
-        lambda each, at: Cell(
-            f"{number(SET_SPEED / (1.0 + each[1][at].scale), 0)} m/s",
+
+
+class VehicleSpeeds(NamedTuple):
+    """A vehicle and its days that show a scale, the smallest scale first."""
+
+    history: VehicleHistory
+    days: Sequence[Extrinsics]
+
+    @property
+    def set_to(self) -> float:
+        """Speed of sound that the DVL used in the newest recording that tells, m/s; else what is usual."""
+        used = math.nan if self.history.water is None else self.history.water.used
+        return SET_SPEED if math.isnan(used) else used
+
+    def speed_at(self, at: int) -> Cell:
+        """The water's on one of the days."""
+        day = self.days[at]
+        return Cell(
+            f"{number(self.set_to / (1.0 + day.scale), 0)} m/s",
             "",
-            f"{with_std(100.0 * each[1][at].scale, 100.0 * each[1][at].std[SCALE])} %, "
-            f"{date(each[1][at].first_ns)[:10]}",
-        ),
-    ),
+            f"{with_std(100.0 * day.scale, 100.0 * day.std[SCALE])} %, {date(day.first_ns)[:10]}",
+        )
+
+
+SPEEDS: Columns[VehicleSpeeds] = {
+    "": lambda each: each.history.name,
+    "days": lambda each: str(len(each.days)),
+    "set to": lambda each: f"{number(each.set_to, 1)} m/s",
+    "lowest": lambda each: each.speed_at(-1),
+    "highest": lambda each: each.speed_at(0),
 }
 
 

@@ -270,7 +270,8 @@ def _mounting(run: Replayed) -> Iterator[Item]:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
         yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")
-    yield from map(Sentence, run.cause_of_scale)
+    if (cause := run.cause_of_scale) is not None:
+        yield Sentence(cause.sentence)
 
 
 def _paste(run: Replayed) -> Commands:

@@ -30,7 +30,8 @@ class Recorded:
     stamps_ns: (N,) of the header, 0 where it has none. log_ns: (N,). values: (N, 3) m/s; of an IMU (N, 4) its
     quaternion. variances: (N, 3) (m/s)², nan where not given; (0, 3) of an IMU. unmeasured: (N,) axes that a
     message says not to measure, as of `screening.Screened`; (0,) of an IMU. refused: by counter of the driver's
-    rules, of how many. unreadable: messages that could not be read.
+    rules, of how many. unreadable: messages that could not be read. window_s: over which positions became these
+    velocities, 0 of what is measured as a velocity.
     """
 
     topic: str
@@ -42,6 +43,7 @@ class Recorded:
     unmeasured: Codes
     refused: Mapping[str, int]
     unreadable: int
+    window_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -68,8 +70,9 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     singly = sorted((row for part in parts for row in part.singles.messages()), key=lambda row: row[0])
     rows: list[_Row] = []
     position = VELOCITY_TYPES[msgtype].position if msgtype in VELOCITY_TYPES else None
+    window_s = 0.0 if position is None else _window_s(singly, parameters)
     if position is not None:
-        rows = _differences(singly, position, parameters)
+        rows = _differences(singly, position, window_s)
     else:
         for arrival, log_ns, message, _ in singly:
             try:
@@ -89,7 +92,7 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
         columns.append(_of_rows(rows, width, is_imu))
     _, log_ns, stamps_ns, values, variances, unmeasured = columns[0] if len(columns) == 1 else _in_order(columns)
     values, variances = _plausible(values, FASTEST), _plausible(variances, FASTEST**2)
-    return Recorded(topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, unreadable)
+    return Recorded(topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, unreadable, window_s)
 
 
 def _claimed(laid: Laid) -> tuple[Array, Codes]:
@@ -132,11 +135,16 @@ def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Para
     return _Row(arrival, log_ns, at_ns, (v.x, v.y, v.z), variances), [] if broken is None else [broken.counter]
 
 
-def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType, parameters: Parameters) -> list[_Row]:
-    """Positions as the velocities between them."""
+def _window_s(singly: Sequence[tuple[int, int, Any, str]], parameters: Parameters) -> float:
+    """Over which positions are differenced."""
     log_ns = np.array([log_ns for _, log_ns, message, _ in singly if message is not None], dtype=np.int64)
     every_s = 1e-9 * float(np.median(np.diff(log_ns))) if len(log_ns) > 1 else 0.0
-    difference = FixDifference(every_s if every_s > SELDOM_S else parameters.position_window, kind.between)
+    return every_s if every_s > SELDOM_S else parameters.position_window
+
+
+def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType, window_s: float) -> list[_Row]:
+    """Positions as the velocities between them."""
+    difference = FixDifference(window_s, kind.between)
     rows = []
     for arrival, at_log_ns, message, _ in singly:
         if message is None or not kind.is_valid(message):

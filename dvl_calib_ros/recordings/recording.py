@@ -26,16 +26,18 @@ from ..calibration.water import Water
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.opening import open_bags
+from ..messages.waters import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
 from .look import Survey, look_of
 from .recorded import Recorded, recorded
 from .streams import Stretch, stretches
 from .topics import Topics
-from .waters import OfWater, WaterCollector, readers, water_of
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 # Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
 MOST_STATIC = 200
+# Of a topic that tells of the water so many messages of each window are read: water changes slowly.
+WATER_OF_WINDOW = 20
 Span = tuple[int, int]
 """First and last log time, ns."""
 
@@ -298,7 +300,9 @@ def _read(
         for part in window.parts:
             topic = part.channel.topic
             if topic in waters:
-                waters[topic].take(part)
+                for message, _ in islice(part.messages(), WATER_OF_WINDOW):
+                    if message is not None:
+                        waters[topic].add(message)
                 if topic not in collectors:
                     continue
             if topic in collectors:

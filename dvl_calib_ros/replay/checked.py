@@ -21,7 +21,6 @@ from ..calibration.dropouts import DROPOUT_NS
 from ..calibration.error_model import corrected_mounting
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.frames import whole_degrees
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
@@ -114,7 +113,7 @@ def checked_replay(
 def _mounting_found(result: Result) -> tuple[float, float, float] | None:
     """The mounting (rad, whole degrees) that a calibration found instead of one that was guessed; None near that."""
     parameters, estimate = Parameters.from_mapping(result.parameters), result.estimate
-    model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.recording_covariance)
+    model, state = MODELS[estimate.model], estimate.of_recording
     about = shown_misalignment(model, state, parameters)
     if math.atan(float(np.linalg.norm(about))) < parameters.reject_misalignment or parameters.initial_calibration:
         return None

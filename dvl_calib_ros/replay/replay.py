@@ -18,16 +18,14 @@ from ..calibration.comparison import Comparison
 from ..calibration.doubts import doubts
 from ..calibration.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
-from ..calibration.mounting_pose import scale_and_delay
 from ..calibration.navigation import Navigation, objections
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
-from ..calibration.water import Water, in_words
+from ..calibration.water import CauseOfScale, Water, cause_of_scale
 from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
@@ -75,12 +73,10 @@ class Replayed:
         return self.dvl_type + (", turned from forward-right-down to forward-left-up" if self.turned else "")
 
     @property
-    def cause_of_scale(self) -> tuple[str, ...]:
-        """The scale as what the speed of sound makes of it, in sentences; none where the recording tells nothing."""
+    def cause_of_scale(self) -> CauseOfScale | None:
+        """The scale as what the speed of sound makes of it; None where the recording tells nothing."""
         estimate, parameters = self.result.estimate, Parameters.from_mapping(self.result.parameters)
-        state = GaussianState(estimate.state, estimate.recording_covariance)
-        found = scale_and_delay(MODELS[estimate.model], state, parameters)
-        return () if found.scale_std is None else in_words(self.water, found.scale, found.scale_std)
+        return cause_of_scale(MODELS[estimate.model], estimate.of_recording, parameters, self.water)
 
 
 def replay(
@@ -198,7 +194,7 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
     return extrinsics_of(
         name,
         MODELS[estimate.model],
-        GaussianState(estimate.state, estimate.recording_covariance),
+        estimate.of_recording,
         Parameters.from_mapping(result.parameters),
         (result.first_ns, result.last_ns),
         estimate.used,

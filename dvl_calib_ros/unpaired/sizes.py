@@ -102,7 +102,7 @@ def is_there(own: Size, other: Size) -> bool:
 
 
 def smallest_difference(vehicle: Size, simulator: Size, n_claims: int) -> dict[str, float]:
-    """Difference of each parameter that would be found four times in five, at the level of so many claims."""
+    """Difference of each parameter that would be found in four of five recordings, where so many are claimed."""
     std = np.sqrt(np.diag(vehicle.mean[1]) + np.diag(simulator.mean[1]))
     factor = float(norm.isf(0.005 / max(n_claims, 1)) + norm.ppf(0.8))
     return {spec.name: factor * float(s) for spec, s in zip(amplitudes(vehicle.effect), std, strict=True)}

@@ -184,3 +184,5 @@ def test_doctor_says_of_noisy_positions_what_a_replay_gives(usbl):
     assert [found.code for found in seen.findings if found.code in ("DOCTOR_UNITS", "DOCTOR_COVARIANCE")] == []
     yaw = next(each for each in seen.shown if each.name == "yaw")
     assert yaw.std < 0.5 and not yaw.needs
+    (reference,) = (each for each in seen.contents if each.role == "reference")
+    assert reference.covariance.removesuffix(" always") == "±2 m"  # poses without a height, of 2 m to the side

@@ -2,53 +2,35 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
+import re
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import succeed
+from command_line import fail, succeed
 from conftest import ROOT
 from io_fixtures import write_bag
 from log_fixtures import nortek, pd0
+from water_fixtures import SALINITY, TEMPERATURE, USED, dive, with_water
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.bags.writer import BagWriter
-from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.calibration.water import speed_of_sound
-from dvl_calib_ros.messages.encode import SampleWriter, WaterReading
+from dvl_calib_ros.files.instruments import instrument_settings
+from dvl_calib_ros.files.mounting import load_calibrated_mounting
+from dvl_calib_ros.messages.waters import OfWater, water_of
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
-from dvl_calib_ros.recordings.waters import OfWater, water_of
-from dvl_calib_ros.simulation.scenario import Scenario, simulate
-from dvl_calib_ros.simulation.sensors import DvlErrors
 
 SCHEMA = json.loads((ROOT / "docs" / "json_schema.json").read_text())["$defs"]["replay"]
-TEMPERATURE, SALINITY = 12.1, 35.0
-USED = 1.0062 * speed_of_sound(TEMPERATURE, SALINITY)
-
-
-def dive(scale: float = 0.0062):
-    errors = DvlErrors((0.01, -0.01, 0.02), (scale,) * 3, beam_std=0.003)
-    made = simulate(
-        Scenario(seconds=240.0, seed=1, errors=errors, gnss_std=0.02, gnss_frame=VelocityFrame.BODY, imu_rate=10.0)
-    )
-    return made.imu, made.gnss, made.dvl
-
-
-def with_water(path: Path, temperature: float, salinity: float) -> Path:
-    imu, gnss, dvl = dive()
-    with BagWriter(path) as bag:
-        writer = SampleWriter(bag)
-        writer.recording(imu, gnss, dvl)
-        writer.water(WaterReading(each.stamp_ns, USED, temperature, salinity) for each in dvl)
-    return path
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> Path:
-    return with_water(tmp_path_factory.mktemp("waters") / "bag", TEMPERATURE, SALINITY)
+    return with_water(tmp_path_factory.mktemp("waters") / "bag")
 
 
 def test_a_replay_says_the_scale_in_its_cause_and_what_to_set(bag, tmp_path, capsys):
@@ -65,7 +47,7 @@ def test_a_replay_says_the_scale_in_its_cause_and_what_to_set(bag, tmp_path, cap
 
 
 def test_an_unknown_salinity_is_said_as_a_range(tmp_path, capsys):
-    bag = with_water(tmp_path / "bag", TEMPERATURE, float("nan"))
+    bag = with_water(tmp_path / "bag", salinity=float("nan"))
     said, _ = succeed(capsys, "replay", bag)
     told = " ".join(said.split())
     assert "and unknown salinity (0 to 40 PSU)" in told and "if the salinity is" in told
@@ -76,6 +58,48 @@ def test_a_recording_without_water_says_nothing(tmp_path):
     bag = write_bag(tmp_path / "bag", sorted((*imu, *gnss, *dvl), key=lambda sample: sample.stamp_ns))
     run = dc.replay(bag, history=False)
     assert run.replayed.water is None and "water" not in run.document()
+
+
+@pytest.fixture(scope="module")
+def saved(bag, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("saved") / "result.yaml"
+    dc.replay(bag, history=False).save(path)
+    return path
+
+
+def applied(capsys, saved: Path, *options: str) -> str:
+    said, _ = succeed(capsys, "apply", saved, "--force", "--instrument", *options)
+    return " ".join(said.split())
+
+
+def test_apply_takes_the_speed_of_sound_that_the_recording_says_was_used(saved, capsys):
+    said = applied(capsys, saved, "waterlinked", "--now", "mounting_rotation_offset=0")
+    new = re.search(rf"speed_of_sound: {USED:.1f}\d* \(as recorded\) -> ([\d.]+) m/s", said)
+    assert abs(float(new[1]) - speed_of_sound(TEMPERATURE, SALINITY)) < 5.0
+    assert "note: Scale +0.6" in said and "That explains the scale: set the speed of sound to 149" in said
+    assert "That explains the scale" in applied(capsys, saved, "cerulean")
+    shown, _ = succeed(capsys, "apply", saved, "--force")
+    assert "water: Scale +0.6" in " ".join(shown.split())
+    told = fail(capsys, "apply", saved, "--force", "--instrument", "waterlinked", "--now", "speed_of_sound=1450")
+    assert f"the recording says that the DVL used {USED:.1f} m/s" in told
+
+
+def test_of_a_dvl_whose_setting_nobody_knows_apply_sets_the_speed_of_sound_of_the_water(saved):
+    calibrated = load_calibrated_mounting(saved)
+    water = dataclasses.replace(calibrated.water, used=math.nan)
+    chosen = instrument_settings(dataclasses.replace(calibrated, water=water), "waterlinked", force=True)
+    (sound,) = (each for each in chosen.settings if each.name == "speed_of_sound")
+    assert sound.now is None and sound.new == pytest.approx(speed_of_sound(TEMPERATURE, SALINITY), abs=0.1)
+    assert any("that of the water, ±" in each and "--now speed_of_sound=1500" in each for each in chosen.notes)
+    fresh_or_salt = dataclasses.replace(water, salinity=math.nan)
+    chosen = instrument_settings(dataclasses.replace(calibrated, water=fresh_or_salt), "waterlinked", force=True)
+    assert [each.name for each in chosen.settings] == ["mounting_rotation_offset"]
+
+
+def test_a_result_whose_water_is_no_water_is_refused(saved, tmp_path, capsys):
+    damaged = tmp_path / "result.yaml"
+    damaged.write_text(saved.read_text().replace("salinity: 35.0", "salinity: salt"))
+    assert "damaged" in fail(capsys, "apply", damaged, "--force")
 
 
 def test_several_recordings_have_one_water(bag):

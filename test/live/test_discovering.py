@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from io_fixtures import run, write_bag
+from position_fixtures import USBL, write_positions
 from ros import NODE, until
 
 from dvl_calib_ros.demo.player import BagPlayer
+from validation.positions import Truth, driven
 
 TARGETS = {"dvl/twist": "/a50/velocity", "gnss/twist": "/gps", "imu/data": "/imu"}
 # A node that listens for a second
@@ -55,3 +58,31 @@ def test_topics_that_nobody_named_are_found_and_calibrated_with(world, playing):
         assert any("[TOPICS_FOUND]" in value for key, value in latest(said).items() if key.startswith("finding"))
     assert "nobody publishes the DVL's topic" in node.output
     assert "DVL /a50/velocity (TwistWithCovarianceStamped" in node.output and "reference /gps" in node.output
+
+
+@pytest.mark.slow
+def test_a_usbl_with_a_fix_each_five_seconds_is_waited_for_found_and_calibrated_with(world, tmp_path):
+    """In its own time until it is found, then once more, fast and to the end."""
+    truth = Truth((0.0, 0.01, 0.03), 0.006, (0.5, 0.0, -0.3), 0.5)
+    made = driven(np.random.default_rng(3), 900.0, truth=truth, fix_s=5.0)
+    bag = write_positions(tmp_path / "bag", made)
+    targets = {"dvl/twist": "/a50/velocity", USBL: "/usbl/pose", "imu/data": "/imu"}
+    player, found = BagPlayer(world.node, [bag], targets), threading.Event()
+    thread = threading.Thread(target=lambda: player.play(1.0, has_ended=found.is_set))
+    with world.calibration_node("max_latency:=40.0", entry=("-c", QUICKLY)) as node:
+        said = world.received(DiagnosticArray, "/diagnostics")
+        thread.start()
+        try:
+            until(lambda: "TOPICS_FOUND" in " ".join(latest(said).values()), "the topics to be found")
+        finally:
+            found.set()
+            thread.join()
+        player.wait_for_subscribers()
+        sent = player.play(45.0)
+        for stream, topic in (("dvl", "dvl/twist"), ("reference", USBL), ("imu", "imu/data")):
+            until(
+                lambda stream=stream, topic=topic: latest(said)[f"{stream} received"] == str(sent[topic]),
+                lambda stream=stream, topic=topic: f"{stream}: {sent[topic]}, not {latest(said)[f'{stream} received']}",
+            )
+        until(lambda: latest(said)["model"] == "D1", lambda: f"legs of positions, not {latest(said)['model']}")
+    assert "reference /usbl/pose (PoseWithCovarianceStamped" in node.output

@@ -74,6 +74,13 @@ def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_
     assert "not to be used" in wrong and "good enough: save" not in wrong
 
 
+def test_the_speed_of_sound_is_said_in_a_line_where_the_water_is_known():
+    brief = "1497.3 m/s would take the scale out (the DVL used 1506.6)"
+    assert f"speed of sound  {brief}\n" in drawn(status(**{"speed of sound": brief}), 100.0, width=80)
+    assert "speed of sound" not in drawn(status(), 100.0)
+    assert "speed of sound" not in drawn(status(2, "wrong", usable="no", **{"speed of sound": brief}), 100.0)
+
+
 def test_what_another_process_says_can_neither_style_the_view_nor_move_the_cursor():
     evil = "[bold]\x1b[2J[/] \x07"
     text = drawn(status(1, evil, **dict.fromkeys(VALUES, evil)), 100.0, [evil], evil)

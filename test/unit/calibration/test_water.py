@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 
 import pytest
 
-from dvl_calib_ros.calibration.water import Water, in_words, speed_of_sound, water_document
+from dvl_calib_ros.calibration.water import (
+    Water,
+    cause,
+    cause_of_setting,
+    speed_of_sound,
+    water_document,
+    water_of_document,
+)
 
 SEA = {"temperature": 12.1, "salinity": 35.0}
 
@@ -57,19 +66,36 @@ def test_a_salinity_that_nobody_measured_is_anything_from_fresh_to_the_saltiest(
     ],
 )  # fmt: skip
 def test_a_scale_is_said_in_its_cause_and_no_more_than_is_known(water, scale, said, not_said):
-    (sentence,) = in_words(Water(**water), scale, 0.0005)
-    assert said in sentence and not_said not in sentence
-    assert sentence.startswith(f"Scale {100.0 * scale:+.2f} ± 0.10 % (2σ)")
+    found = cause(Water(**water), scale, 0.0005)
+    assert said in found.sentence and not_said not in found.sentence
+    assert found.sentence.startswith(f"Scale {100.0 * scale:+.2f} ± 0.10 % (2σ)")
+    assert len(f"speed of sound  {found.brief}") <= 80
+    setting = re.search(r"[Ss]et (?:the speed of sound )?to ([\d.]+) m/s", found.sentence)
+    assert math.isnan(found.setting) if setting is None else f"{found.setting:.1f}" == setting[1]
 
 
 def test_where_the_recording_tells_nothing_nothing_is_said():
-    assert in_words(None, 0.006, 0.0005) == () and in_words(Water(), 0.006, 0.0005) == ()
-    assert in_words(Water(temperature=math.nan, salinity=35.0), 0.006, 0.0005) == ()
+    for water in (None, Water(), Water(temperature=math.nan, salinity=35.0)):
+        assert cause(water, 0.006, 0.0005) is None and cause_of_setting(water) is None
+    assert cause_of_setting(Water(used=1500.0)) is None and cause_of_setting(Water(**SEA)) is None
+
+
+def test_before_the_motion_shows_a_scale_the_setting_is_held_against_the_water():
+    right, wrong = (cause_of_setting(Water(**SEA, used=used)) for used in (1497.0, 1530.0))
+    assert right.sentence.endswith("They agree.") and math.isnan(right.setting)
+    assert "makes a scale of +1." in wrong.sentence and wrong.sentence.startswith("The DVL used")
+    assert wrong.setting == pytest.approx(speed_of_sound(12.1, 35.0), abs=0.1)
+    assert math.isnan(cause_of_setting(Water(temperature=12.1, used=1600.0)).setting)  # a range of 50 m/s
+    assert all(len(f"speed of sound  {each.brief}") <= 80 for each in (right, wrong))
 
 
 def test_as_data_what_is_not_known_is_null():
     assert water_document(Water(temperature=4.0))["dvl_speed_of_sound"] is None
     written = water_document(Water(**SEA, used=1500.0))
+    again = water_of_document(json.loads(json.dumps(written)))
+    assert again == Water(**SEA, used=1500.0) and water_document(water_of_document(water_document(Water()))) == (
+        water_document(Water())
+    )
     assert written["scale_explained"] == pytest.approx(
         [1500.0 / each - 1.0 for each in written["speed_of_sound"][::-1]]
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,8 +19,10 @@ import pytest
 from command_line import fail, succeed
 from fleet_fixtures import copies, write_dive, write_fleet
 from report_fixtures import drawn
+from water_fixtures import SALINITY, TEMPERATURE, USED, with_water
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.water import speed_of_sound
 from dvl_calib_ros.fleet import fleet as running
 from dvl_calib_ros.fleet.catalogue import Catalogue
 from dvl_calib_ros.fleet.history import Catalogued
@@ -173,6 +177,19 @@ def test_a_recording_whose_name_is_no_text_or_that_is_gone_costs_its_row(dives, 
     assert dc.fleet(place, tmp_path / "out", jobs=1).unchanged == 2
 
 
+def test_what_recordings_say_of_the_water_is_in_rows_and_on_the_page(tmp_path):
+    bag = with_water(tmp_path / "dives" / "auv1" / "dive")
+    result = dc.fleet(tmp_path / "dives", tmp_path / "out", jobs=1)
+    own = table(tmp_path / "out").set_index("parameter")
+    names = ["water_temperature", "water_salinity", "dvl_speed_of_sound"]
+    assert own.value[names].tolist() == pytest.approx([TEMPERATURE, SALINITY, USED])
+    assert own.value["water_speed_of_sound"] == pytest.approx(speed_of_sound(TEMPERATURE, SALINITY), abs=0.1)
+    assert 1.0 < own.std_recording["water_speed_of_sound"] < 3.0
+    page = result.page.read_text()
+    assert dc.replay(bag, history=False).replayed.cause_of_scale.sentence in html.unescape(page)
+    assert f"{USED:.1f} m/s" in page  # and not the usual 1500
+
+
 def test_a_part_of_another_schema_is_not_read(made, dives, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(made[1], out)
@@ -271,6 +288,52 @@ def test_what_kills_its_worker_costs_itself_alone():
     outcomes = dict(outcomes_as_done(eval, items, Workers(jobs=2)))
     assert isinstance(outcomes.pop(2), Lost)
     assert outcomes == {0: 1, 1: 2, 3: 4, 4: 5, 5: 6}
+
+
+def children_of(parent: int) -> list[int]:
+    """Processes that are not over yet, by their parent."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, of = stat.read_text().rpartition(")")[2].split()[:2]
+            if int(of) == parent and state != "Z":
+                found.append(int(stat.parent.name))
+    return found
+
+
+def is_over(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_workers_end_with_a_parent_that_is_killed():
+    """Those that work, and one that waits for work in vain."""
+    script = (
+        "import time; from dvl_calib_ros.parallel import Workers, outcomes_as_done; "
+        "list(outcomes_as_done(time.sleep, [300.0, 300.0], Workers(jobs=3)))"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script])
+    try:
+        until = time.monotonic() + 60.0
+        while len(workers := children_of(parent.pid)) < 3:
+            assert time.monotonic() < until and parent.poll() is None
+            time.sleep(0.05)
+        time.sleep(1.0)  # they are up
+        workers = children_of(parent.pid)
+    finally:
+        parent.kill()
+        parent.wait()
+    try:
+        until = time.monotonic() + 20.0
+        while not all(map(is_over, workers)):
+            assert time.monotonic() < until, f"orphans: {[pid for pid in workers if not is_over(pid)]}"
+            time.sleep(0.05)
+    finally:
+        for pid in workers:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
 
 
 @pytest.mark.slow

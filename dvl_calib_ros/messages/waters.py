@@ -1,24 +1,21 @@
-"""What a recording says of its water: thermometers, salinity, pressure, and the speed of sound that a DVL used."""
+"""What messages say of the water: thermometers, salinity, pressure, and the speed of sound that a DVL used."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from itertools import islice
 from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..bags.columns import Part
 from ..calibration.frames import Array
 from ..calibration.water import SALINITIES, TEMPERATURES, THERMOMETER, Water
 
 _FLOATS = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 _PHASED_ARRAY = 1
-# Of a topic that is fast so many messages of each window are read: water changes slowly.
-_OF_WINDOW = 20
 # Words in the name of a thermometer's topic that is in the water, and of one that is not.
 _IN_WATER = {"water", "sea", "ctd", "dvl", "ocean", "outside", "external"}
 _NOT_IN_WATER = {
@@ -69,21 +66,18 @@ def readers(topic: str, msgtype: str) -> Mapping[str, Callable[[Any], float]]:
 
 
 class WaterCollector:
-    """Collects one topic's readings as its messages are read."""
+    """Collects one topic's readings, the last of them if there are more than so many."""
 
-    def __init__(self, topic: str, msgtype: str) -> None:
+    def __init__(self, topic: str, msgtype: str, most: int | None = None) -> None:
         self._topic, self._readers = topic, readers(topic, msgtype)
-        self._values: dict[str, list[float]] = {kind: [] for kind in self._readers}
+        self._values: dict[str, deque[float]] = {kind: deque(maxlen=most) for kind in self._readers}
         self._variance = 0.0
 
-    def take(self, part: Part) -> None:
-        """Read some messages of a window."""
-        for message, _ in islice(part.messages(), _OF_WINDOW):
-            if message is None:
-                continue
-            for kind, read in self._readers.items():
-                self._values[kind].append(read(message))
-            self._variance = max(self._variance, float(getattr(message, "variance", 0.0)))
+    def add(self, message: Any) -> None:
+        """Read a message."""
+        for kind, read in self._readers.items():
+            self._values[kind].append(read(message))
+        self._variance = max(self._variance, float(getattr(message, "variance", 0.0)))
 
     def readings(self) -> list[OfWater]:
         """Of each kind, where there is one that is a number."""

@@ -1,0 +1,82 @@
+"""What topics of a running vehicle say of its water, looked at once a second.
+
+What nobody waits for costs nothing per message: of each topic the newest message stays in the middleware until it is
+asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from ..calibration.water import Water
+from ..errors import InputError
+from ..messages.waters import WaterCollector, readers, water_of
+from .inbox import take
+from .message_types import message_class
+
+# New topics are looked for each so many seconds; of each so many of the last readings are kept, one a second.
+LOOK_S, READINGS = 5, 600
+
+
+class NeverCalled(CallbackGroup):
+    """Of subscriptions that no executor is to wait for."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Never."""
+        return False
+
+
+class WaterHeard:
+    """Readings of the topics that there are. looks_for: whether topics are listened to, beside the DVL's own."""
+
+    def __init__(self, node: Node, looks_for: bool) -> None:
+        self._node, self._looks_for = node, looks_for
+        self._group = NeverCalled()
+        self._subscriptions: dict[tuple[str, str], Any] = {}
+        self._collectors: dict[tuple[str, str], WaterCollector] = {}
+        self._seconds = 0
+
+    def hear(self, own: Collection[str], dvl: tuple[str, str, Any]) -> Water | None:
+        """What is known of the water, asked once a second.
+
+        own: topics that the node hears anyway. dvl: topic, type and newest message of the DVL's, None for none.
+        """
+        if self._looks_for and self._seconds % LOOK_S == 0:
+            self._look(own)
+        self._seconds += 1
+        for key, subscription in self._subscriptions.items():
+            if (arrived := take(subscription)) is not None:
+                self._collectors[key].add(arrived.message)
+        topic, kind, message = dvl
+        if message is not None and readers(topic, kind):
+            self._collector(topic, kind).add(message)
+        return water_of([each for one in self._collectors.values() for each in one.readings()], topic)
+
+    def _collector(self, topic: str, kind: str) -> WaterCollector:
+        return self._collectors.setdefault((topic, kind), WaterCollector(topic, kind, READINGS))
+
+    def _look(self, own: Collection[str]) -> None:
+        for topic, kinds in self._node.get_topic_names_and_types():
+            for kind in kinds:
+                if topic in own or (topic, kind) in self._subscriptions or not readers(topic, kind):
+                    continue
+                try:
+                    class_ = message_class(topic, kind)
+                except InputError:  # not installed, so nothing of it can be read
+                    continue
+                profile = QoSProfile(
+                    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+                )
+                self._subscriptions[topic, kind] = self._node.create_subscription(
+                    class_, topic, lambda _: None, profile, callback_group=self._group
+                )
+                self._collector(topic, kind)
