@@ -1,4 +1,7 @@
-"""The result of a calibration as a YAML file: never lost to a worse one, never believed blindly when read."""
+"""The result of a calibration as a YAML file: never lost to a worse one, never believed blindly when read.
+
+(Long, because what is written, kept and believed of a result is one thing.)
+"""
 
 from __future__ import annotations
 

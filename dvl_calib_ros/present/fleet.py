@@ -202,22 +202,20 @@ class VehicleSpeeds(NamedTuple):
         used = math.nan if self.history.water is None else self.history.water.used
         return SET_SPEED if math.isnan(used) else used
 
-    def speed_at(self, at: int) -> Cell:
-        """The water's on one of the days."""
-        day = self.days[at]
-        return Cell(
-            f"{number(self.set_to / (1.0 + day.scale), 0)} m/s",
-            "",
-            f"{with_std(100.0 * day.scale, 100.0 * day.std[SCALE])} %, {date(day.first_ns)[:10]}",
-        )
-
 
 SPEEDS: Columns[VehicleSpeeds] = {
     "": lambda each: each.history.name,
     "days": lambda each: str(len(each.days)),
     "set to": lambda each: f"{number(each.set_to, 1)} m/s",
-    "lowest": lambda each: each.speed_at(-1),
-    "highest": lambda each: each.speed_at(0),
+    **columns_for(
+        {"lowest": -1, "highest": 0},
+        lambda each, at: Cell(
+            f"{number(each.set_to / (1.0 + each.days[at].scale), 0)} m/s",
+            "",
+            f"{with_std(100.0 * each.days[at].scale, 100.0 * each.days[at].std[SCALE])} %, "
+            f"{date(each.days[at].first_ns)[:10]}",
+        ),
+    ),
 }
 
 
