@@ -55,6 +55,9 @@ TRIMMED = 0.85
 # A noise (m/s) that no reference is below, and how many times too much one may claim, or too little: by its own
 # differences from sample to sample, which at a lower rate (Hz) are the waves'.
 QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.0
+# ... and one that sends velocities: so much that it would be rejected for agreeing too well (verification.IMPLAUSIBLE).
+# A filter of the DVL does as well, and is no noisier from sample to sample; a reference so many times noisier is none.
+CLAIMS_FAR_TOO_MUCH, NOISIER = 4.0, 1.5
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
 # Reference frames, in the order in which they are taken for one that the data cannot tell.
@@ -147,7 +150,8 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         seen = in_time(recording, found.topics, clocks.registration)
         seen = replace(seen, topics=recording.survey.topics, counts=recording.survey.counts)
         topics = found.topics
-        all_named = replace(named, dvl_topic=topics.dvl, gnss_topic=topics.gnss, imu_topic=topics.imu)
+        imu = topics.imu if topics.imu in seen.topics else named.imu_topic
+        all_named = replace(named, dvl_topic=topics.dvl, gnss_topic=topics.gnss, imu_topic=imu)
         again = _Search(seen, parameters, all_named, recording.where).run()
         if again.values != found.values:
             found, clocks = again, _clocks(recording, again, named) or clocks
@@ -556,27 +560,36 @@ class _Search:
             )
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
-        """The noise of a reference that claims none, or far too little, or as positions one that its velocities do not
-        have."""
-        if self._gives("gnss_aided_std") or self._gives("use_message_covariance") or chosen.best_left > FITS:
+        """The noise of a reference that claims none, or far too little, or one that its velocities do not have."""
+        if self._gives("gnss_aided_std") or self._gives("use_message_covariance"):
+            return
+        if self._readings.beside_noise(chosen.best_left) > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
         own = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
         too_little = not is_position and own > CLAIMS_TOO_LITTLE * reference.claimed_std
-        if not (is_position or too_little or math.isnan(reference.claimed_std)):
+        # of a lever arm and a delay that are yet to be found a part stays in
+        least = 0.5 * chosen.best_left
+        per_axis = dvl.speed / (math.sqrt(3.0) * TRIMMED)
+        claims = [reference.claimed_std] if is_position else [reference.claimed_std, dvl.claimed_std]
+        claimed = math.hypot(*np.nan_to_num(claims))  # both are in what is predicted
+        most = claimed / (CLAIMS_TOO_MUCH if is_position else CLAIMS_FAR_TOO_MUCH)
+        may_claim_less = is_position or own > NOISIER * math.sqrt(white_noise(dvl.values))
+        claims_none = not is_position and math.isnan(reference.claimed_std)
+        if not (too_little or claims_none or (may_claim_less and most > max(least * per_axis, QUIETEST))):
             return
         best, _ = self._readings.registered(chosen.reading, None if known is None else known.T)
-        # of a lever arm and a delay that are yet to be found a part stays in
-        left = max(min(best, chosen.best_left), 0.5 * chosen.best_left)
-        shown = max(left * dvl.speed / (math.sqrt(3.0) * TRIMMED), QUIETEST)
-        if is_position and not reference.claimed_std > CLAIMS_TOO_MUCH * shown:
+        shown = max(max(min(best, chosen.best_left), least) * per_axis, QUIETEST)
+        too_much = may_claim_less and most > shown
+        if not (too_much or too_little or claims_none):
             return
-        if is_position or too_little:
+        if too_much or too_little:
             self._values["use_message_covariance"] = False
         self._values["gnss_aided_std"] = float(f"{shown:.2g}")
-        claims = "claims no noise" if math.isnan(reference.claimed_std) else f"claims {reference.claimed_std:.2g} m/s"
+        whose = "DVL and reference claim" if too_much and not is_position else "the reference claims"
+        size = f"{claimed if too_much else reference.claimed_std:.2g} m/s" if claimed else "no noise"
         self._found.append(
-            f"the reference {claims}; against the DVL it shows {shown:.2g} m/s per axis, which is used "
+            f"{whose} {size}; against the DVL it shows {shown:.2g} m/s per axis, which is used "
             f"(-p gnss_aided_std:={shown:.2g})"
         )
 

@@ -57,6 +57,17 @@ def test_without_an_imu_a_reference_in_the_body_is_compared_and_not_said_to_be_i
     assert "earth's frame cannot" not in " ".join(out.split())
 
 
+def test_without_an_imu_a_late_reference_in_the_body_is_taken_off_and_no_imu_asked_for(tmp_path):
+    told, m = Told(), motion()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    for i, stamp in told.every(5.0, 0.04):
+        sample = Sample(stamp + 2_000_000_000, m.velocity_body[i] + told.rng.normal(0.0, 0.03, 3), 0.03**2 * np.eye(3))
+        told.say(sample.stamp_ns, "/gps/vel", TWIST, told.make.velocity(TWIST, sample, "base_link"))
+    run = dc.replay(told.write(tmp_path / "bag"), history=False)
+    apart = run.discovery.parameters.dvl_time_offset - run.discovery.parameters.reference_time_offset
+    assert abs(apart + 2.0) < 0.1 and run.verdict != "reject"
+
+
 @pytest.mark.slow
 def test_a_reject_offers_nothing_to_paste_anywhere(tmp_path, capsys):
     told = Told()
@@ -134,6 +145,30 @@ def test_the_noise_of_a_reference_that_claims_none_or_far_too_little_is_measured
     assert 0.04 < run.discovery.parameters.gnss_aided_std < 0.08
     held_out = run.replayed.result.verifications[run.model].held_out
     assert 0.7 < held_out.corrected / held_out.predicted < 1.1
+
+
+@pytest.mark.spread(1)
+@pytest.mark.parametrize("dvl_claims, reference_claims", [(0.01, 1.0), (2.0, 0.05), (0.01, 0.01)])
+def test_noise_that_is_claimed_far_too_large_or_small_is_measured_and_no_reason_to_reject(
+    tmp_path, dvl_claims, reference_claims
+):
+    """Two of them were rejected as if the DVL were in the reference, the third as every sample was an outlier."""
+    told, m, std = Told(), motion(), 0.3 if reference_claims < 0.05 else 0.05
+    told.dvl("/dvl", TWIST, "dvl_link")
+    for row in told.rows:
+        row[3].twist.covariance[[0, 7, 14]] = dvl_claims**2
+    for i, stamp in told.every(5.0, 0.04):
+        velocity = m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, std, 3)
+        message = told.make.velocity(TWIST, Sample(stamp, velocity, reference_claims**2 * np.eye(3)), "map")
+        told.say(stamp, "/gps/vel", TWIST, message)
+    told.imu("/imu", "base_link")
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+    run = dc.replay(told.write(tmp_path / "bag"), history=False)
+    assert run.discovery.parameters.use_message_covariance is False
+    assert 0.7 * std < run.discovery.parameters.gnss_aided_std < 1.5 * std
+    assert run.verdict == "accept"
+    off = run.mounting.rpy_deg[2] - math.degrees(rpy_from_rotation(true_mounting((0.0, 0.0, 0.0)))[2])
+    assert abs(off) < 3.0 * run.mounting.std_deg[2]
 
 
 @pytest.mark.parametrize(("claimed", "taken"), [(0.012, True), (1.2, False)])
