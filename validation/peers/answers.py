@@ -15,7 +15,18 @@ from scipy import stats
 from dvl_calib_ros.calibration.parameters import Parameters
 
 from .forward import CLOCKS, COLUMNS, LINEAR, N_PARTS, Clock, Forward
-from .search import ALWAYS, Fitted, Search, Whitening, residual_of_all, sizes_of, solved, step_of
+from .search import (
+    ALWAYS,
+    EXPECTED_MISALIGNMENT,
+    EXPECTED_SCALE,
+    Fitted,
+    Search,
+    Whitening,
+    calibration_of,
+    residual_of_all,
+    solved,
+    step_of,
+)
 from .streams import Floats, read_streams
 
 Document = dict[str, Any]
@@ -23,7 +34,8 @@ Document = dict[str, Any]
 NORMAL_95 = 1.959964
 # Standard deviation of each effect's parameters before anything was seen, in their units
 EXPECTED: Mapping[str, float] = {
-    "misalignment": 0.1, "scale": 0.05, "lever_arm": 1.0, "velocity_bias": 0.05, "quadratic_scale": 0.02,
+    "misalignment": EXPECTED_MISALIGNMENT, "scale": EXPECTED_SCALE,
+    "lever_arm": 1.0, "velocity_bias": 0.05, "quadratic_scale": 0.02,
     "scale_drift": 0.1, "misalignment_drift": 0.15, "mount_flexure": 0.015, "axis_nonorthogonality": 0.03,
     "water_lock": 0.2, "heading_error": 0.05, "sideslip": 0.3, "tilt_coupling": 1.5, "dvl_time_offset": 1.0,
     "reference_time_offset": 1.0, "attitude_time_offset": 0.7, "reference_lag": 1.0, "clock_drift": 8.0,
@@ -83,8 +95,8 @@ def searched(paths: tuple[Path, ...], parameters: Parameters) -> Searched:
     began = time.process_time()
     model = Forward(read_streams(paths, parameters), parameters.mounting_rpy)
     best = Search(model).best(3)[0]
-    model.calibrated(best.values[:6])
-    model.take(sizes_of(best))
+    model.calibrated(calibration_of(best))
+    model.clock = best.clock
     search = Search(model, Whitening(residual_of_all(model, best.clock, best.members)))
     sets = tuple(search.best())
     return Searched(search, sets, time.process_time() - began)

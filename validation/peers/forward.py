@@ -54,9 +54,6 @@ CLOCKS: Mapping[str, str] = {
     "time_offset_jump": "seconds",
 }
 EFFECTS = (*LINEAR, *CLOCKS)
-GROW_WITH_SPEED = frozenset(
-    {"quadratic_scale", "scale_drift", "misalignment_drift", "mount_flexure", "axis_nonorthogonality"}
-)
 NEED_AN_EARTH_FRAME = frozenset({"heading_error", "attitude_time_offset"})
 CALIBRATION = (*(f"{ROTATION}.{axis}" for axis in AXES), *(f"{SCALE}.{axis}" for axis in AXES))
 COLUMNS = (*CALIBRATION, *(f"{name}.{each}" for name, parameters in LINEAR.items() for each in parameters))
@@ -83,14 +80,15 @@ class Clock:
 class Forward:
     """The columns of recordings at any clock, about a calibration that is moved on by `calibrated`.
 
-    Rows are the reference's samples, to whose times the quieter DVL is interpolated.
+    Rows are the reference's samples, to whose times the DVL is interpolated.
     """
 
     def __init__(self, streams: Sequence[Streams], mounting_rpy: Sequence[float]) -> None:
         self.streams = list(streams)
         self.body_from_dvl = Rotation.from_euler("xyz", mounting_rpy).as_matrix()
         self.inverse_calibration = np.eye(3)
-        self.taken = np.zeros(len(COLUMNS))
+        # at which the DVL's noise is taken
+        self.clock = Clock()
         self.n_axes = 3 if all(each.vertical for each in self.streams) else 2
         self.in_earth = all(each.in_earth for each in self.streams)
         self._rows = [_inside(each) for each in self.streams]
@@ -114,21 +112,12 @@ class Forward:
         turn = Rotation.from_rotvec(-small[:3]).as_matrix()
         self.inverse_calibration = turn @ np.diag(1.0 / (1.0 + small[3:6])) @ self.inverse_calibration
 
-    def take(self, sizes: Mapping[str, tuple[float, float]]) -> None:
-        """Take columns about a velocity without effects that grow with it, of sizes by column: exact where large."""
-        for name, (value, _) in sizes.items():
-            if name.split(".")[0] in GROW_WITH_SPEED:
-                self.taken[COLUMNS.index(name)] = value
-
     def at(self, clock: Clock, generic: bool = False) -> Floats:
         """(C, N, P + 1) all columns and, last, the difference, at a clock. generic: also those that no effect has."""
         blocks = []
         for streams, rows in zip(self.streams, self._rows, strict=True):
             seen = _Seen(streams, clock, self)
-            difference = -seen.turned(seen.body)
-            if self.taken.any():
-                seen.correct(np.einsum("nap,p->na", np.stack([*seen.columns()], axis=2), self.taken))
-            columns = [*seen.columns(), *(seen.generic() if generic else ()), difference]
+            columns = [*seen.columns(), *(seen.generic() if generic else ()), -seen.turned(seen.body)]
             blocks.append(seen.compared(np.stack(columns, axis=2), rows))
         return np.ascontiguousarray(np.concatenate(blocks)[:, : self.n_axes].transpose(1, 0, 2))
 
@@ -169,10 +158,10 @@ def _at(times: Floats, stamps: Floats, values: Floats) -> Floats:
     return np.asarray(np.einsum("nk,nk...->n...", weights, values[places]))
 
 
-def _noise(values: Floats) -> float:
-    """Rms of noise, by how much a sample differs from what its neighbours make of it."""
-    third = np.diff(values, n=3, axis=0) / np.sqrt(20.0)
-    return float(1.4826 * np.median(np.abs(third)))
+def _late(clock: Clock, times: Floats, seconds: float) -> Floats:
+    """(n,) s by which the DVL's stamps are late."""
+    late = clock.size("dvl_time_offset") + clock.size("clock_drift") / HOUR_S * times
+    return np.asarray(late + clock.size("time_offset_jump") * (times >= clock.leap_at * seconds))
 
 
 class _Seen:
@@ -184,37 +173,35 @@ class _Seen:
         self.true_s = streams.reference_s - clock.size("reference_time_offset")
         self._lag_s = max(clock.size("reference_lag"), 0.0)
         self.elapsed = np.arange(self.true_s[0], self.true_s[-1] + FINE_S, FINE_S) if self._lag_s else self.true_s
-        inertial = self.elapsed + clock.size("attitude_time_offset")
-        self.attitude = Rotation.from_quat(_at(inertial, streams.imu_s, streams.attitude)).as_matrix()
-        self.rates = _at(inertial, streams.imu_s, streams.rates)
-        places, weights = _weights(self.elapsed + self._late(self.elapsed), streams.dvl_s)
-        interpolated = np.einsum("nk,nkj->nj", weights, streams.dvl[places])
-        self.dvl = interpolated @ model.inverse_calibration.T
+        self.attitude = self._attitude(streams, clock, self.elapsed)
+        self.rates = _at(self.elapsed + clock.size("attitude_time_offset"), streams.imu_s, streams.rates)
+        self.dvl = self._velocity(streams, streams.quiet, clock, self.elapsed) @ model.inverse_calibration.T
         self.body = self.dvl @ model.body_from_dvl.T
+        noisy_s = streams.reference_s - model.clock.size("reference_time_offset")
+        noise = self._velocity(streams, streams.dvl - streams.quiet, model.clock, noisy_s) @ model.inverse_calibration.T
+        self._noise = noise @ model.body_from_dvl.T
+        if self.in_earth:
+            self._noise = np.einsum("nij,nj->ni", self._attitude(streams, model.clock, noisy_s), self._noise)
         self.speed = np.linalg.norm(self.dvl, axis=1)
-        self._dvl_step_s = float(np.median(np.diff(streams.dvl_s)))
-        _, compared = _weights(self.true_s + self._late(self.true_s), streams.dvl_s)
-        self._kept = (compared**2).sum(axis=1)
-        noise = _noise(streams.dvl) ** 2
-        self._dvl_share = noise / (noise + _noise(streams.reference[:, :2]) ** 2 + 1e-12)
 
-    def _late(self, times: Floats) -> Floats:
-        """(n,) s by which the DVL's stamps are late."""
-        late = self.clock.size("dvl_time_offset") + self.clock.size("clock_drift") / HOUR_S * times
-        return np.asarray(late + self.clock.size("time_offset_jump") * (times >= self.clock.leap_at * self.seconds))
+    def _velocity(self, streams: Streams, values: Floats, clock: Clock, times: Floats) -> Floats:
+        """(n, 3) of values of the DVL's samples, at true times."""
+        return _at(times + _late(clock, times, self.seconds), streams.dvl_s, values)
+
+    def _attitude(self, streams: Streams, clock: Clock, times: Floats) -> Floats:
+        """(n, 3, 3) at true times."""
+        at = times + clock.size("attitude_time_offset")
+        return np.asarray(Rotation.from_quat(_at(at, streams.imu_s, streams.attitude)).as_matrix())
 
     def compared(self, values: Floats, rows: NDArray[np.bool_]) -> Floats:
-        """Columns (N, 3, k) at some rows as the reference shows them, the last with the reference added.
+        """Columns (N, 3, k) at some rows as the reference shows them, the last with the reference and the DVL's noise.
 
-        Interpolating and filtering make the DVL's noise smaller, at some clocks more than at others: rows are as large
-        as if they did not.
+        Noise is not filtered with what is, and is that of one clock: a lag or a clock would be claimed for making it
+        smaller, as interpolating does at some clocks more than at others.
         """
-        taken, kept = self._lagged(values, rows) if self._lag_s else values[rows], self._kept[rows]
-        taken[..., -1] += self.reference[rows]
-        if self._lag_s:
-            keep, smooth = np.exp(-self._dvl_step_s / self._lag_s), min(1.0, self._lag_s / self._dvl_step_s)
-            kept = (1.0 - keep) / (1.0 + keep) * (smooth + (1.0 - smooth) * kept)
-        return np.asarray(taken / np.sqrt(1.0 + self._dvl_share * (kept - 1.0))[:, None, None])
+        taken = self._lagged(values, rows) if self._lag_s else values[rows]
+        taken[..., -1] += self.reference[rows] - self._noise[rows]
+        return np.asarray(taken)
 
     def _lagged(self, values: Floats, rows: NDArray[np.bool_]) -> Floats:
         """At some rows as a reference that lags would show them: first order, exact for what is straight in between."""
@@ -222,13 +209,6 @@ class _Seen:
         mean = self._lag_s / FINE_S * (1.0 - keep)
         filtered, _ = lfilter([1.0 - mean, mean - keep], [1.0, -keep], values, axis=0, zi=mean * values[:1])
         return _at(self.true_s[rows], self.elapsed, np.asarray(filtered))
-
-    def correct(self, by: Floats) -> None:
-        """Change the velocity that columns are about, by (N, 3) in the frame of the reference."""
-        of_body = np.einsum("nji,nj->ni", self.attitude, by) if self.in_earth else by
-        self.dvl = self.dvl + of_body @ self.body_from_dvl
-        self.body = self.dvl @ self.body_from_dvl.T
-        self.speed = np.linalg.norm(self.dvl, axis=1)
 
     def turned(self, of_body: Floats) -> Floats:
         """(N, 3) of the body in the frame of the reference."""

@@ -16,7 +16,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 
 from .answers import slope
 from .forward import CLOCKS, COLUMNS, LINEAR, N_CALIBRATION, Clock, Forward
-from .search import OFFSETS, Fitted, Search, Whitening, residual_of_all, solved
+from .search import OFFSETS, Fitted, Search, Whitening, calibration_of, residual_of_all, solved
 from .streams import Floats, read_streams
 
 WORTH_A_SHIFT = 0.8
@@ -91,7 +91,8 @@ def residual(paths: Sequence[Path], parameters: Parameters) -> Residual:
     search = Search(model)
     shift_s = _shift(search)
     clock = Clock({"dvl_time_offset": shift_s})
-    model.calibrated(search.refined(Fitted((), clock, np.inf, search.n)).values[:6])
+    model.clock = clock
+    model.calibrated(calibration_of(search.refined(Fitted((), clock, np.inf, search.n))))
     search = Search(model, Whitening(residual_of_all(model, clock)))
     alone = search.refined(Fitted((), clock, np.inf, search.n))
     whole = search.whiten(model.at(clock, generic=True))
