@@ -166,7 +166,7 @@ class Fitter:
         hypothesis = start
         seen, residual = self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
-        length, before = 1.0, np.zeros(len(kept))
+        length, before, moved = 1.0, np.zeros(len(kept)), True
         for _ in range(max_steps):
             columns = self.columns(hypothesis, seen)
             system = self._system(noise, columns, residual, hypothesis)
@@ -190,13 +190,14 @@ class Fitter:
             if np.abs(step / std).max() < STANDS_STILL or gained < GAINS_NOTHING:
                 break
         columns = self.columns(hypothesis, seen)
-        system = self._without_own_noise(
-            self._system(noise, columns, residual, hypothesis), hypothesis, noise, columns, residual
-        )
+        plain = self._system(noise, columns, residual, hypothesis)
+        system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
         free = np.flatnonzero(~kept)
         if len(free):
             step = np.zeros(len(kept))
             step[free] = system.part(free).solution()
+            if not moved:  # a step that only made it worse, as at the kink of a slow attitude, is none with less noise
+                step[free] -= plain.part(free).solution()
             hypothesis = hypothesis.moved(step)
             seen, residual = self.evaluated(hypothesis)
             misfit = self._misfit(noise, residual, hypothesis)

@@ -133,7 +133,7 @@ def select(
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         finer = _finer_steps(problem)
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
-        best = fitter.refined(_best(fits, effects), finer[3:])
+        best = _by_fewer_clocks(fitter, fitter.refined(_best(fits, effects), finer[3:]), effects)
         best = _called_for(fitter, best, len(effects))
         names = frozenset(effect.name for effect in best.effects)
         fitter, fit = _about(fitter, best, every)
@@ -141,6 +141,7 @@ def select(
             break
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
+    fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fit = with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
@@ -350,6 +351,14 @@ def _told_by_other_clocks(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypot
             start = {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
             found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
     return found
+
+
+def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
+    """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
+    if not set(CLOCKS[:2]) <= set(fit.values):
+        return fit
+    others = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in _told_by_other_clocks(fit, effects)]
+    return _best([fit, *others], effects)
 
 
 def _shortlisted(table: _Table, own: Sequence[int], cost: Sequence[float]) -> list[int]:

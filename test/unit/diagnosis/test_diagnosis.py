@@ -16,14 +16,16 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
-from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
+from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
+from dvl_calib_ros.diagnosis.fitting import Fit, Fitter
 from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
+from dvl_calib_ros.diagnosis.selection import _by_fewer_clocks
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -80,6 +82,40 @@ def assert_within(diagnosis, name, **values):
         estimate, low, high = parameters[parameter]
         margin = high - estimate  # twice the interval: one of many would be outside the interval itself
         assert low - margin < value < high + margin, (name, parameter, parameters[parameter])
+
+
+def fitted(given: Scenario, effects: dict[str, dict[str, float]]) -> tuple[Fitter, Fit, Hypothesis]:
+    """Fitter, fit and its start of a simulated recording, by effects with the values they start from."""
+    problem = make_problem(
+        [recording_of(simulate(given), given.gnss_frame)], np.eye(3), np.zeros(3), [Offsets(0.0, 0.0)]
+    )
+    start = no_effect().with_effects([EFFECTS[name] for name in effects], 1, {k: (v,) for k, v in effects.items()})
+    fitter = Fitter(problem)
+    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
+    return fitter, fitter.fit(start, noise), start
+
+
+# ------------------------------------------------------------------ how it is fitted
+
+
+def test_a_step_that_only_makes_it_worse_is_not_taken_at_the_end_either(monkeypatch):
+    """Derivatives that point the wrong way, as at the kink of a slow attitude: no step is better, none is taken."""
+    right = Fitter.columns
+    monkeypatch.setattr(Fitter, "columns", lambda *given: -right(*given))
+    _, fit, start = fitted(scenario(effects=[LEVER]), {"lever_arm": {"x_m": -1.5, "y_m": 0.4, "z_m": -0.3}})
+    np.testing.assert_allclose(fit.hypothesis.vector(), start.vector(), atol=0.02)
+
+
+def test_two_clocks_that_are_as_late_as_each_other_are_told_by_the_third_whatever_else_there_is():
+    flexure = {"x_rad_per_mps": -0.009, "y_rad_per_mps": -0.03, "z_rad_per_mps": -0.027}
+    told = "mount_flexure:" + ",".join(f"{name}={value}" for name, value in flexure.items())
+    fitter, fit, _ = fitted(
+        scenario(effects=["attitude_time_offset:seconds=0.52", told], seed=1),
+        {"dvl_time_offset": {"seconds": -0.5}, "reference_time_offset": {"seconds": -0.5}, "mount_flexure": flexure},
+    )
+    found = _by_fewer_clocks(fitter, fit, EFFECTS)
+    assert {effect.name for effect in found.effects} == {"attitude_time_offset", "mount_flexure"}
+    assert found.values["attitude_time_offset"][0]["seconds"] == pytest.approx(0.52, abs=0.02)
 
 
 # ------------------------------------------------------------------ what is found
