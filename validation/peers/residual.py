@@ -14,9 +14,9 @@ import numpy as np
 
 from dvl_calib_ros.calibration.parameters import Parameters
 
-from .answers import slope
+from .answers import calibration_of, slope
 from .forward import CLOCKS, COLUMNS, LINEAR, N_CALIBRATION, Clock, Forward
-from .search import OFFSETS, Fitted, Search, Whitening, calibration_of, residual_of_all, solved
+from .search import OFFSETS, Fitted, Search, Whitening, residual_of_all, solved
 from .streams import Floats, read_streams
 
 WORTH_A_SHIFT = 0.8

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .forward import (
-    AXES,
     CLOCKS,
     COLUMNS,
     LARGEST_OFFSET_S,
@@ -42,8 +41,6 @@ STEP_S = 0.05
 ORDER = 3  # of the whitening filter
 N_REFINED = 8
 N_CLOCKS_PAIRED = 3
-# Standard deviation of misalignment (rad) and scale before anything was seen
-EXPECTED_MISALIGNMENT, EXPECTED_SCALE = 0.1, 0.05
 LAST = len(COLUMNS)
 ALWAYS = (0, N_PARTS)
 
@@ -300,17 +297,6 @@ def sizes_of(fitted: Fitted) -> dict[str, tuple[float, float]]:
         effect = name.split(".")[0]
         found[name] = (value + (fitted.clock.size(effect) if effect in CLOCKS else 0.0), each)
     return found
-
-
-def calibration_of(fitted: Fitted) -> Floats:
-    """(6,) misalignment and scale, drawn to none as far as they are not shown.
-
-    A scale across of which nothing is seen came out as 89 %, and then made the DVL's noise twice as large.
-    """
-    shown = slice(0, 2 * len(AXES))
-    covariance = fitted.covariance[shown, shown] * fitted.chi2 / fitted.n
-    prior = np.diag([EXPECTED_MISALIGNMENT**2] * len(AXES) + [EXPECTED_SCALE**2] * len(AXES))
-    return np.asarray(prior @ np.linalg.solve(prior + covariance, fitted.values[shown]))
 
 
 def solved(columns: Floats, wanted: Floats) -> tuple[Floats, Floats, float]:
