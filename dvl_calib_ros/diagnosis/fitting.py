@@ -156,10 +156,13 @@ class Fitter:
         max_steps: int = MAX_STEPS,
         only_of_the_day: bool = False,
         fixed: frozenset[str] = frozenset(),
+        careful: bool = False,
     ) -> Fit:
         """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept.
 
-        fixed: names of effects whose values are kept.
+        fixed: names of effects whose values are kept. careful: the last step, with what noise makes in the columns
+        taken off, is not one that was just seen to make it worse, as at the kink of a slow attitude. Where a fit is
+        stuck far from the best, that step is what takes it out.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
         kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
@@ -196,7 +199,7 @@ class Fitter:
         if len(free):
             step = np.zeros(len(kept))
             step[free] = system.part(free).solution()
-            if not moved:  # a step that only made it worse, as at the kink of a slow attitude, is none with less noise
+            if careful and not moved:
                 step[free] -= plain.part(free).solution()
             hypothesis = hypothesis.moved(step)
             seen, residual = self.evaluated(hypothesis)

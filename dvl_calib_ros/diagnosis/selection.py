@@ -357,7 +357,7 @@ def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) ->
     """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
     if not set(CLOCKS[:2]) <= set(fit.values):
         return fit
-    others = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in _told_by_other_clocks(fit, effects)]
+    others = [fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in _told_by_other_clocks(fit, effects)]
     return _best([fit, *others], effects)
 
 

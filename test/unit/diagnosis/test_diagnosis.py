@@ -92,13 +92,13 @@ def fitted(given: Scenario, effects: dict[str, dict[str, float]]) -> tuple[Fitte
     start = no_effect().with_effects([EFFECTS[name] for name in effects], 1, {k: (v,) for k, v in effects.items()})
     fitter = Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    return fitter, fitter.fit(start, noise), start
+    return fitter, fitter.fit(start, noise, careful=True), start
 
 
 # ------------------------------------------------------------------ how it is fitted
 
 
-def test_a_step_that_only_makes_it_worse_is_not_taken_at_the_end_either(monkeypatch):
+def test_a_careful_fit_does_not_take_a_step_at_the_end_that_only_made_it_worse(monkeypatch):
     """Derivatives that point the wrong way, as at the kink of a slow attitude: no step is better, none is taken."""
     right = Fitter.columns
     monkeypatch.setattr(Fitter, "columns", lambda *given: -right(*given))
