@@ -200,7 +200,7 @@ def test_replay_json_has_the_documented_structure(document, bag):
     assert tuple(document["models"]) == BY_VELOCITY
     for name, model in ((name, MODELS[name]) for name in BY_VELOCITY):
         entry = document["models"][name]
-        covariances = {"covariance", "covariance_of_recording", "covariance_of_filter"}
+        covariances = {"by_dvl_bias", "covariance", "covariance_of_recording", "covariance_of_filter"}
         assert set(entry) == {"state_names", "state", *covariances, "used", "gated", "convergence"}
         scales, nuisance = [scale for scale, _ in model.scale_axes], [state.name for state in model.nuisance]
         assert entry["state_names"] == ["phi_x", "phi_y", "phi_z", *scales, *nuisance]
