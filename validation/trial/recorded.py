@@ -29,6 +29,8 @@ WITHOUT_INS = ("T02", "T04", "T06", "T07", "T08", "T10", "T12")
 BY_BOAT = ("20250117163514", "20250117164453")
 # Recorded at 1 Hz: what changes faster than this is noise of the recording as much as motion
 SMOOTHING_S = 1.5
+# m/s, from what the boat usually does: such a sample is none
+NO_BOAT_MPS = 5.0
 NO_RECORDINGS = "no recorded sea trials; name the folder that has data/snapir and data/snapir_ins in DVL_CALIB_SHARED"
 
 
@@ -89,6 +91,8 @@ def by_boat(name: str, smoothing_s: float = SMOOTHING_S) -> Motion:
         raise InputError(NO_RECORDINGS)
     seconds, angles_deg = _columns(folder / BOAT_FOLDER / f"{name}_attitude.csv")
     at, velocity = _columns(folder / BOAT_FOLDER / f"{name}_dvl.csv")
+    measured = (np.abs(velocity - np.median(velocity, axis=0)) < NO_BOAT_MPS).all(axis=1)
+    at, velocity = at[measured], velocity[measured]
     yaw, pitch, roll = np.unwrap(np.radians(angles_deg), axis=0).T
     start = max(seconds[0], at[0]) + MARGIN_S
     length = float(min(seconds[-1], at[-1]) - MARGIN_S - start)

@@ -201,3 +201,12 @@ def test_a_displaced_dvl_of_the_boat_moves_as_the_boat_does():
         pytest.skip("no recordings of the boat")
     motion = draw(Case(Category.NULL, BOAT, family=Family.DISPLACED), 0).scene.motions[0]
     assert 0.8 < np.median(motion.at(np.arange(0.0, motion.seconds)).speed) < 0.9
+
+
+@pytest.mark.parametrize("name", recorded.BY_BOAT)
+def test_a_boat_never_goes_as_fast_as_a_sample_that_is_none(name):
+    """One of 592 is 27 m/s ahead, aside and up: smoothed, a boat of 0.85 m/s went at 13 m/s for three seconds."""
+    if not recorded.has_boat(recordings_folder()):
+        pytest.skip("no recordings of the boat")
+    motion = recorded.by_boat(name)
+    assert motion.at(np.arange(0.0, motion.seconds)).speed.max() < 1.5
