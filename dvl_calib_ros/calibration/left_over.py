@@ -49,6 +49,8 @@ QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
 # of how it bends, m/s².
 LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+# Share of the whole bend that means of `MEAN_S` have to leave, for smoothing to be told by them.
+LEAST_OF_BEND = 0.3
 # Known to no better than this (σ), it may as well be all of it.
 TILT_SHOWN = 0.2
 # A bias of the DVL (m/s) that has been seen, which the motion shows to no better than this (σ, of ahead or across).
@@ -116,6 +118,10 @@ class _Fit(NamedTuple):
     rest: Array
     starts: Index
 
+    def seen_of(self, columns: Array, values: Array) -> float:
+        """How much of the last one of the columns (N, 3, n) fits values (N, 3), beside all others."""
+        return float(self.p[-1] @ np.einsum("n,nij,ni->j", self.weight, columns, values))
+
 
 def left_over(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array
@@ -151,8 +157,10 @@ def left_over(
         quick[:, :, axis] = cross(about, moving)
     # as the vehicle's turning bends it: noise of the DVL is in all of a mean alike
     turning = _mean(time, _turned(rotation_enu_from_body, _mean(time, velocity - error, MEAN_S)), BEND_S)
-    bend = _at(time, turning, BEND_S) - 2.0 * turning + _at(time, turning, -BEND_S)
-    quick[:, :, 2] = _turned(body_from_enu, bend / BEND_S**2)
+    bend, whole_bend = (
+        (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
+    )
+    quick[:, :, 2] = _turned(body_from_enu, bend)
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
     both = np.concatenate([known, quick], axis=2)
     fast = _fitted(time, both, error, np.concatenate([KNOWN, QUICK]))
@@ -171,9 +179,12 @@ def left_over(
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
     # without tilt, what waves do to it looks like turning
     shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
-    smoothed_std = float(fast.std[-1]) if shows else math.inf
+    # a mean leaves little of waves, whose whole bend a smoothed reference lacks: so it is of that
+    bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
+    shows = shows and bends_by > LEAST_OF_BEND
+    smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return LeftOver(
-        tilt, std, slow.x[-3:], slow.std[-3:], float(fast.x[-1]), smoothed_std, lean, speed,
+        tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
         *_circular(time, velocity - error, both, fast),
     )  # fmt: skip
 

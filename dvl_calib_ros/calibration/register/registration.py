@@ -36,7 +36,7 @@ from .fine import (
     N,
 )  # fmt: skip
 from .motion import MotionStreams
-from .steadiness import MOST_STRETCHES, STRETCH_S, Unsteady, unsteady
+from .steadiness import MOST_STRETCHES, STRETCH_S, Unsteady, stamps, unsteady
 
 # Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
 # of an inertial navigation are late by less (five real recordings: 0.03 to 0.07 s).
@@ -250,7 +250,7 @@ def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation:
         if best is not None:
             found.append((float(times[at].mean()), best))
     is_turned = motion.in_earth and motion.has_attitude
-    return unsteady(np.array([at for at, _ in found]), [each for _, each in found], is_turned)
+    return unsteady(np.array([at for at, _ in found]), [each for _, each in found], is_turned, stamps(motion))
 
 
 def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:

@@ -16,7 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates
 from ..frames import Array
-from ..samples import Mask
+from ..samples import Index, Mask
 from .fine import APART, ARM, LATE, Fitted, MotionFit, N
 from .motion import MotionStreams
 
@@ -35,6 +35,7 @@ MOST_DRIFT, MOST_LEAP_S = 0.01, 10.0
 STRETCH_S, MOST_STRETCHES = 90.0, 16
 # What it costs, in chi-square, that one stretch is anything; and so many at least on either side of a leap.
 ANYTHING, EACH_SIDE = 10.0, 2
+NO_STREAMS: Mapping[str, Array] = {}
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,11 @@ class Unsteady:
         """
         if not self.leap:
             return self
-        reach = float(np.ptp(fit.times)) / MOST_STRETCHES + STRETCH_S
-        streams = {"reference": motion.reference_times, "imu": motion.imu.times}
-        times = streams.get(self.whose, motion.dvl.times)
-        gap = np.diff(times)
-        holes = np.flatnonzero((gap > HOLE * self.leap) & (np.abs(times[1:] - self.at) < reach + gap))
+        reach = _reach(fit.times)
+        times = stamps(motion).get(self.whose, motion.dvl.times)
+        holes = _holes(times, self.leap, self.at, reach)
         if self.leap > 0.0 and len(holes) == 1:
-            return replace(self, at=float(times[holes[0]] + 0.5 * gap[holes[0]]))
+            return replace(self, at=float(times[holes[0] : holes[0] + 2].mean()))
         after = x.copy()
         after[[APART, LATE]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
         (at, before), (later, behind) = (fit.costs(each, rotation, level) for each in (x, after))
@@ -123,9 +122,36 @@ class _Course(NamedTuple):
     kept: Mask
     at: float | None
 
+    def fits(self, value: float, stamps: Array | None, reach: float) -> bool:
+        """Whether a clock that is later by value (s) has the stamps (N,) s for that; None for unknown ones."""
+        if self.at is None or value <= 0.0 or stamps is None:
+            return True
+        return bool(len(_holes(stamps, value, self.at, reach)))
 
-def unsteady(times: Array, stretches: Sequence[Fitted], is_turned: bool) -> Unsteady | None:
-    """Which clock moves through stretches at times (S,) s; None where that is not beyond doubt."""
+
+def stamps(motion: MotionStreams) -> Mapping[str, Array]:
+    """Times (N,) s of each stream, by the names of `DIRECTIONS`."""
+    return {"dvl": motion.dvl.times, "reference": motion.reference_times, "imu": motion.imu.times}
+
+
+def _reach(times: Array) -> float:
+    """About a leap within times (N,), how far off (s) it may be."""
+    return float(np.ptp(times)) / MOST_STRETCHES + STRETCH_S
+
+
+def _holes(times: Array, leap: float, at: float, reach: float) -> Index:
+    """Which of times (N,) come before a hole of the size of a leap (s), within reach of it."""
+    gap = np.diff(times)
+    return np.flatnonzero((gap > HOLE * leap) & (np.abs(times[1:] - at) < reach + gap))
+
+
+def unsteady(
+    times: Array, stretches: Sequence[Fitted], is_turned: bool, streams: Mapping[str, Array] = NO_STREAMS
+) -> Unsteady | None:
+    """Which clock moves through stretches at times (S,) s; None where that is not beyond doubt.
+
+    streams: as of `stamps`; where stamps have no hole, their clock has not leapt ahead.
+    """
     if len(times) < 2 * EACH_SIDE:
         return None
     # where the vehicle hardly speeds up, a clock looks like an arm; but that is the same in all stretches
@@ -149,7 +175,8 @@ def unsteady(times: Array, stretches: Sequence[Fitted], is_turned: bool) -> Unst
             moved = np.outer(course.of, (0.0, 0.0, 0.0, *direction))
             left, value, std = _explained(seen, weight, moved, course.kept)
             left += ANYTHING * (not course.kept.all())
-            found.append((left, value, std, name, course))
+            if course.fits(value, streams.get(name) if is_turned else None, _reach(times)):
+                found.append((left, value, std, name, course))
     left, value, std, name, course = min(found, key=lambda each: each[0])
     length = float(np.ptp(times)) if course.at is None else 1.0
     # stretches scatter by more than they claim where noise lasts as long as they do: all is worth as much less

@@ -199,3 +199,17 @@ def test_noise_of_their_own_is_not_followed(seed):
     vehicle.noise = 0.3 * vehicle.noise[0] + lasting, vehicle.noise[1]
     found = vehicle.found()
     assert found.circular < 4.5 * found.circular_std
+
+
+@pytest.mark.parametrize("interval_s", [0.4, 1.0])
+def test_waves_between_samples_of_a_slow_reference_do_not_make_it_a_smoothed_one(rng, interval_s):
+    """Line by line between samples 1 s apart is 0.4 s of smoothing; surge in waves made that 0.7 s, and a reject."""
+    vehicle = Vehicle(rng)
+    surge = 0.2 * np.sin(vehicle.time * 0.9)[:, None] * vehicle.level[:, :, 0]
+    vehicle.earth += surge
+    vehicle.body = np.einsum("nji,nj->ni", vehicle.turns, vehicle.earth)
+    at = vehicle.time[:: round(interval_s / STEP_S)]
+    read = vehicle.earth[:: round(interval_s / STEP_S)]
+    found = vehicle.found(reference=np.column_stack([np.interp(vehicle.time, at, each) for each in read.T]))
+    assert found.smoothed == pytest.approx(interval_s**2 / 12.0, abs=0.03)
+    assert "VELOCITY_SMOOTHED" not in {each.code for each in left_over_advice(found)}

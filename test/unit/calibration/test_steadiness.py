@@ -100,3 +100,21 @@ def test_only_the_clock_of_the_dvl_is_put_right_and_what_is_left_is_said():
     said = of_reference.contradiction(Parameters())
     assert said is not None and said.code == "CLOCK_LEAPS"
     assert said.numbers["whose"] == "the reference's" and said.numbers["way"] == "ahead"
+
+
+def test_a_clock_that_leaps_ahead_leaves_a_hole_in_its_stamps():
+    """Combination 652, in noise that lasts: the DVL's clock leapt ahead by 42 s, in stamps that are all there."""
+    at, std = np.arange(45.0, 600.0, 90.0), np.array([0.01] * 4 + [0.3] * 3 + [0.2, 0.2])
+    each = [
+        Fitted(
+            np.array([0.0] * 7 + [40.0 * (n > 2), 0.0]), np.diag(std**2), np.eye(3), 0.05, 400, 0.8, np.zeros(400), 3,
+            1.5, np.arange(400), np.full(9, 1.5),
+        )
+        for n in range(len(at))
+    ]  # fmt: skip
+    even = np.arange(0.0, 600.0, 0.2)
+    streams = {"dvl": even[(even < 270.0) | (even > 310.0)], "reference": even, "imu": even}
+    found = unsteady(at, each, True, streams)
+    assert found is not None and found.whose == "dvl" and found.leap == pytest.approx(40.0, abs=1.0)
+    found = unsteady(at, each, True, {**streams, "dvl": even})
+    assert found is None or found.leap < 0.0
