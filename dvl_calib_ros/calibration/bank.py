@@ -303,15 +303,15 @@ class Group:
         if name not in self._of_recording:
             found = self._scatter.found(self.index[name])
             state = self._sound_state(name, found.shift[0], found.more[0]) if found.more.any() else self.state(name)
-            self._of_recording[name] = state.raised(found.inflation).turned(self._up, found.drifted)
+            raised = state.raised(found.inflation).turned(self._up, found.drifted)
+            self._of_recording[name] = found.of_bias.at(0).added_to(raised)
         return self._of_recording[name]
 
     def of_bias(self, name: str) -> OfBias:
         """What a bias of the DVL makes of `of_recording`, by one model."""
         if self._scatter is None:
             return OfBias.none(self._x.shape[1])
-        found = self._scatter.found(self.index[name])
-        return found.of_bias.at(0).raised(found.inflation)
+        return self._scatter.found(self.index[name]).of_bias.at(0)
 
     def heading_deviation(self, name: str) -> GaussianState | None:
         """Coefficients of how the heading deviates, as of `HeadingStates`, by one model; None where it has none."""

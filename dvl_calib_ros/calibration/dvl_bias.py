@@ -12,38 +12,41 @@ from typing import NamedTuple
 import numpy as np
 
 from .frames import Array
+from .kalman import GaussianState
 from .samples import Mask
 
 
 class OfBias(NamedTuple):
     """Of states (..., n).
 
-    covariance: (..., n, n), the part of P that would not be, were the bias known. columns: (..., n, 3), by how much
-    states are off where the DVL is off by one σ of its prior (`dvl_bias_std`) along each of its axes.
+    columns: (..., n, 3), by how much states are off where the DVL is off by one σ along each of its axes: of its prior
+    (`dvl_bias_std`) at one speed, of what is left of it where speeds show it.
     """
 
-    covariance: Array
     columns: Array
+
+    @property
+    def covariance(self) -> Array:
+        """(..., n, n), the part of P that would not be, were there no bias."""
+        return np.asarray(self.columns @ self.columns.swapaxes(-1, -2))
 
     @staticmethod
     def none(*shape: int) -> OfBias:
         """Of states (..., n) = shape that no bias reaches."""
-        return OfBias(np.zeros((*shape, shape[-1])), np.zeros((*shape, 3)))
+        return OfBias(np.zeros((*shape, 3)))
 
     def at(self, index: int | slice) -> OfBias:
         """Of some of several."""
-        return OfBias(self.covariance[index], self.columns[index])
-
-    def raised(self, factor: Array) -> OfBias:
-        """With each standard deviation times a factor (n,)."""
-        return OfBias(self.covariance * (factor[:, None] * factor), self.columns * factor[:, None])
+        return OfBias(self.columns[index])
 
     def mixed(self, share: Array) -> OfBias:
         """Of the mean of M, each with a share (M,)."""
-        return OfBias(np.tensordot(share, self.covariance, axes=1), np.tensordot(share, self.columns, axes=1))
+        return OfBias(np.tensordot(share, self.columns, axes=1))
 
     def where(self, known: Mask) -> OfBias:
         """Of those states (n,) alone that are known from data."""
-        return OfBias(
-            np.where(np.outer(known, known), self.covariance, 0.0), np.where(known[:, None], self.columns, 0.0)
-        )
+        return OfBias(np.where(known[:, None], self.columns, 0.0))
+
+    def added_to(self, state: GaussianState) -> GaussianState:
+        """The state x (n,), P (n, n) of a DVL that may be off so far."""
+        return GaussianState(state.x, state.p + self.covariance) if self.columns.any() else state

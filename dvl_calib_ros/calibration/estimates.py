@@ -47,6 +47,8 @@ class Estimates:
         """Estimate of one model, with all that is known about it."""
         model, estimator = MODELS[name], self.estimators[name]
         state, covariance = self.of_recording(name)
+        of_bias = estimator.of_bias
+        of_velocity = covariance - of_bias.covariance  # more of the same motion tells no more of a bias
         used, gated, mean_nis, rows, _ = estimator.counts
         return Estimate(
             model=name,
@@ -55,13 +57,13 @@ class Estimates:
             recording_covariance=covariance,
             filter_covariance=estimator.filter_covariance,
             left_open=estimator.left_open + self._by_clock(name),
-            of_bias=estimator.of_bias,
+            of_bias=of_bias,
             used=used,
             gated=gated,
             mean_nis=mean_nis,
             nis_bounds=nis_bounds(rows, self.parameters, used),
-            convergence=convergence(model, covariance, self.parameters),
-            observability=observability(model, covariance, self.parameters),
+            convergence=convergence(model, of_velocity, self.parameters),
+            observability=observability(model, of_velocity, self.parameters),
             heading_deviation=estimator.heading_deviation,
         )
 
@@ -136,11 +138,11 @@ class Estimates:
         if needs == MEASURES_VERTICAL and told_arm.finds_arm(model):  # nor does anything show its height
             height = model.state_names.index("lever_arm_z")
             unknown[height, height] = p.initial_std_lever_arm**2
-        own = estimate.recording_covariance + unknown
+        own = estimate.velocity_covariance + unknown
         return replace(
             estimate,
             covariance=estimate.covariance + unknown,
-            recording_covariance=own,
+            recording_covariance=estimate.recording_covariance + unknown,
             convergence=convergence(model, own, p),
             observability=observability(model, own, p, needs),
         )

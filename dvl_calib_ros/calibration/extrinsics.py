@@ -119,8 +119,8 @@ def extrinsics_of(
 ) -> Extrinsics:
     """What a state (n,) of a model says of the DVL, with the parameters that it was found with.
 
-    state: with σ of its recording, by which a component is shown: if that is at most half of what the parameters say is
-    known without data, as for observability. span_ns: stamps of the first and last sample.
+    state: with σ of its recording, by which a component is shown: if that without the bias is at most half of what the
+    parameters say is known without data, as for observability. span_ns: stamps of the first and last sample.
     by_bias: (n, 3), `OfBias.columns` of the state.
     """
     found = _components(model, state.x, parameters)
@@ -132,12 +132,12 @@ def extrinsics_of(
         turn = turn_between(found[0], up[0]) - turn_between(found[0], down[0])
         jacobian[:, index] = np.concatenate([turn, up[1] - down[1]]) / (2.0 * _STEP)
     covariance = jacobian @ state.p @ jacobian.T
-    std = np.sqrt(np.diag(covariance))
+    common = np.zeros((N_COMPONENTS, N_AXES)) if by_bias is None else jacobian @ by_bias
+    std = np.sqrt(np.diag(covariance - common @ common.T))
     shown = jacobian.any(axis=1) & (std <= OBSERVED_SHARE * _unknown(parameters))
     covariance += jacobian @ day_covariance(model, parameters) @ jacobian.T
     covariance[~shown] = 0.0
     covariance[:, ~shown] = 0.0
-    common = np.zeros((len(state.x), N_AXES)) if by_bias is None else by_bias
     rotation, rest = found
     return Extrinsics(
         name=name,
@@ -153,7 +153,7 @@ def extrinsics_of(
         used=used,
         remarks=tuple(remarks),
         dvl=dvl,
-        by_bias=np.where(shown[:, None], jacobian @ common, 0.0),
+        by_bias=np.where(shown[:, None], common, 0.0),
     )
 
 

@@ -7,6 +7,10 @@ what they tell of the mounting (block_terms.py). On one heading a deviation and 
 one speed a bias and roll, pitch or yaw and scale: σ of these holds both. On reciprocal headings one cycle of a
 deviation averages out; several speeds show a bias. How large coefficients of the heading are is said by
 `heading_deviation_std`, until headings show it to be more or less (empirical Bayes); of the bias by `dvl_bias_std`.
+
+Coefficients of the heading are taken off the states, as a heading that deviates does so whatever is done with the
+result. The bias is considered, and not taken off: nobody takes a bias off velocities, and a mounting without it would
+be worse at the speeds driven than one with it.
 """
 
 from __future__ import annotations
@@ -55,7 +59,7 @@ class HeadingStates(NamedTuple):
 
     coefficients: x (5,), P (5, 5), of the hypothesis that says how large it is: of sine and cosine of the yaw and of
     twice the yaw, rad, and of time, rad/s; None where no reference is turned by a heading. shift (M, n), more
-    (M, n, n): to be added to x and P. of_bias: of M times n states, its covariance part of `more`.
+    (M, n, n): to be added to x and P. of_bias: of M times n states, its covariance to be added to P when σ has grown.
     drifted: rad², to be added to the variance of yaw, as nobody knows when a heading that drifts was right. inflation:
     (n,) by how much σ of that hypothesis has to grow then, as of `TimeBlocks`.
     """
@@ -221,34 +225,35 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
 
     # what is left where it may be of any size is noise, and whatever else: the evidence is worth as much less
     as_claimed: Array = np.ones((len(each), N_COEFFICIENTS))
-    has_bias = bool(std[_BIAS].any())
 
-    def level_of(which: Mask) -> Array:
+    def level_of(which: Mask, std: Array) -> Array:
         widest = np.where(which, _FACTORS[-1], 1.0) * std * as_claimed
         return np.asarray((inflation(widest, as_claimed)[1][:, n:][:, which] ** 2).mean(axis=1))
 
-    level = level_of(~_BIAS)
+    without_bias = np.where(_BIAS, 0.0, std)
+    level = level_of(~_BIAS, without_bias)
     # and a constant beside, of any size: a yaw that its own prior does not expect is no deviation for that
     free = np.concatenate([onto, np.broadcast_to(np.eye(N_TERMS)[-1:], (len(each), 1, N_TERMS))], axis=1)
     across = free.swapaxes(1, 2)
     beside = free @ of_best[:, n:, :n]
     own_free = free @ of_best[:, n:, n:] @ across - beside @ p @ beside.swapaxes(1, 2)
     scores_free = product(free, vector[best, n:]) - product(beside, x)
-    root = std * as_claimed
+    root = without_bias * as_claimed
     for which in (_CYCLES, _DRIFT):
         size = _size(own_free / level[:, None, None], scores_free / level[:, None], root, which)
         root = np.where(which, size[:, None], 1.0) * root
-    # of the heading its size goes by that, and σ grows with what is left; a bias is known before to what it is
-    worth = np.where(_BIAS, level_of(_BIAS)[:, None], 1.0) if has_bias else as_claimed
-    found, factor = inflation(root, worth)
+    found, factor = inflation(root, as_claimed)
     every = np.arange(len(owner))
-    of_all, (shift, more) = deviating(root, worth, every)
+    shift, more = deviating(root, as_claimed, every)[1]
     of_bias = OfBias.none(*shift.shape)
-    if has_bias:
-        without = deviating(np.where(_BIAS, 0.0, root), worth, every)[1].p
-        # of a bias of a σ the data take off what they show of it
-        off = turned.swapaxes(1, 2) @ of_all.p[:, :, :N_BIAS] / std[_BIAS]
-        of_bias = OfBias(more - without, off)
+    if std[_BIAS].any():
+        # of the heading its size goes by the level, and σ grows with what is left; a bias is known before to what it is
+        worth = np.where(_BIAS, level_of(_BIAS, std)[:, None], 1.0)
+        of_all = deviating(np.where(_BIAS, std, root), worth, every)[0]
+        bias, p_bias = of_all.x[:, :N_BIAS], of_all.p[:, :N_BIAS, :N_BIAS]
+        off = turned.swapaxes(1, 2) @ of_all.p[:, :, :N_BIAS] @ np.linalg.inv(p_bias)
+        # it is as large as its prior and the data leave it, and is left in the states with all that the data show of it
+        of_bias = OfBias(off @ _root(p_bias + bias[:, :, None] * bias[:, None]))
     states = []
     for number, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True)):
         at = slice(end - size, end)
@@ -269,6 +274,12 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
             )
         )
     return states
+
+
+def _root(p: Array) -> Array:
+    """Symmetric root of (M, k, k)."""
+    values, vectors = np.linalg.eigh(p)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None] @ vectors.swapaxes(1, 2))
 
 
 def _symmetric(p: Array) -> Array:

@@ -76,6 +76,7 @@ class Judge:
         """As of `verify`. judged: as of `calibration_error`."""
         name, p = estimate.model, self._estimates.parameters
         model, estimator = MODELS[name], self._estimates.estimators[name]
+        of_velocity = self._estimates.of_recording(name).p - estimator.of_bias.covariance
         return verify(
             model,
             GaussianState(estimate.state, estimate.covariance),
@@ -88,7 +89,7 @@ class Judge:
             self._further.doubt if model.aided else None,
             bool(model.estimator) and estimator.claims,
             typical,
-            calibration_error(model, self._estimates.of_recording(name).p, judged, p.rotation_dvl_from_body),
+            calibration_error(model, of_velocity, judged, p.rotation_dvl_from_body),
         )
 
     def doubts(self, name: str, of_clocks: Sequence[Reason], *, fresh: bool) -> list[Reason]:

@@ -382,10 +382,10 @@ class Parameters:
         high=0.5,
     )
     dvl_bias_std: float = _parameter(
-        0.0,
+        0.008,
         "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (G1, G2). At one "
-        "speed σ of roll, pitch, yaw and scale includes it; several speeds show its size. 0: the DVL has none. 0.01 "
-        "holds the worst that is known, and makes scale and yaw of several minutes two to four times less certain.",
+        "speed σ of roll, pitch, yaw and scale includes it; several speeds show its size. 0.008: as the beam biases "
+        "of the paper's data make it; the worst that is known is under three times that. 0: the DVL has none.",
         unit="m/s",
         low=0.0,
         high=1.0,

@@ -342,7 +342,7 @@ FINDINGS = (
         "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes what dvl_bias_std says of it",
         "A bias turns with the vehicle as a mounting does, and only another speed tells one from the other.",
-        "drive at two speeds, one twice the other; or set dvl_bias_std, which is then in σ",
+        "drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
     ),
     Kind(
         "DVL_BIAS",

@@ -461,15 +461,15 @@ class DelayBank:
     def _posterior(self, found: Likely, errors: GaussianState) -> Posterior:
         state = _one(errors, self.delays_s[found.kept], found.share)
         raised = state.raised(found.inflation).turned(self._up, found.drifted)
-        p = state.p - found.of_bias.covariance  # which is there with a lever arm as without
+        p = state.p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
         by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)
         rest = np.maximum(np.diag(p)[:3] - by_lever_arm, 1e-12)
         turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
         unclaimed = _without(found.shown, _BEYOND)
+        of_bias = found.of_bias.where(~np.isin(np.arange(N_STATE), unclaimed))
         claimed = with_states_of(raised, self.prior, unclaimed)
-        of_bias = found.of_bias.raised(found.inflation).where(~np.isin(np.arange(N_STATE), unclaimed))
         return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest, found.heading, of_bias)
 
     def days(self) -> list[DayState]:

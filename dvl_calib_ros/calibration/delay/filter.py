@@ -172,7 +172,7 @@ class DelayFilter(Estimator):
         return posterior.state if posterior is not None and self.claims else self.extended(base)
 
     def of_recording(self) -> GaussianState:
-        """As `state`, with σ as blocks of time show it: its own has been raised."""
+        """As `state`, with σ as blocks of time show it, by which its own has been raised, and as a bias makes it."""
         posterior = self.posterior
         if posterior is None or not self.claims:
             return self.extended(self._base.of_recording())
@@ -180,7 +180,8 @@ class DelayFilter(Estimator):
         known = self._of_recording
         if known is None or known[0] is not posterior or known[1] is not registration:
             x, p = posterior.state
-            known = self._of_recording = posterior, registration, GaussianState(x, p + self.left_open)
+            of_all = posterior.of_bias.added_to(GaussianState(x, p + self.left_open))
+            known = self._of_recording = posterior, registration, of_all
         return known[2]
 
     @property
@@ -196,7 +197,7 @@ class DelayFilter(Estimator):
         if posterior is not None and self.claims:
             return posterior.of_bias
         found, base = OfBias.none(N_STATE), self._base.of_bias
-        found.covariance[:N_G1, :N_G1], found.columns[:N_G1] = base
+        found.columns[:N_G1] = base.columns
         return found
 
     @property

@@ -121,7 +121,7 @@ class Posterior:
     its standard deviations were raised above the filter's own. turned: (3,) by how much 1 m of lever arm along the
     axis that matters most turns each misalignment, rad; by_lever_arm: (3,) variance of each that comes with what is not
     known of the lever arm, in variances without. heading: coefficients of its deviation, as of `HeadingStates`.
-    of_bias: what a bias of the DVL makes of x and P.
+    of_bias: what a bias of the DVL makes of x, which P is without.
     """
 
     state: GaussianState

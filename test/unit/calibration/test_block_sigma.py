@@ -19,8 +19,9 @@ from dvl_calib_ros.calibration.time_blocks import TimeBlocks
 from dvl_calib_ros.calibration.worth import predicted_drift
 from dvl_calib_ros.files.result_file import result_document
 
-# σ of the recording itself, with an exact heading: what another day or a compass makes of it is no matter of noise
-OF_THE_DAY = {"day_std_heading": 0.0, "day_std_scale": 0.0, "heading_deviation_std": 0.0}
+# σ of the recording itself, with an exact heading and DVL: what another day, a compass or a bias makes of it is no
+# matter of noise
+OF_THE_DAY = {"day_std_heading": 0.0, "day_std_scale": 0.0, "heading_deviation_std": 0.0, "dvl_bias_std": 0.0}
 CLAIMED = Parameters(gnss_aided_std=0.03, **OF_THE_DAY)
 
 

@@ -198,7 +198,7 @@ def biased(speeds, bias, rng, noise=0.03):
     seen = HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)
     found = heading_states([seen], prior_std(STD, BIAS))[0]
     of = GaussianState(alone.x[0] + found.shift[0], alone.p[0] + found.more[0]).raised(found.inflation)
-    return of, found, alone
+    return found.of_bias.at(0).added_to(of), found, alone
 
 
 def test_at_one_speed_sigma_holds_the_bias_and_two_speeds_show_it(rng):
@@ -206,22 +206,32 @@ def test_at_one_speed_sigma_holds_the_bias_and_two_speeds_show_it(rng):
     one, of_one, alone = biased(np.full(24, 1.5), bias, rng)
     assert abs(alone.x[0, 2]) > 10.0 * math.sqrt(alone.p[0, 2, 2])  # what was claimed before
     assert abs(one.x[2]) < 3.0 * math.sqrt(one.p[2, 2]) < 3.5 * BIAS / 1.5
-    # known, it would be no matter
-    np.testing.assert_allclose(of_one.more[0], of_one.of_bias.covariance[0], rtol=1e-6, atol=1e-9)
+    assert not of_one.shift.any() and not of_one.more.any()  # the best at the speeds driven, whatever the bias is
+    no_bias, _, _ = biased(np.tile([0.5, 2.0], 12), np.zeros(3), rng)
+    assert math.sqrt(no_bias.p[2, 2]) < 0.5 * BIAS / 1.5
     two, _, _ = biased(np.tile([0.5, 2.0], 12), bias, rng)
-    assert abs(two.x[2]) < 3.0 * math.sqrt(two.p[2, 2]) < 0.8 * BIAS / 1.5
+    assert abs(two.x[2]) < 3.0 * math.sqrt(two.p[2, 2])
 
 
-@pytest.mark.parametrize("speeds", [np.full(6, 1.5), np.tile([0.5, 2.0], 3)], ids=["one speed", "two"])
-def test_the_columns_of_a_bias_are_by_how_much_it_takes_the_states_off(speeds):
-    free, of_bias = (biased(speeds, BIAS * np.eye(3)[0] * k, np.random.default_rng(3)) for k in (0.0, 1.0))
-    off = of_bias[0].x - free[0].x
-    columns = free[1].of_bias.columns[0]
-    np.testing.assert_allclose(columns[:, 0], off, rtol=1e-6, atol=1e-9)
-    # all of it at one speed, little where speeds show it
-    covariance = free[1].of_bias.covariance[0]
-    share = (columns @ columns.T)[3, 3] / covariance[3, 3]
-    assert share == pytest.approx(1.0, abs=0.01) if len(set(speeds)) == 1 else share < 0.5
+def test_the_columns_of_a_bias_are_by_how_much_it_takes_the_states_off_as_far_as_speeds_do_not_show_it():
+    def taken_off(speeds):
+        free, of_bias = (biased(speeds, BIAS * np.eye(3)[0] * k, np.random.default_rng(3)) for k in (0.0, 1.0))
+        return of_bias[0].x - free[0].x, free[1].of_bias.columns[0]
+
+    off, columns = taken_off(np.full(6, 1.5))
+    np.testing.assert_allclose(columns[:, 0], off, rtol=5e-3, atol=1e-6)
+    off, columns = taken_off(np.tile([0.5, 2.0], 3))
+    assert abs(columns[3, 0]) < 0.5 * abs(off[3])
+
+
+def test_a_bias_is_in_sigma_as_it_is_likely_whatever_the_speeds():
+    """Its size drawn from its prior: what the states are off by has the size that σ says."""
+    off = []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        found, _, _ = biased(rng.uniform(0.7, rng.uniform(0.7, 2.5), 12), rng.normal(0.0, BIAS, 3), rng)
+        off.append(found.x[1:] / np.sqrt(np.diag(found.p)[1:]))
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(off), axis=0)), 1.0, atol=0.15)
 
 
 def test_what_says_that_a_vehicle_does_not_heave_makes_no_bias_of_trim(rng):
@@ -238,8 +248,10 @@ def test_what_says_that_a_vehicle_does_not_heave_makes_no_bias_of_trim(rng):
     mean = MeanBias(N)
     mean.add(terms.of_states)
     where = np.zeros(1, dtype=int), 0
-    shift = [
-        heading_states([HeadingEvidence.of(told, state, *where, beside)], prior_std(STD, BIAS))[0].shift[0, 1]
+    wider = [
+        heading_states([HeadingEvidence.of(told, state, *where, beside)], prior_std(STD, BIAS))[0].of_bias
         for beside in (None, mean.told(heave, of_heave))
     ]
-    assert abs(shift[0]) > math.radians(0.1) > 20.0 * abs(shift[1])
+    a_bias = BIAS / 1.5  # of pitch
+    std = [math.sqrt(each.covariance[0, 1, 1]) for each in wider]
+    assert std[0] > 1.1 * a_bias and std[1] == pytest.approx(a_bias, rel=0.01)

@@ -59,7 +59,7 @@ def test_the_card_has_the_estimate_its_worth_and_the_heading():
 def predicted_drift_of(calibrator, estimate):
     from dvl_calib_ros.calibration.models import MODELS
 
-    return predicted_drift(MODELS[estimate.model], estimate.recording_covariance, calibrator.parameters)
+    return predicted_drift(MODELS[estimate.model], estimate.velocity_covariance, calibrator.parameters)
 
 
 def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
