@@ -33,8 +33,11 @@ from ..verdict.reasons import Reason, finding
 THOUGHT_OF_EVERY_S = 5.0
 # What is predicted differs from look to look, by up to twice. It is good enough when each look of so long, s, was
 # within the goal. It no longer is when the median of so long, which is what is told, is above so many times the goal:
-# of 25 blocks a σ is known to a seventh (1σ), so that half as much again is no chance.
+# of 25 blocks a σ is known to a seventh (1σ), so that half as much again is no chance. Seconds are those of the DVL's
+# stamps: a bag that is played faster shows as much in less time, and a DVL that is silent shows nothing.
 STANDS_S, TAKEN_BACK = 30.0, 1.5
+# From one look to the next no more than so long, s, counts: a stamp that is far ahead shows nothing either.
+LEAST_LOOKS = 5
 # Rates are means over so many statuses.
 RATED_OVER = 10
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
@@ -55,7 +58,10 @@ class RecentWorth:
         self.taken_back: Reason | None = None
 
     def look(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
-        """What is told of the drift, with this one. rejected: whether a replay would reject the calibration."""
+        """What is told of the drift, with this one.
+
+        now_s: how much the DVL has shown. rejected: whether a replay would reject the calibration.
+        """
         was_good = self.is_good
         if rejected or model != self._model:
             self._looks.clear()
@@ -64,6 +70,8 @@ class RecentWorth:
                 self.taken_back = None  # the findings say why
             elif was_good:
                 self.taken_back = finding("WORTH_OF_ANOTHER_MODEL", model=model)
+        if self._looks and self._looks[-1][0] == now_s:
+            self._looks.pop()
         self._looks.append((now_s, drift))
         while self._looks[0][0] < now_s - STANDS_S:
             self._looks.popleft()
@@ -93,6 +101,8 @@ class Card:
         self._received: deque[tuple[float, Mapping[str, int]]] = deque(maxlen=RATED_OVER)
         self._came_s: dict[str, float] = {}
         self._driven_s = dict.fromkeys(SECTORS, 0.0)
+        self._newest_ns: int | None = None
+        self._shown_s = 0.0
         self._squares, self._looks = 0.0, 0
         self._worth = RecentWorth()
         self._outlook: Outlook | None = None
@@ -129,23 +139,31 @@ class Card:
         self._received.append((now_s, received))
         return values
 
+    def _step(self, newest_ns: int | None) -> float:
+        """How much the DVL has shown since the last look, s."""
+        before_ns, self._newest_ns = self._newest_ns, newest_ns
+        if before_ns is None or newest_ns is None:
+            return 0.0
+        return min(max(1e-9 * (newest_ns - before_ns), 0.0), STANDS_S / LEAST_LOOKS)
+
     def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
         parameters, model = calibrator.parameters, MODELS[estimate.model]
-        motion = calibrator.latest_motion()
+        motion, step = calibrator.latest_motion(), self._step(calibrator.last_ns)
+        self._shown_s += step
         if motion is not None and motion.speed > 0.0:
             self._squares, self._looks = self._squares + motion.speed**2, self._looks + 1
-            if motion.heading is not None and self._received[-1][0] == self._came_s.get("dvl"):
+            if motion.heading is not None:
                 sector = round((90.0 - math.degrees(motion.heading)) / 45.0) % len(SECTORS)
-                self._driven_s[SECTORS[sector]] += now_s - (self._received[-2][0] if len(self._received) > 1 else now_s)
+                self._driven_s[SECTORS[sector]] += step
         target, worth = parameters.target_drift, self._worth
         now = predicted_drift(model, estimate.velocity_covariance, parameters)
-        drift = worth.look(model.name, now, target, now_s, rejected)
+        drift = worth.look(model.name, now, target, self._shown_s, rejected)
         if rejected:
             found = Outlook(finding("NEXT_REJECTED"), None)
         elif worth.is_good:
             found = Outlook(is_good_enough(model), None)
         elif now.both <= target:
-            found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(now_s))
+            found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
         else:
             found = self._thought(calibrator, estimate, motion, now_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale

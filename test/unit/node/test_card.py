@@ -12,13 +12,23 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.calibration.worth import PredictedDrift, predicted_drift
-from dvl_calib_ros.node.card import SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
+from dvl_calib_ros.node.card import LEAST_LOOKS, SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
 
 RUN = MatchedRun("box", 120.0, (0.0, 0.0, 0.05), dvl_std=0.01, gnss_std=0.03, frame=VelocityFrame.ENU)
 
 
 def counts(dvl, gnss=0, imu=0):
     return {"dvl": {"received": dvl}, "reference": {"received": gnss}, "imu": {"received": imu}}
+
+
+class Going:
+    """A calibrator whose DVL has stamps up to so many seconds."""
+
+    def __init__(self, calibrator: Calibrator, newest_s: float) -> None:
+        self._calibrator, self.last_ns = calibrator, int(newest_s * 1e9)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._calibrator, name)
 
 
 def values(card, calibrator, received, now_s):
@@ -43,8 +53,8 @@ def test_rates_are_those_of_the_last_seconds_and_ages_since_something_came():
 def test_the_card_has_the_estimate_its_worth_and_the_heading():
     calibrator = calibrate(make_samples(RUN), Parameters(model="G1"))
     card = Card(0.0)
-    values(card, calibrator, counts(1), 1.0)
-    said = values(card, calibrator, counts(6), 2.0)
+    values(card, Going(calibrator, 1.0), counts(1), 1.0)
+    said = values(card, Going(calibrator, 2.0), counts(6), 2.0)
     estimate = calibrator.estimate()
     drift = predicted_drift_of(calibrator, estimate)
     assert float(said["worth"]) == pytest.approx(drift.both, abs=0.01) and said["target"] == "2"
@@ -74,12 +84,12 @@ def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
     assert len(calls) == 1 + 10 // THOUGHT_OF_EVERY_S
 
 
-def looks(card, calibrator, factors):
-    """What the card says each second of the estimate with its σ so many times larger."""
+def looks(card, calibrator, factors, rate=1.0, since_s=0.0):
+    """What the card says each second of the estimate with its σ so many times larger. rate: of play."""
     estimate = calibrator.estimate()
     for second, factor in enumerate(factors):
         each = replace(estimate, recording_covariance=factor**2 * estimate.recording_covariance)
-        yield card.values(calibrator, each, counts(second), float(second))
+        yield card.values(Going(calibrator, since_s + rate * second), each, counts(second), float(second))
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +113,22 @@ def test_good_enough_is_said_when_it_has_stood_and_until_then_how_long_that_take
     first = codes.index("NEXT_IS_GOOD")
     assert first == STANDS_S and set(codes[:first]) == {"NEXT_STANDS"} and set(codes[first:]) == {"NEXT_IS_GOOD"}
     assert [each["seconds"] for each in said[:2]] == ["30", "29"] and said[first]["seconds"] == "-"
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 5.0, 10.0])
+def test_good_enough_takes_as_much_data_however_fast_it_is_played(at_the_goal, rate):
+    codes = [each["next code"] for each in looks(Card(0.0), at_the_goal, [1.0] * 70, rate)]
+    assert codes.index("NEXT_IS_GOOD") == max(STANDS_S / rate, LEAST_LOOKS)
+
+
+def test_a_dvl_that_is_silent_or_far_ahead_by_one_stamp_makes_nothing_good_enough(at_the_goal):
+    card = Card(0.0)
+    assert {each["next code"] for each in looks(card, at_the_goal, [1.0] * 10)} == {"NEXT_STANDS"}
+    silent = list(looks(card, at_the_goal, [1.0] * 3000, rate=0.0, since_s=9.0))
+    assert {each["next code"] for each in silent} == {"NEXT_STANDS"} and silent[-1]["seconds"] == "21"
+    assert len(card._worth._looks) <= STANDS_S  # what is kept stays bounded
+    ahead = next(looks(card, at_the_goal, [1.0], since_s=1e6))
+    assert ahead["next code"] == "NEXT_STANDS"
 
 
 def test_a_sigma_that_differs_from_look_to_look_does_not_take_good_enough_back(at_the_goal):
