@@ -55,8 +55,8 @@ EFFECTS_NOTE = (
     "“or”, the parameters are those of the first."
 )
 TRACES_NOTE = (
-    "Measured: the residual without the other effects. From both, what misalignment and scale take in has been left "
-    "out, so only that is shown which speaks for the effect."
+    "Measured: the residual without the other effects. What misalignment and scale could explain has been removed from "
+    "both curves, so they show only what is evidence for the effect."
 )
 TWINS_NOTE = (
     "The twin is a simulated DVL on the recorded motion, without and with what was found. What is shown is what was "

@@ -27,7 +27,7 @@ _KINDS = (
     Kind(
         "MOUNTING_MOVED",
         "the mounting has moved {moved} {between}",
-        "Chance makes as much of a mounting that did not move more seldom than a normal error is beyond 4 σ.",
+        "A mounting that did not move differs this much less often than a normal error exceeds 4 σ.",
         "",
         Severity.REJECT,
     ),
