@@ -23,8 +23,11 @@ from .frames import Array
 MOST = 64
 # With fewer, the scatter says little: of 8 its own standard deviation is a quarter.
 FEWEST = 8
-# By chance a scatter may exceed the filter's σ up to this quantile without being taken for more.
-CHANCE = 0.1
+# By chance a scatter may exceed the filter's σ up to this quantile without being taken for more. What is beyond the
+# other is made by no chance, and how much it is is known by as many blocks as there are: 3 σ are to be what they are.
+CHANCE, RARELY = 0.1, 0.02
+# No fewer blocks that tell alike are taken to tell a quantity: the scatter of fewer is none.
+FEWEST_ALIKE = 5.0
 # Neighbours of so many blocks are correlated if their coefficient is more than so many times its σ, 1/√m: of noise that
 # lasts as long as blocks do more would show in half of the runs of four minutes. No more than this is believed of it.
 LASTING_FROM, LASTS, MOST_LASTING = 16, 1.5, 0.85
@@ -108,9 +111,9 @@ class TimeBlocks:
         information, vector = (each[:, index].copy() for each in self.kept)
         return BlocksOfOne(information, vector, self.total[0][index])
 
-    def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTS) -> Array:
+    def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTS, rarely: float | None = RARELY) -> Array:
         """`inflations` of one of the K, x (n,), P (n, n)."""
-        return inflations([self.of(index)], x[None], p[None], lasts=lasts)[0]
+        return inflations([self.of(index)], x[None], p[None], lasts=lasts, rarely=rarely)[0]
 
 
 class BlocksOfOne(NamedTuple):
@@ -122,12 +125,18 @@ class BlocksOfOne(NamedTuple):
 
 
 def inflations(
-    blocks: Sequence[BlocksOfOne], x: Array, p: Array, variance: Array | None = None, lasts: float = LASTS
+    blocks: Sequence[BlocksOfOne],
+    x: Array,
+    p: Array,
+    variance: Array | None = None,
+    lasts: float = LASTS,
+    rarely: float | None = RARELY,
 ) -> Array:
     """By how much σ of each state has to grow, at least 1, by S times blocks (S, n). x (S, n), P (S, n, n).
 
     The largest over blocks as they are, and over two and four of them together. variance: (S, r) of r quantities that
-    are judged instead, whose covariance with the states p (S, r, n) then is. lasts: as `LASTS`.
+    are judged instead, whose covariance with the states p (S, r, n) then is. lasts, rarely: as
+    `LASTS` and `RARELY`; None where σ is compared with more than 3 of it.
     """
     variance = np.diagonal(p, axis1=1, axis2=2) if variance is None else variance
     factor = np.ones(variance.shape)
@@ -135,29 +144,53 @@ def inflations(
     for count in sorted(set(counts[counts >= FEWEST].tolist())):
         at = np.flatnonzero(counts == count)
         scores = np.stack([blocks[number].vector - blocks[number].information @ x[number] for number in at.tolist()])
-        total = np.stack([blocks[number].total for number in at.tolist()])
-        factor[at] = _inflations(scores, total, p[at], variance[at], lasts)
+        information = np.stack([blocks[number].information for number in at.tolist()])
+        # of the variance that blocks claim of each quantity the part of each (S, m, r)
+        parts = np.einsum("srn,smnk,srk->smr", p[at], information, p[at], optimize=True)
+        factor[at] = _inflations(scores, parts, p[at], variance[at], lasts, rarely)
     return factor
 
 
-def _inflations(scores: Array, total: Array, p: Array, variance: Array, lasts: float) -> Array:
-    """(S, r), by scores (S, m, n) and their information (S, n, n)."""
+def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: float, rarely: float | None) -> Array:
+    """(S, r), by scores (S, m, n) and the parts (S, m, r) of the variance that they claim."""
     factor = np.ones(variance.shape)
-    claimed = ((p @ total) * p).sum(axis=2)
+    claimed = parts.sum(axis=1)
     while scores.shape[1] >= FEWEST:
         m = scores.shape[1]
         scatter = p @ scores.swapaxes(1, 2)
-        found = (scatter**2).sum(axis=2) * (m / (m - 1.0)) * _lasting(scatter, lasts)
-        ratio = found / np.maximum(claimed, 1e-300)
-        beyond_chance = ratio > chi2_isf(CHANCE, m - 1) / (m - 1)
+        longer = _lasting(scatter, lasts)
+        alike = _alike(parts)
+        found = (scatter**2).sum(axis=2) * (alike / (alike - 1.0)) * longer
+        by_chance = claimed * (chi2_isf(CHANCE, m - 1) / (m - 1))
+        beyond = found - claimed
+        if rarely is not None:
+            surely = np.maximum(found - claimed * (chi2_isf(rarely, m - 1) / (m - 1)), 0.0)
+            beyond = beyond + surely * (_of_few(alike - 1.0) ** 2 - 1.0)
         # the prior's part of P is not the data's to judge
-        more = 1.0 + (found - claimed) / np.maximum(variance, 1e-300)
-        factor = np.maximum(factor, np.where(beyond_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
-        pairs = scores[:, 0 : m - m % 2 : 2] + scores[:, 1::2]
-        if m % 2:
-            pairs[:, -1] += scores[:, -1]
-        scores = pairs
+        more = 1.0 + beyond / np.maximum(variance, 1e-300)
+        factor = np.maximum(factor, np.where(found > by_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
+        scores, parts = (_paired(each) for each in (scores, parts))
     return factor
+
+
+def _paired(values: Array) -> Array:
+    """Neighbours of (S, m, ...) as one; an odd one goes to the last."""
+    m = values.shape[1]
+    pairs = values[:, 0 : m - m % 2 : 2] + values[:, 1::2]
+    if m % 2:
+        pairs[:, -1] += values[:, -1]
+    return pairs
+
+
+def _alike(parts: Array) -> Array:
+    """Of how many alike blocks a sum (S, r) of parts (S, m, r) is: those that tell most of it may be few."""
+    number = parts.sum(axis=1) ** 2 / np.maximum((parts**2).sum(axis=1), 1e-300)
+    return np.clip(number, FEWEST_ALIKE, parts.shape[1])
+
+
+def _of_few(dof: Array) -> Array:
+    """By how much 3 σ has to be more where σ is of so few: Student's t (Cornish and Fisher)."""
+    return np.asarray(1.0 + 2.5 / dof + 5.75 / dof**2)
 
 
 def _lasting(scatter: Array, lasts: float) -> Array:

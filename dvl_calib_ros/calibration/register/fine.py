@@ -294,7 +294,7 @@ class MotionFit:
             h = rows.jacobian[part].reshape(-1, N)
             w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
             blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
-        factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT)
+        factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT, None)
         return p * np.outer(factor, factor), factor
 
 
