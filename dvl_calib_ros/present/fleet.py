@@ -154,7 +154,7 @@ PERSONS: Columns[NeedsPerson] = {
     "recordings": lambda each: str(len(each.recordings)),
     "why": lambda each: Cell(
         full(each.why) + (f" [{each.code}]" if each.code else ""),
-        "",
+        "text",
         ", ".join(each.recordings[:NAMED])
         + (f" and {len(each.recordings) - NAMED} more" if len(each.recordings) > NAMED else ""),
     ),

@@ -100,6 +100,7 @@ def test_the_day_on_which_a_mounting_moved_is_said(made):
     assert result.word == "moved" and "auv1: The mounting has moved by 1.9" in repr(result)
     page = result.page.read_text()
     assert page.count("<img") >= 3 and "no.mcap" in page
+    assert '<td class="text word">Damaged' in page  # a sentence, which wraps
 
 
 @pytest.mark.slow
