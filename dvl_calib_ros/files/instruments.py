@@ -167,11 +167,14 @@ def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple
     heading, swing = _heading(calibrated, now["heading"])
     settings = [Setting("heading", now["heading"], round(math.remainder(heading, 360.0), 2), "°")]
     lines = [f"SET-SENSOR-ORIENTATION {now['roll']:g}, {now['pitch']:g}, {settings[0].new:g}"]
+    notes = [*_left(calibrated, swing), *_delay(calibrated)]
     if calibrated.model.scale_axes:
         new = round(calibrated.speed_of_sound_factor * now["velocity_adjustment"], 5)
         settings.append(Setting("velocity_adjustment", now["velocity_adjustment"], new))
         lines.append(f"SET-VELOCITY-ADJUSTMENT {new:g}")
-    return settings, "\n".join(lines) + "\n", [*_left(calibrated, swing), *_delay(calibrated)]
+        if calibrated.cause_of_scale is not None:
+            notes.append("velocity_adjustment takes the scale out: set it or the speed of sound, not both")
+    return settings, "\n".join(lines) + "\n", notes
 
 
 def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:

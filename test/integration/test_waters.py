@@ -77,7 +77,10 @@ def test_apply_takes_the_speed_of_sound_that_the_recording_says_was_used(saved, 
     new = re.search(rf"speed_of_sound: {USED:.1f}\d* \(as recorded\) -> ([\d.]+) m/s", said)
     assert abs(float(new[1]) - speed_of_sound(TEMPERATURE, SALINITY)) < 5.0
     assert "note: Scale +0.6" in said and "That explains the scale: set the speed of sound to 149" in said
-    assert "That explains the scale" in applied(capsys, saved, "cerulean")
+    assert "not both" not in said
+    said = applied(capsys, saved, "cerulean")
+    assert "SET-VELOCITY-ADJUSTMENT 0.99" in said and "That explains the scale" in said
+    assert "velocity_adjustment takes the scale out: set it or the speed of sound, not both" in said
     shown, _ = succeed(capsys, "apply", saved, "--force")
     assert "water: Scale +0.6" in " ".join(shown.split())
     told = fail(capsys, "apply", saved, "--force", "--instrument", "waterlinked", "--now", "speed_of_sound=1450")
