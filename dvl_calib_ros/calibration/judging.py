@@ -19,6 +19,7 @@ from .navigation import Navigation, dead_reckoned, objections
 from .results import Estimate
 from .told_arm import finds_arm
 from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
+from .worth import drift_left_open
 
 # What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
 JUDGED_LIVE = {
@@ -116,7 +117,8 @@ class Judge:
         if navigation is None:
             return found
         held_out = self.so_far(name, fresh=fresh).reasons
-        return [*found, *objections(navigation), *(each for each in held_out if each.code in JUDGED_LIVE)]
+        known_to = drift_left_open(self._estimate(name, fresh=fresh), p)
+        return [*found, *objections(navigation, known_to), *(each for each in held_out if each.code in JUDGED_LIVE)]
 
     def navigation(self, name: str, deviation: GaussianState | None) -> Navigation | None:
         """What one model's calibration is worth to dead reckoning, on data that it had not seen. None without

@@ -269,8 +269,11 @@ def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
     }
 
 
-def objections(navigation: Navigation | None) -> list[Reason]:
-    """What the drift says against a calibration: velocities may fit better and the track worse."""
+def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Reason]:
+    """What the drift says against a calibration: velocities may fit better and the track worse.
+
+    known_to: m per km (σ) that the estimate leaves open; what is worse by no more contradicts nothing.
+    """
     if navigation is None or navigation.stretches < ENOUGH:
         return []
     before, after, noise = navigation.before.per_km, navigation.after.per_km, navigation.noise_per_km
@@ -279,7 +282,8 @@ def objections(navigation: Navigation | None) -> list[Reason]:
             return []
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
     worse = finding("DRIFT_WORSE", after=after, before=before)
-    return [worse.weighed(Severity.MARGINAL) if navigation.fits_better else worse]
+    is_open = after**2 - before**2 < known_to**2
+    return [worse.weighed(Severity.MARGINAL) if navigation.fits_better or is_open else worse]
 
 
 def in_words(navigation: Navigation) -> list[str]:

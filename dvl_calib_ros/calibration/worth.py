@@ -66,6 +66,11 @@ def predicted_drift(model: Model, covariance: Array, parameters: Parameters) -> 
     return PredictedDrift(side, ahead if model.scale_axes else math.nan, math.hypot(side, ahead))
 
 
+def drift_left_open(estimate: Estimate, parameters: Parameters) -> float:
+    """Drift (m per km, σ) at the speeds driven that an estimate leaves open."""
+    return predicted_drift(MODELS[estimate.model], estimate.velocity_covariance, parameters).both
+
+
 def _rows(model: Model, parameters: Parameters) -> Array:
     """(2, n) velocity to port and ahead, in m/s for each m/s ahead, by the state of a model."""
     t = parameters.rotation_dvl_from_body

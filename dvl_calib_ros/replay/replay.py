@@ -26,6 +26,7 @@ from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..calibration.water import CauseOfScale, Water, cause_of_scale
+from ..calibration.worth import drift_left_open
 from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
@@ -144,7 +145,7 @@ def replay(
         is_level=calibrator.is_level,
     )
     found += [each.weighed(Severity.WARNING) for each in against]
-    of_drift = objections(navigation)
+    of_drift = objections(navigation, drift_left_open(result.estimate, calibrator.parameters))
     of_all = calibrator.clock_objections(fresh=True) + [
         each for each in against if each.severity is not Severity.WARNING
     ]
