@@ -21,7 +21,7 @@ from .results import Estimate
 
 # Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
 OPEN_FROM = 4.0
-# So many σ of the difference between the two are no chance.
+# So many σ of the difference between the two are no chance, and as many of its own are too little claimed.
 NO_CHANCE = 3.0
 
 
@@ -110,7 +110,7 @@ class Estimates:
         open_arm = np.diag(other.p - estimator.of_bias.covariance)[:3]
         by_arm = open_arm - own
         away = (state - other.x[: len(state)])[:3] ** 2
-        is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.maximum(by_arm, 0.0))
+        is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.minimum(own, np.maximum(by_arm, 0.0)))
         np.fill_diagonal(found[:3, :3], np.where(is_open & (by_arm > 0.0), by_arm + away, 0.0))
         return found
 
