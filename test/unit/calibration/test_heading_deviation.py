@@ -23,10 +23,11 @@ YAW = math.radians(1.0)  # of the DVL in the vehicle
 def recorded(seed, off, offset=(0.0, 0.0), legs=16, every=math.pi / 4.0, **parameters):
     """Legs of 40 s at 1 m/s, each turned by `every` from the one before; off: (yaw, s) -> by what the heading is off.
 
-    offset: m/s, of the reference east and north. The DVL is exact. Returns the calibrator, times (N,) and true yaws (N,).
+    offset: m/s, of the reference east and north. Returns the calibrator, times (N,) and true yaws (N,).
     """
     rng = np.random.default_rng(seed)
-    calibrator = Calibrator(Parameters(gnss_aided_std=0.03, dvl_bias_std=0.0, **parameters), block_size=64, models=("G1",))
+    exact_dvl = Parameters(gnss_aided_std=0.03, dvl_bias_std=0.0, **parameters)
+    calibrator = Calibrator(exact_dvl, block_size=64, models=("G1",))
     time = np.arange(0.0, LEG_S * legs, STEP_S)
     yaw = np.floor(time / LEG_S) * every + 0.2
     for at, heading in zip(time.tolist(), yaw.tolist(), strict=True):
