@@ -34,7 +34,7 @@ _BAD_VELOCITY, _LONGEST_DT_S = -32.0, 1.0
 
 def is_nortek_log(start: bytes) -> bool:
     """Whether a record of bottom track begins in the first bytes of a file."""
-    return next(_records(start, whole=False), None) is not None
+    return any(True for _ in _records(start))
 
 
 def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str], list[WaterReading]]:
@@ -43,6 +43,9 @@ def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str], list
     waters: list[WaterReading] = []
     left_out: Counter[str] = Counter()
     for data in _records(content):
+        if data is None:
+            left_out["damaged"] += 1
+            continue
         try:
             sample = _sample(data)
         except (struct.error, ValueError, OverflowError):
@@ -57,8 +60,8 @@ def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str], list
     return samples, left_out, waters
 
 
-def _records(content: bytes, whole: bool = True) -> Iterator[bytes]:
-    """Data of each record of bottom track, its checksums right. whole: not one that is cut off at the end."""
+def _records(content: bytes) -> Iterator[bytes | None]:
+    """Data of each record of bottom track whose header is whole; None where they are damaged or cut off."""
     start = 0
     while (at := content.find(_SYNC, start)) >= 0:
         start = at + 1
@@ -69,8 +72,8 @@ def _records(content: bytes, whole: bool = True) -> Iterator[bytes]:
             continue
         data = content[at + size : at + size + length]
         if len(data) < length or _sum(data) != checksum:
-            if identity == _BOTTOM_TRACK and not whole:
-                yield data
+            if identity == _BOTTOM_TRACK:
+                yield None
             continue
         start = at + size + length
         if identity == _BOTTOM_TRACK:

@@ -154,7 +154,7 @@ def test_bottom_track_of_nortek_is_a_velocity_at_its_echo(tmp_path, capsys):
     )  # fmt: skip
     assert is_dvl_log(path)
     log = read_dvl_log(path)
-    assert log.left_out == {"without bottom lock": 2}
+    assert log.left_out == {"without bottom lock": 2, "damaged": 2}
     expected = [(1.5, -0.2, 0.02)] * 8 + [(1.5, -0.2, 0.03), (1.6, 0.0, 0.0)]
     np.testing.assert_allclose([each.velocity for each in log.samples], expected, atol=1e-7)
     first_ns = round(datetime(2025, 11, 21, 10, 30, 15, tzinfo=timezone.utc).timestamp()) * 1_000_000_000
