@@ -143,10 +143,10 @@ def select(
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
-    fit = with_arm(fitter, fit, guesses, effects)
+    called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects))
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for)
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem))
     clocks = tuple(effect.name for effect in freed.effects if effect not in fit.effects)
     if clocks:
@@ -319,10 +319,11 @@ def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[H
     worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
     if tuple(own) not in worth:
         worth.append(tuple(own))
-    return [_hypothesis(fitter, fit, table, chosen) for chosen in worth] + _told_by_other_clocks(fit, effects)
+    return [_hypothesis(fitter, fit, table, chosen) for chosen in worth] + _told_by_other_clocks(fitter, fit, effects)
 
 
 CLOCKS = ("dvl_time_offset", "reference_time_offset", "attitude_time_offset")
+LEAP = "time_offset_jump"
 
 
 def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
@@ -331,16 +332,22 @@ def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
     return CLOCKS[2] not in names or len(names & set(CLOCKS)) == 1
 
 
-def _told_by_other_clocks(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """The fit's offsets said by fewer clocks, and by all that can say them: for large ones no straight line would."""
+def _told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The fit's offsets said by fewer clocks, and by all that can say them: for large ones no straight line would.
+
+    A leap at the beginning is a DVL's clock that is late throughout.
+    """
     n, values = len(fit.seen), fit.values
-    if not set(CLOCKS) & set(values):
+    said = (*CLOCKS, LEAP) if _leaps_at_the_beginning(fitter, fit) else CLOCKS
+    if not set(said) & set(values):
         return []
     dvl, reference, attitude = (
         np.array([each["seconds"] for each in values[name]]) if name in values else np.zeros(n) for name in CLOCKS
     )
     dvl, reference = dvl - attitude, reference - attitude
-    rest = [effect for effect in fit.effects if effect.name not in CLOCKS]
+    if LEAP in said:
+        dvl = dvl + [each["seconds"] for each in values[LEAP]]
+    rest = [effect for effect in fit.effects if effect.name not in said]
     told = [
         {CLOCKS[2]: -0.5 * (dvl + reference)}, {CLOCKS[0]: dvl - reference}, {CLOCKS[1]: reference - dvl},
         {CLOCKS[0]: dvl, CLOCKS[1]: reference},
@@ -353,11 +360,20 @@ def _told_by_other_clocks(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypot
     return found
 
 
+def _leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
+    """Whether there is a leap, and in each recording before the first of the times that are tried for it."""
+    leaps = fit.values.get(LEAP, ())
+    first = [recording.seconds / WINDOW_STEPS for recording in fitter.problem.recordings]
+    return bool(leaps) and all(leap["at_s"] < at for leap, at in zip(leaps, first, strict=True))
+
+
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
     """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
-    if not set(CLOCKS[:2]) <= set(fit.values):
+    if not set(CLOCKS[:2]) <= set(fit.values) and not _leaps_at_the_beginning(fitter, fit):
         return fit
-    others = [fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in _told_by_other_clocks(fit, effects)]
+    others = [
+        fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in _told_by_other_clocks(fitter, fit, effects)
+    ]
     return _best([fit, *others], effects)
 
 
@@ -546,8 +562,13 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
 
 
-def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int) -> list[Selected]:
-    """Lever arm and clock as one where each would do without the other."""
+def _clock_or_arm(
+    fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int, called_for: Sequence[Effect]
+) -> list[Selected]:
+    """Lever arm and clock as one where each would do without the other.
+
+    called_for: what the data calls for; a further clock that only stands beside the arm is named where it is shown.
+    """
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
     def is_shown(each: Selected) -> bool:
@@ -558,6 +579,8 @@ def _clock_or_arm(fitter: Fitter, fit: Fit, selected: list[Selected], n_effects:
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)
+    beside = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
+    selected = [each for each in selected if each not in beside]
     if is_shown(arm) and is_shown(clock):
         return selected
     one, other = (arm, clock) if is_shown(arm) else (clock, arm)

@@ -25,7 +25,7 @@ from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.selection import _by_fewer_clocks
+from dvl_calib_ros.diagnosis.selection import _by_fewer_clocks, _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -116,6 +116,29 @@ def test_two_clocks_that_are_as_late_as_each_other_are_told_by_the_third_whateve
     found = _by_fewer_clocks(fitter, fit, EFFECTS)
     assert {effect.name for effect in found.effects} == {"attitude_time_offset", "mount_flexure"}
     assert found.values["attitude_time_offset"][0]["seconds"] == pytest.approx(0.52, abs=0.02)
+
+
+def test_a_leap_at_the_beginning_beside_a_clock_is_the_third_clock():
+    """It was named for an IMU that is late: the reference early, and the DVL as early from 3 s on."""
+    fitter, fit, _ = fitted(
+        scenario(effects=["attitude_time_offset:seconds=0.52"], seed=1),
+        {"reference_time_offset": {"seconds": -0.5}, "time_offset_jump": {"seconds": -0.5, "at_s": 3.0}},
+    )
+    found = _by_fewer_clocks(fitter, fit, EFFECTS)
+    assert [effect.name for effect in found.effects] == ["attitude_time_offset"]
+    assert found.values["attitude_time_offset"][0]["seconds"] == pytest.approx(0.52, abs=0.02)
+
+
+def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown():
+    """With twelve others that could as well be meant, for none was."""
+    late = {"reference_time_offset": {"seconds": -0.5}}
+    fitter, fit, _ = fitted(
+        scenario(effects=["reference_time_offset:seconds=-0.5"], seed=1),
+        {"lever_arm": {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0}, "dvl_time_offset": {"seconds": 0.0}, **late},
+    )
+    selected = [_selected(fitter, fit, effect, EFFECTS) for effect in fit.effects]
+    kept = _clock_or_arm(fitter, fit, selected, len(EFFECTS), [EFFECTS["reference_time_offset"]])
+    assert [each.effect.name for each in kept] == ["reference_time_offset"]
 
 
 # ------------------------------------------------------------------ what is found
