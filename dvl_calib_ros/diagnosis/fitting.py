@@ -22,6 +22,9 @@ MAX_STEPS, STANDS_STILL = 30, 0.01
 # or when one gains less than this in deviance, of which differences of 1 begin to count
 GAINS_NOTHING = 1e-3
 HALVINGS = 5
+# The last step, with what noise makes in the columns taken off, is none if it makes the misfit so many times larger: of
+# what is hardly told apart without that, next to nothing may be left
+ASTRAY = 2.0
 # Squared cosine between steps from which on they are one series
 ALIKE = 0.9
 # Standard deviations of what other noise explains by chance that are taken off
@@ -201,10 +204,12 @@ class Fitter:
             step[free] = system.part(free).solution()
             if careful and not moved:
                 step[free] -= plain.part(free).solution()
-            hypothesis = hypothesis.moved(step)
-            seen, residual = self.evaluated(hypothesis)
-            misfit = self._misfit(noise, residual, hypothesis)
-            columns = self.columns(hypothesis, seen)
+            last = hypothesis.moved(step)
+            last_seen, last_residual = self.evaluated(last)
+            last_misfit = self._misfit(noise, last_residual, last)
+            if last_misfit < ASTRAY * misfit:
+                hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
+                columns = self.columns(hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
         return Fit(hypothesis, seen, residual, noise, columns, system, deviance, own_noise)
@@ -268,6 +273,18 @@ class Fitter:
                 for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
                     fit = self._finer(fit, effect, spec.name, step)
         return fit
+
+    def refined_as_white(self, fit: Fit, steps: Sequence[float]) -> Fit:
+        """`refined` as if the noise were white, where that is the better fit.
+
+        Noise with a memory takes in what a wrong time leaves, all but the step itself: only the exact time is better.
+        """
+        times = (is_time_of_run(spec) for effect in fit.effects for spec in effect.parameters)
+        if not fit.noise.is_coloured or not any(times):
+            return fit
+        white = self.refined(self.fit(fit.hypothesis, fit.noise.white), steps)
+        found = self.fit(white.hypothesis, fit.noise)
+        return found if found.deviance < fit.deviance else fit
 
     def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
         for sign in (-1.0, 1.0):

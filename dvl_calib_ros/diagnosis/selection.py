@@ -133,7 +133,8 @@ def select(
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         finer = _finer_steps(problem)
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
-        best = _by_fewer_clocks(fitter, fitter.refined(_best(fits, effects), finer[3:]), effects)
+        best = fitter.refined_as_white(fitter.refined(_best(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
+        best = _by_fewer_clocks(fitter, best, effects)
         best = _called_for(fitter, best, len(effects))
         names = frozenset(effect.name for effect in best.effects)
         fitter, fit = _about(fitter, best, every)

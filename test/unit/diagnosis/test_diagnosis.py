@@ -141,6 +141,27 @@ def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown(
     assert [each.effect.name for each in kept] == ["reference_time_offset"]
 
 
+def test_the_times_of_a_water_lock_are_found_where_noise_with_a_memory_hides_all_but_the_exact_ones():
+    lock = {"east_mps": 0.14, "north_mps": 0.26, "from_s": 65.0, "to_s": 260.0}
+    told = "water_lock:" + ",".join(f"{name}={value}" for name, value in lock.items())
+    given = scenario(effects=[told], seed=1, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.02)
+    fitter, fit, _ = fitted(given, {"water_lock": {**lock, "from_s": 0.0}})
+    coloured = fitter.fit(fit.hypothesis, fit.noise.refitted(fit.residual))
+    steps = [40.0 / 2**n for n in range(9)]
+    assert fitter.refined(coloured, steps).values["water_lock"][0]["from_s"] != pytest.approx(65.0, abs=5.0)
+    found = fitter.refined_as_white(coloured, steps).values["water_lock"][0]
+    assert found["from_s"] == pytest.approx(65.0, abs=0.5) and found["to_s"] == pytest.approx(260.0, abs=0.5)
+
+
+def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
+    """Its deviance was -3e12; what came after had noise of 43 m/s, and no effect was named."""
+    told = ["attitude_time_offset:seconds=-0.26", "water_lock:east_mps=0.14,north_mps=0.26,from_s=61,to_s=140"]
+    diagnosis = diagnosed(effects=told, seed=3, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.02)
+    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
+    assert set(found(diagnosis)) == {"attitude_time_offset", "water_lock"}
+    assert_within(diagnosis, "attitude_time_offset", seconds=-0.26)
+
+
 # ------------------------------------------------------------------ what is found
 
 
