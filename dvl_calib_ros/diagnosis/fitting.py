@@ -22,8 +22,7 @@ MAX_STEPS, STANDS_STILL = 30, 0.01
 # or when one gains less than this in deviance, of which differences of 1 begin to count
 GAINS_NOTHING = 1e-3
 HALVINGS = 5
-# The last step, with what noise makes in the columns taken off, is none if it makes the misfit so many times larger: of
-# what is hardly told apart without that, next to nothing may be left
+# Times by which the last step may make the misfit larger; one that goes further is not taken
 ASTRAY = 2.0
 # Squared cosine between steps from which on they are one series
 ALIKE = 0.9
@@ -279,11 +278,9 @@ class Fitter:
 
         Noise with a memory takes in what a wrong time leaves, all but the step itself: only the exact time is better.
         """
-        times = (is_time_of_run(spec) for effect in fit.effects for spec in effect.parameters)
-        if not fit.noise.is_coloured or not any(times):
+        if not fit.noise.is_coloured or not any(is_time_of_run(s) for e in fit.effects for s in e.parameters):
             return fit
-        white = self.refined(self.fit(fit.hypothesis, fit.noise.white), steps)
-        found = self.fit(white.hypothesis, fit.noise)
+        found = self.fit(self.refined(self.fit(fit.hypothesis, fit.noise.white), steps).hypothesis, fit.noise)
         return found if found.deviance < fit.deviance else fit
 
     def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
