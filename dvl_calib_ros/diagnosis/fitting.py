@@ -23,7 +23,7 @@ MAX_STEPS, STANDS_STILL = 30, 0.01
 GAINS_NOTHING = 1e-3
 HALVINGS = 5
 # Times by which the last step may make the misfit larger; one that goes further is not taken
-ASTRAY = 2.0
+ASTRAY = 30.0
 # Squared cosine between steps from which on they are one series
 ALIKE = 0.9
 # Standard deviations of what other noise explains by chance that are taken off
