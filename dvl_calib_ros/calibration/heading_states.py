@@ -44,8 +44,6 @@ _WIDTH = np.log(4.0)
 _LOGS: Array = np.arange(-6.0, 3.5, 0.35)
 _LOG_LIKELY: Array = -0.5 * (_LOGS / _WIDTH + _WIDTH) ** 2
 _FACTORS: Array = np.exp(_LOGS) / np.sqrt(np.exp(_LOG_LIKELY) @ np.exp(2.0 * _LOGS) / np.exp(_LOG_LIKELY).sum())
-# What was known before counts so little where nothing is to be known before.
-NOTHING_KNOWN = 1e-6
 # A block with less than this of another's information has none: rounding left it.
 NOTHING = 1e-9
 # A constant of any size, rad.
@@ -146,17 +144,13 @@ def _none(seen: HeadingEvidence) -> HeadingStates:
 
 class _Deviation(NamedTuple):
     """What M hypotheses know of the coefficients. onto: (8, 9), from terms to coefficients. turned: (M, 8, n), by how
-    much the states turn them. information (M, 8, 8), scores (M, 8): theirs, whatever the states are. freely: (M, 8, n),
-    information_freely, scores_freely: the same by the data alone, of states of which nothing was known before."""
+    much the states turn them. information (M, 8, 8), scores (M, 8): theirs, whatever the states are."""
 
     seen: HeadingEvidence
     onto: Array
     turned: Array
     information: Array
     scores: Array
-    freely: Array
-    information_freely: Array
-    scores_freely: Array
 
     @staticmethod
     def of(seen: HeadingEvidence) -> _Deviation:
@@ -167,12 +161,7 @@ class _Deviation(NamedTuple):
         beside, both = onto @ told[:, n:, :n], onto @ told[:, n:, n:] @ onto.T
         across, of_terms = beside.swapaxes(1, 2), seen.vector[:, n:] @ onto.T
         turned = beside @ p
-        freely = beside @ np.linalg.inv(told[:, :n, :n] + NOTHING_KNOWN * np.linalg.inv(p))
-        return _Deviation(
-            seen, onto,
-            turned, both - turned @ across, of_terms - product(beside, x),
-            freely, both - freely @ across, of_terms - product(freely, seen.vector[:, :n]),
-        )  # fmt: skip
+        return _Deviation(seen, onto, turned, both - turned @ across, of_terms - product(beside, x))
 
 
 def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
@@ -180,9 +169,7 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     sizes = np.array([len(one.scores) for one in each])
     owner, ends = np.repeat(np.arange(len(each)), sizes), np.cumsum(sizes)
     best = ends - sizes + [one.seen.best for one in each]
-    turned, own, scores, freely, own_freely, scores_freely = (
-        np.concatenate(parts) for parts in zip(*(one[2:] for one in each), strict=True)
-    )
+    turned, own, scores = (np.concatenate(parts) for parts in zip(*(one[2:] for one in each), strict=True))
     told, vector = (
         np.concatenate(parts) for parts in zip(*((one.seen.information, one.seen.vector) for one in each), strict=True)
     )
@@ -195,6 +182,8 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     to_terms[:, :n, :n] = np.eye(n)
     to_terms[:, n:, n:] = onto.swapaxes(1, 2)
 
+    as_claimed: Array = np.ones((len(each), N_COEFFICIENTS))
+
     def deviating(root: Array, level: Array, at: Index) -> tuple[GaussianState, GaussianState]:
         """Coefficients, and what they add to the states, of some hypotheses.
 
@@ -202,21 +191,19 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         """
         std_of, share = root[owner[at]], 1.0 / level[owner[at]]
         worth = np.sqrt(share)
-        known = own[at] - own_freely[at] + worth[:, :, None] * own_freely[at] * worth[:, None]
-        told_of_them = scores[at] - scores_freely[at] + share * scores_freely[at]
+        known = worth[:, :, None] * own[at] * worth[:, None]
         spread = np.eye(N_COEFFICIENTS) + std_of[:, :, None] * known * std_of[:, None]
         p = std_of[:, :, None] * np.linalg.inv(spread) * std_of[:, None]
-        x = product(p, told_of_them)
+        x = product(p, share * scores[at])
         across = turned[at].swapaxes(1, 2)
         of_states = GaussianState(-product(across, x), _symmetric(across @ (p @ turned[at])))
         return GaussianState(x, _symmetric(p)), of_states
 
-    def inflation(root: Array, level: Array) -> tuple[GaussianState, Array]:
+    def inflation(root: Array) -> tuple[GaussianState, Array]:
         """Of the best ones: coefficients, and by how much σ (S, n + 8) of states and them grow."""
-        found, (shift, more) = deviating(root, level, best)
-        share = 1.0 / level[:, :, None]
+        found, (shift, more) = deviating(root, as_claimed, best)
         # by how much what a block tells of states and terms moves coefficients and states
-        moved = found.p @ np.concatenate([(1.0 - share) * freely[best] - turned[best], share * onto], axis=2)
+        moved = found.p @ np.concatenate([-turned[best], onto], axis=2)
         of_states = np.concatenate([p, np.zeros((*p.shape[:2], N_TERMS))], axis=2) - turned[best].swapaxes(1, 2) @ moved
         at = product(to_terms, np.concatenate([x + shift, found.x], axis=1))
         variance = np.concatenate([np.diagonal(of, axis1=1, axis2=2) for of in (p + more, found.p)], axis=1)
@@ -224,11 +211,9 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         return found, inflations([s.blocks for s, *_ in each], at, gain, variance)
 
     # what is left where it may be of any size is noise, and whatever else: the evidence is worth as much less
-    as_claimed: Array = np.ones((len(each), N_COEFFICIENTS))
-
     def level_of(which: Mask, std: Array) -> Array:
         widest = np.where(which, _FACTORS[-1], 1.0) * std * as_claimed
-        return np.asarray((inflation(widest, as_claimed)[1][:, n:][:, which] ** 2).mean(axis=1))
+        return np.asarray((inflation(widest)[1][:, n:][:, which] ** 2).mean(axis=1))
 
     without_bias = np.where(_BIAS, 0.0, std)
     level = level_of(~_BIAS, without_bias)
@@ -242,7 +227,7 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     for which in (_CYCLES, _DRIFT):
         size = _size(own_free / level[:, None, None], scores_free / level[:, None], root, which)
         root = np.where(which, size[:, None], 1.0) * root
-    found, factor = inflation(root, as_claimed)
+    found, factor = inflation(root)
     every = np.arange(len(owner))
     shift, more = deviating(root, as_claimed, every)[1]
     of_bias = OfBias.none(*shift.shape)

@@ -220,7 +220,8 @@ class DelayBank:
             seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
             velocity, off = rows.motion.velocities(rows.body_from_dvl)
             terms = block_terms(rows.motion.earth, velocity, off, weight, seconds, self._up, N_ERRORS)
-            self._mean_bias.add(terms.of_states.mean(axis=0))
+            # of the likeliest: which of the others are still there depends on how many blocks came at once
+            self._mean_bias.add(terms.of_states[int(np.argmax(found.log_evidence))])
             self.blocks.add(*with_terms(*told.parts[:2], terms), told.weight)
             if self._folds is not None:
                 for fold, of_fold in told.by_fold:
