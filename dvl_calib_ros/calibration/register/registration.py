@@ -44,8 +44,6 @@ SAID_FROM_S = 0.1
 # So many σ from which a clock is said to be off. In chi-square: what one more clock that is off has to gain, and by how
 # much the next explanation has to be worse to be ruled out.
 SIGMAS, ONE_MORE, TOLD_APART = 4.0, 12.0, 8.0
-# ... and by how much clocks in time have to be worse for one to be off whatever its σ is.
-CERTAIN = 100.0
 # In chi-square: what clocks in time may cost for no other explanation to be tried.
 NO_DOUBT = 3.0
 # Places whose misfit is so much more than the best one's are none: of it, and a share of the squares.
@@ -237,7 +235,7 @@ def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> 
         return None
     closest = min(fitted, key=lambda each: each.level)
     # legs that repeat agree at more than one delay
-    as_good = [each for each in fitted if _is_as_good(quick, each, closest, rotation)]
+    as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation)]
     return min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
 
 
@@ -259,24 +257,18 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
     """By the fewest clocks that are off: none, one of the three, or both of DVL and reference."""
     apart = float(free.x[APART])
     early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
-    imu_early = EARLY if free.x[LATE] > 0.0 else 0.0
     tried = {_Off.NONE: _held(fit, free, rotation, 0.0, 0.0, (DVL, REFERENCE))}
     if tried[_Off.NONE][1] >= NO_DOUBT:
         tried |= {
             _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), ONE_MORE + early),
             _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), ONE_MORE + too_early),
-            _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE + imu_early),
+            _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE),
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # that both are off holds either one, and is no other cause
-    is_told_apart = all(
-        c - cost > TOLD_APART + _by_reading(fit, free, best, other)
-        for each, (other, c) in tried.items()
-        if each is not likeliest
+    is_told_apart = (
+        min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost > TOLD_APART
     )
-    # at one speed slopes hardly tell a clock from an arm, where what is left of the motion does
-    in_time = min((tried[each][1] for each in (_Off.NONE, _Off.DVL) if each in tried), default=math.inf)
-    is_certain = likeliest is _Off.IMU and in_time - cost > CERTAIN
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, is_told_apart = _Off.BOTH, free, True
     x, p = best.x, best.p
@@ -285,11 +277,7 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
     return Registration(
         dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and is_beyond_doubt(best.dvl_late, best.dvl_std)),
         reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(best, LATE)),
-        imu=Clock(
-            -float(x[LATE]),
-            float(std[LATE]),
-            likeliest is _Off.IMU and is_told_apart and (is_certain or _is_off(best, LATE)),
-        ),
+        imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
         apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
         is_turned=fit.is_turned,
         are_known=bool((free.std[[APART, LATE] if fit.is_turned else [APART]] < KNOWN_STD_S).all()),
@@ -384,15 +372,15 @@ def _way(clock: Clock) -> str:
     return "late" if clock.late > 0.0 else "early"
 
 
-def _is_as_good(fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
+def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
     """Whether a place explains the data about as well as the one that leaves least, and the same data.
 
     A delay that pushes a bad stretch of the DVL out of the overlap leaves less of the rest, as any other place does.
     Read at other times, the DVL's noise is another one: in waves that repeat, that alone tells two places apart.
     """
     is_read_elsewhere = abs(float(one.x[APART]) - float(closest.x[APART])) > ALIKE_S
-    enough = GAIN + (_by_chance(fit, one) if is_read_elsewhere else 0.0)
-    if _gain(fit, one, closest) < enough:
+    enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
+    if _gain(motion, one, closest) < enough:
         return True
     if closest.rows > AS_MANY * one.rows:
         return False
@@ -400,30 +388,24 @@ def _is_as_good(fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | 
     if again is None:
         return False
     grown = again.cost(closest.level, again.at) - closest.cost(closest.level, again.at)
-    return 0.5 * grown * min(1.0, _independent(fit, again) / again.rows) < enough
+    return 0.5 * grown * min(1.0, _independent(motion, again) / again.rows) < enough
 
 
-def _by_reading(fit: MotionFit, free: Fitted, one: Fitted | None, other: Fitted | None) -> float:
-    """By how much chi-square of two explanations differs by chance (σ), for the DVL is read at other times."""
-    if one is None or other is None or abs(float(one.x[APART]) - float(other.x[APART])) < ALIKE_S:
-        return 0.0
-    return 2.0 * _by_chance(fit, free) / free.inflation**2
-
-
-def _by_chance(fit: MotionFit, fitted: Fitted) -> float:
+def _by_chance(motion: MotionStreams, fitted: Fitted, dvl_noise: float) -> float:
     """σ of the difference in log evidence of two places at which the DVL's noise is not the same."""
-    share = min(fit.dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of what is left
+    share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of what is left
     # variance of (g + a)² - (g + b)², in squares of what is left: g the reference's noise, a and b the DVL's
     each = 8.0 * share * (1.0 - share) + 4.0 * share**2
     samples = fitted.rows * fitted.axes
-    return 0.5 * math.sqrt(each * samples) * min(1.0, _independent(fit, fitted) / fitted.rows)
+    return 0.5 * math.sqrt(each * samples) * min(1.0, _independent(motion, fitted) / fitted.rows)
 
 
-def _gain(fit: MotionFit, one: Fitted, other: Fitted) -> float:
+def _gain(motion: MotionStreams, one: Fitted, other: Fitted) -> float:
     """By how much the log evidence of the other is larger, of samples that are so far apart as to be independent."""
-    return 3.0 * _independent(fit, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
+    return 3.0 * _independent(motion, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
 
 
-def _independent(fit: MotionFit, fitted: Fitted) -> float:
+def _independent(motion: MotionStreams, fitted: Fitted) -> float:
     """How many of the references that are compared are so far apart as to be independent."""
-    return min(float(fitted.rows), float(fit.times[-1] - fit.times[0]) / INDEPENDENT_S)
+    times = motion.reference_times
+    return min(float(fitted.rows), float(times[-1] - times[0]) / INDEPENDENT_S)

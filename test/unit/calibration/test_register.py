@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import pytest
 from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.register import registration
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.register.configuration import fitting_configuration
 from dvl_calib_ros.calibration.register.curves import Curves
@@ -392,51 +390,3 @@ def test_a_clock_that_a_steady_turn_hides_leaves_its_yaw_open_and_one_that_turns
     np.testing.assert_allclose(turn_open(fit, 0.0), [0.0, 0.0, -0.1 * std], atol=1e-9)
     information[LATE, LATE] = 1e6
     assert not turn_open(fit._replace(p=np.linalg.inv(information), x=np.zeros(N)), 0.0).any()
-
-
-def explained(monkeypatch, late, apart, std, grown, dvl_noise=0.0):
-    """Of clocks that are free at late (of the reference) and apart, and by how much chi-square grows with each held.
-
-    grown: for none off, the DVL's, the reference's and the IMU's.
-    """
-
-    def fitted(late, apart):
-        x, p = np.zeros(N), np.eye(N) * 1e-4
-        x[LATE], x[APART], p[LATE, LATE], p[APART, APART] = late, apart, std**2, 0.03**2
-        return Fitted(x, p, np.eye(3), 0.04, 3000, 0.9, np.zeros(3000), 3, 1.2, np.arange(3000), np.ones(N))
-
-    places = {2: (0.0, 0.0), REFERENCE.tobytes(): (0.0, apart), DVL.tobytes(): (-apart, apart)}
-
-    def held(fit, free, rotation, reference, apart, in_time, costs=0.0):
-        if len(in_time) == 2:
-            return fitted(0.0, 0.0), grown[0]
-        key = in_time[0].tobytes()
-        if key in places:
-            return fitted(*places[key]), costs + grown[1 if key == REFERENCE.tobytes() else 2]
-        return fitted(late, 0.0), costs + grown[3]
-
-    monkeypatch.setattr(registration, "_held", held)
-    fit = SimpleNamespace(is_turned=True, dvl_noise=dvl_noise, times=np.linspace(0.0, 600.0, 3000))
-    return registration._explained(fit, fitted(late, apart), None, np.zeros(3))
-
-
-@pytest.mark.parametrize(("late", "is_shown"), [(0.92, False), (-0.92, True)])
-def test_an_imu_that_is_early_is_less_likely_than_one_that_is_late(monkeypatch, late, is_shown):
-    """Survey 37011: of a reference 0.3 s late and a compass that is 0.5° off an IMU was made that is 0.9 s early."""
-    assert explained(monkeypatch, late, -0.17, 0.136, (24.3, 29.1, 16.0, 1.5)).imu.is_shown is is_shown
-
-
-@pytest.mark.parametrize(("dvl_noise", "is_shown"), [(1e-6, True), (8e-4, False)])
-def test_what_the_dvl_s_noise_may_make_where_it_is_read_at_other_times_tells_no_clock(monkeypatch, dvl_noise, is_shown):
-    """Combination 301: a DVL 0.8 s late of 0.03 m/s was an IMU 0.7 s off, by 18 of chi-square."""
-    found = explained(monkeypatch, -0.73, 0.8, 0.1, (343.0, 6.8, 1050.0, -11.7), dvl_noise)
-    assert found.imu.is_shown is is_shown
-
-
-@pytest.mark.parametrize(("in_time", "is_shown"), [(187.0, True), (60.0, False)])
-def test_an_imu_is_late_where_nothing_else_explains_the_motion_though_at_one_speed_it_looks_like_an_arm(
-    monkeypatch, in_time, is_shown
-):
-    """Combination 661: an IMU 0.5 s late was 0.44 ± 0.13 s late, or the arm 1.1 m longer, and the arm was rejected."""
-    found = explained(monkeypatch, -0.436, -0.022, 0.128, (542.0, in_time, 640.0, -4.0))
-    assert found.imu.is_shown is is_shown
