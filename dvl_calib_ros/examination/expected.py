@@ -67,13 +67,16 @@ def _shown(found: Quantity, estimate: Estimate, parameters: Parameters, share: f
     """By a calibration with a share of the recording; what is the same however much there is stays as it is."""
     model = MODELS[estimate.model]
     stays = estimate.covariance - estimate.velocity_covariance + estimate.left_open
+    # more of the recording shows more of a bias where speeds show it, and no more at one speed: between the two
+    of_all = stays - (1.0 - math.sqrt(share)) * estimate.of_bias.covariance
     if found.name == "scale":
         unit, prior, fine = 100.0, parameters.initial_std_scale, parameters.fine_std_scale
-        floor = float(scale_std_ahead(model, stays, parameters)[0])
+        part, floor = (float(scale_std_ahead(model, each, parameters)[0]) for each in (stays, of_all))
     else:
         unit, prior, fine = math.degrees(1.0), parameters.initial_std_misalignment, parameters.fine_std_misalignment
-        floor = float(rpy_std(estimate.misalignment, stays, parameters)[_NAMES.index(found.name)])
-    of_share = max((found.std / unit) ** 2 - floor**2, 1e-12)
+        axis = _NAMES.index(found.name)
+        part, floor = (float(rpy_std(estimate.misalignment, each, parameters)[axis]) for each in (stays, of_all))
+    of_share = max((found.std / unit) ** 2 - part**2, 1e-12)
     told = max(1.0 / of_share - prior**-2, 0.0) / share
     std = math.sqrt(floor**2 + min(of_share, 1.0 / (told + prior**-2)))
     is_shown = found.shown or std <= OBSERVED_SHARE * prior
