@@ -112,7 +112,7 @@ CONFIGURATIONS = (
     ),
     _Said(
         "RATES_EXCHANGED",
-        "an attitude that turns about x, y, z as the angular velocity's about {axes}",
+        "exchanged axes: where the attitude turns about x, y, z, the angular velocity is about {axes}",
         "Axes are exchanged or negated.",
         "",
     ),
