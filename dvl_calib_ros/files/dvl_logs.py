@@ -16,7 +16,7 @@ import json
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,7 +70,7 @@ def is_dvl_log(path: Path) -> bool:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     if _is_ardupilot_log(path, start) or is_nortek_log(start):
         return True
-    return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or b'"vx"' in start
+    return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or _holds_json(start)
 
 
 def _is_ardupilot_log(path: Path, start: bytes) -> bool:
@@ -87,11 +87,14 @@ def read_dvl_log(path: Path) -> DvlLog:
         from .ardupilot_logs import read_ardupilot_log  # which gives this module's log
 
         log = read_ardupilot_log(path)
-    elif is_nortek_log(start):
-        nortek, left_out, waters = read_nortek_log(path.read_bytes())
-        log = DvlLog(nortek, left_out, waters=waters)
     else:
-        log = (_read_json if b'"vx"' in start else _read_pd0)(path, path.read_bytes())
+        content = path.read_bytes()
+        held = [kind for kind, (holds, _) in _KINDS.items() if holds(content)]
+        log = (_KINDS[held[0]][1] if held else _read_pd0)(path, content)
+        if len(held) > 1:
+            others = " and ".join(held[1:])
+            note = f"{path}: holds {others} as well as {held[0]}, which alone are imported; split it for the rest"
+            log = log._replace(notes=(*log.notes, note))
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"
         raise InputError(f"{path}: no velocity that can be used ({why})")
@@ -100,7 +103,19 @@ def read_dvl_log(path: Path) -> DvlLog:
     return log._replace(samples=in_order, left_out=+log.left_out)
 
 
+# ---------------------------------------------------------------------- Nortek
+
+
+def _read_nortek(_: Path, content: bytes) -> DvlLog:
+    samples, left_out, waters = read_nortek_log(content)
+    return DvlLog(samples, left_out, waters=waters)
+
+
 # ---------------------------------------------------------------------- Water Linked
+
+
+def _holds_json(content: bytes) -> bool:
+    return b'"vx"' in content
 
 
 def _read_json(path: Path, content: bytes) -> DvlLog:
@@ -309,3 +324,11 @@ def _earth_from_ship(roll: float, pitch: float, heading: float, fixed: bytes) ->
             [-cp * sr, sp, cp * cr],
         ]
     )
+
+
+# What a file may hold: how to tell, and the reader. Of several the first is read.
+_KINDS: dict[str, tuple[Callable[[bytes], bool], Callable[[Path, bytes], DvlLog]]] = {
+    "Nortek's records": (is_nortek_log, _read_nortek),
+    "Water Linked's reports": (_holds_json, _read_json),
+    "RDI's ensembles": (lambda content: _next_ensemble(content, 0) is not None, _read_pd0),
+}

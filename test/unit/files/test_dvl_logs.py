@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from log_fixtures import nortek
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.reader import BagReader
@@ -148,6 +149,17 @@ def test_what_is_no_log_is_not_taken_for_one(tmp_path, content):
     path = tmp_path / "file.bin"
     path.write_bytes(content)
     assert not is_dvl_log(path)
+
+
+@pytest.mark.parametrize("nortek_first", [True, False])
+def test_of_logs_of_two_instruments_in_one_file_one_is_read_and_the_other_named(tmp_path, nortek_first):
+    parts = [b"".join(nortek(i, (1.5, 0.1, -0.02, -0.02)) for i in range(8)), ensemble((0, -1500, 0, 0), 5) * 2000]
+    path = tmp_path / "both.log"
+    path.write_bytes(b"".join(parts if nortek_first else reversed(parts)))
+    log = read_dvl_log(path)
+    assert len(log.samples) == 8
+    (note,) = log.notes
+    assert "holds RDI's ensembles as well as Nortek's records" in note
 
 
 def test_import_writes_a_bag_of_either_log(tmp_path, capsys):
