@@ -212,13 +212,14 @@ def diagnosis(**changes: Any) -> Diagnosis:
     return Diagnosis(**{**values, **changes})
 
 
-def comparison(name: str) -> Comparison:
-    """Three calibrations, of which the last has moved. name: of one of them."""
+def comparison(name: str, apart_s: int = 86_400) -> Comparison:
+    """Three calibrations, so long after each other, of which the last has moved. name: of one of them."""
     std = np.array([0.001, 0.001, 0.001, 0.02, 0.02, 0.02, 0.001, 0.01])
     return compare(
         [
             Extrinsics(
-                name=each, model="G2", first_ns=day * 86_400_000_000_000, last_ns=(day * 86_400 + 600) * 1_000_000_000,
+                name=each, model="G2", first_ns=day * apart_s * 1_000_000_000,
+                last_ns=(day * apart_s + 600) * 1_000_000_000,
                 rotation_body_from_dvl=rotation_of((0.0, 0.0, yaw)), lever_arm=np.zeros(3), scale=0.0, time_offset=0.0,
                 covariance=np.diag(std**2), shown=np.ones(8, dtype=bool), used=100, remarks=("as it is",),
             )

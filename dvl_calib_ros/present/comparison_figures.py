@@ -77,8 +77,8 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
         label = "changed" if index == 0 else None
         axes.axvline(sum(ends) / 2.0, color=_MOVED, linewidth=1.2, linestyle="--", label=label)
     if dated:
-        # with fewer it finds no interval that fits some spans, and warns
-        locator = AutoDateLocator(maxticks=11)  # type: ignore[no-untyped-call]
+        # seven dates fit beside each other; as few as three let it find an interval for every span
+        locator = AutoDateLocator(minticks=3, maxticks=7)  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_locator(locator)
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     else:

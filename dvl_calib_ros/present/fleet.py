@@ -79,16 +79,20 @@ def fleet(result: Fleet) -> Document:
         answer=Answer(result.word, severity, said),
         warnings=result.notes,
         sections=[
-            Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True)]),
+            Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True, folded=True)]),
             section(
                 "Recordings that need a person",
                 table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=2),
             ),
             *(_trend(each) for each in sorted(vehicles, key=_by_word)),
-            section("Speed of sound", table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)), *waters),
+            section(
+                "Speed of sound",
+                replace(table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)), folded=True),
+                *waters,
+            ),
             section(
                 "Deviation of the compass",
-                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True),
+                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True, folded=True),
                 drawn if compasses else None,
             ),
         ],

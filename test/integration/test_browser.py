@@ -7,9 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fleet_fixtures import write_dive
 from io_fixtures import run
 from report_fixtures import comparison, cross_checked, diagnosis, evaluation, replay_page
 
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.discovery.discover import Given
+from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.present.reports import write_report
 
 pytestmark = pytest.mark.slow
@@ -111,6 +115,25 @@ def test_a_wide_table_can_be_read_on_a_phone_by_scrolling_it(browser, reports):
     assert scrolled
     for scroll_left, row_name_left in scrolled:
         assert scroll_left > 0 and row_name_left >= 0  # the row's name stays in sight
+    page.close()
+
+
+def test_on_a_phone_no_table_of_a_fleet_is_scrolled_and_every_value_has_its_heading(browser, tmp_path):
+    pytest.importorskip("pyarrow", reason="pip install '.[fleet]'")
+    from dvl_calib_ros.fleet.fleet import run_fleet
+
+    for day in range(2):
+        write_dive(tmp_path / "dives" / "auv1" / f"dive{day}", day, seed=day)
+    found = run_fleet([str(tmp_path / "dives")], tmp_path / "out", Parameters(), Given(), Workers(1))
+    write_report(found.page, found)
+    page, _ = opened(browser, found.page, PHONE)
+    tables = page.evaluate(
+        """() => [...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth <= e.clientWidth,
+             [...e.querySelectorAll('.folded td')].map(
+               td => getComputedStyle(td, '::before').content.replaceAll('"', '') || '-')])"""
+    )
+    assert len(tables) >= 2 and all(fits for fits, _ in tables)
+    assert next(headings for _, headings in tables if headings)[2:4] == ["mounting", "roll, °"]
     page.close()
 
 

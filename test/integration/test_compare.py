@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import copy
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from command_line import fail
-from report_fixtures import drawn
+from report_fixtures import comparison, drawn
 from yaml_text import parsed
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.present.comparison_figures import trend
 
 SHORT = ("--trajectory", "box", "--duration", "120", "--gnss-std", "0.05")
 
@@ -74,6 +76,19 @@ def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     assert document["says"][0] in text and text.count("<img") >= 2
     assert main(["compare", *results, "--report", str(png)]) == 1
     assert png.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("hours_apart", [0.25, 1.5, 4, 9, 13, 24, 240, 24 * 61, 24 * 500])
+def test_dates_below_a_trend_do_not_run_into_each_other(monkeypatch, hours_apart):
+    figures = drawn(monkeypatch)
+    trend(comparison("monday.yaml", apart_s=round(3600 * hours_apart)))
+    (axes,) = figures[0].axes
+    figures[0].canvas.draw()
+    low, high = axes.get_xlim()
+    labels = [label for at, label in zip(axes.get_xticks(), axes.get_xticklabels(), strict=True) if low <= at <= high]
+    boxes = [label.get_window_extent() for label in labels]
+    assert len(boxes) > 1
+    assert all(before.x1 < after.x0 for before, after in pairwise(boxes))
 
 
 @pytest.mark.parametrize(
