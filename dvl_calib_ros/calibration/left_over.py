@@ -69,8 +69,9 @@ QUIETEST_MPS = 1e-3
 FORGOTTEN_S, SLOWEST_S = (0.5, 1.0, 3.0), 0.3
 # Samples that foretell the next; more than so many σ of it is no noise but an outlier.
 FORETOLD_BY, NEW_AT_MOST = 12, 4.0
-# So many σ of the noise being followed are no chance, of three that are looked at and one sign; and a share of it.
-FOLLOWED_SURELY, FOLLOWED_FROM = 4.5, 0.02
+# So many σ of the noise being followed are no chance, of three that are looked at and one sign; and the share (σ) that
+# what waves leave of themselves may look like (waves of 0.2 m/s at 8 Hz: up to 0.05).
+FOLLOWED_SURELY, OF_WAVES = 4.5, 0.015
 # ... where that the reference is a filter's shows by how it smooths, in so many σ: both are rare by chance, not one.
 FOLLOWED_BY_FILTER, FILTER_SHOWN = 2.4, 2.4
 # A filter lags by what it smooths over, within this factor; by less than this (s) so does anything. That it lags so
@@ -241,7 +242,7 @@ def left_over_advice(
     """
     if found is None:
         return []
-    least = FOLLOWED_BY_POSITIONS if of_positions else FOLLOWED_FROM
+    least = FOLLOWED_BY_POSITIONS if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
     lags_so = lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and lag_s < LAGS_WITHIN * seconds
     filter_from = FILTER_SHOWN_LAGGING if lags_so else FILTER_SHOWN
@@ -320,13 +321,24 @@ def _std(scatter: Array) -> Array:
 
 
 def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
-    """Share of the DVL's noise (velocity (N, 3), body) that the reference still holds, its σ, and over how long, s."""
+    """Share of the DVL's noise (velocity (N, 3), body) that the reference still holds, its σ, and over how long, s.
+
+    What the samples around do not foretell of a velocity holds some of their noise. What is left is taken against its
+    own samples around by the same shares: the DVL's noise is then the same in both, as far as waves leave it so.
+    """
     step = float(median(np.diff(time)))
-    if step > SLOWEST_S:
+    if step > SLOWEST_S or len(time) < 4 * FORETOLD_BY:
         return 0.0, math.inf, 0.0
-    noise = np.column_stack([_between(each) for each in dvl.T])
-    noise[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
-    weight, weighted = fit.weight, columns * fit.weight[:, None, None]
+    new, rest = (np.zeros_like(dvl) for _ in range(2))
+    for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
+        shares = _not_foretold(values)
+        for filtered, each in ((new, values), (rest, fit.rest[:, axis])):
+            filtered[FORETOLD_BY:-FORETOLD_BY, axis] = np.correlate(each, shares, "valid")
+    most = NEW_AT_MOST * robust_std(new)
+    new[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
+    noise = np.clip(new, -most, most)
+    weight = fit.weight * ((new == noise) & (new != 0.0)).all(axis=1)  # neither clipped, nor at an end
+    weighted = columns * fit.weight[:, None, None]
 
     def without_columns(values: Array) -> Array:
         return np.asarray(values - columns @ (fit.p @ np.einsum("nij,ni->j", weighted, values)))
@@ -337,7 +349,7 @@ def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float
     def without_now(values: Array) -> Array:
         return np.asarray(values - now * (np.einsum("n,ni,ni->i", weight, now, values) / level))
 
-    rest, found = without_now(fit.rest), []
+    rest, found = without_now(rest), []
     for seconds in FORGOTTEN_S:
         for late in (0.0, seconds):  # that lag is taken for a late clock, and off
             past = without_now(without_columns(_followed(noise, step, seconds, late)))
@@ -346,8 +358,8 @@ def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float
                 continue
             share = float(np.einsum("n,ni,ni->", weight, past, rest)) / square
             scores = np.add.reduceat(weight * (past * (rest - share * past)).sum(axis=1), fit.starts)
-            found.append((share, float(_std(scores[None] / square)[0]), seconds))
-    return max(found, key=lambda each: each[0] / max(each[1], 1e-12), default=(0.0, math.inf, 0.0))
+            found.append((share, math.hypot(float(_std(scores[None] / square)[0]), OF_WAVES), seconds))
+    return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
 def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
@@ -359,18 +371,13 @@ def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
     return np.asarray(made[ahead : ahead + len(noise)])
 
 
-def _between(values: Array) -> Array:
-    """What the samples on both sides do not foretell of each (N,), which is nearly its noise; without outliers."""
-    values = values - values.mean()
-    if len(values) < 4 * FORETOLD_BY:
-        return np.zeros(len(values))
+def _not_foretold(values: Array) -> Array:
+    """Shares (2 `FORETOLD_BY` + 1,) by which the samples around one of (N,), and it, make what is new in it."""
     around = np.lib.stride_tricks.sliding_window_view(values, 2 * FORETOLD_BY + 1)
     own, others = around[:, FORETOLD_BY], np.delete(around, FORETOLD_BY, axis=1)
     square = others.T @ others
     level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # a simulator's may be foretold exactly
-    new = own - others @ np.linalg.solve(square + level * np.eye(2 * FORETOLD_BY), others.T @ own)
-    most = NEW_AT_MOST * float(robust_std(new))
-    return np.pad(np.clip(new, -most, most), FORETOLD_BY)
+    return np.insert(-np.linalg.solve(square + level * np.eye(2 * FORETOLD_BY), others.T @ own), FORETOLD_BY, 1.0)
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:

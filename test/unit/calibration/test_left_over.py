@@ -201,6 +201,20 @@ def test_noise_of_their_own_is_not_followed(seed):
     assert found.circular < 4.5 * found.circular_std
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_a_mean_of_noise_leaves_of_waves_is_no_filter_of_the_dvl(seed):
+    """What the samples around do not foretell of waves holds their noise: 4.7 to 6.2 σ of nothing."""
+    vehicle = Vehicle(np.random.default_rng(seed), wave_deg=0.5)
+    at = vehicle.time[:, None] * [0.65, 0.48, 0.65, 0.48] + [1.0, 2.0, 2.6, 0.5]
+    surge, sway, heave, more = np.sin(at).T
+    along = np.column_stack([0.1 * surge, 0.08 * sway, 0.25 * heave + 0.12 * more])
+    vehicle.earth += np.einsum("nij,nj->ni", vehicle.level, along)
+    vehicle.body = np.einsum("nji,nj->ni", vehicle.turns, vehicle.earth)
+    vehicle.noise = 0.3 * vehicle.noise[0], 3.0 * vehicle.noise[1]
+    found = vehicle.found()
+    assert found.circular < 2.4 * found.circular_std
+
+
 @pytest.mark.parametrize("interval_s", [0.4, 1.0])
 def test_waves_between_samples_of_a_slow_reference_do_not_make_it_a_smoothed_one(rng, interval_s):
     """Line by line between samples 1 s apart is 0.4 s of smoothing; surge in waves made that 0.7 s, and a reject."""
