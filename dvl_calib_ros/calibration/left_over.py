@@ -125,7 +125,7 @@ class _Fit(NamedTuple):
 
 
 def left_over(
-    time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array
+    time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> LeftOver | None:
     """None where there is too little to look at.
 
@@ -135,6 +135,7 @@ def left_over(
     rotation_enu_from_body: (N, 3, 3).
     velocity, error: (N, 3) m/s of the reference, and reference less corrected DVL, body.
     rates: (N, 3) rad/s, body.
+    interval_s: between samples of the reference, which is read along straight lines between them.
 
     """
     if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
@@ -163,8 +164,10 @@ def left_over(
     )
     quick[:, :, 2] = _turned(body_from_enu, bend)
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
+    # a straight line between two samples is short of the bend by so much in the mean
+    bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
     both = np.concatenate([known, quick], axis=2)
-    fast = _fitted(time, both, error, np.concatenate([KNOWN, QUICK]))
+    fast = _fitted(time, both, bent, np.concatenate([KNOWN, QUICK]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # of a mean its own noise is what the reference is further on: that alone would be a scale, and a bias against it
@@ -186,7 +189,7 @@ def left_over(
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return LeftOver(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_circular(time, velocity - error, both, fast),
+        *_circular(time, velocity - error, error, both, fast),
     )  # fmt: skip
 
 
@@ -320,11 +323,12 @@ def _std(scatter: Array) -> Array:
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
-def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
+def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
     """Share of the DVL's noise (velocity (N, 3), body) that the reference still holds, its σ, and over how long, s.
 
-    What the samples around do not foretell of a velocity holds some of their noise. What is left is taken against its
-    own samples around by the same shares: the DVL's noise is then the same in both, as far as waves leave it so.
+    What the samples around do not foretell of a velocity holds some of their noise. The error is taken against its own
+    samples around by the same shares: the DVL's noise is then the same in both, as far as waves leave it so. What else
+    is in it goes with that; the columns hold the DVL's noise themselves, so they are not taken off.
     """
     step = float(median(np.diff(time)))
     if step > SLOWEST_S or len(time) < 4 * FORETOLD_BY:
@@ -332,7 +336,7 @@ def _circular(time: Array, dvl: Array, columns: Array, fit: _Fit) -> tuple[float
     new, rest = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
         shares = _not_foretold(values)
-        for filtered, each in ((new, values), (rest, fit.rest[:, axis])):
+        for filtered, each in ((new, values), (rest, error[:, axis])):
             filtered[FORETOLD_BY:-FORETOLD_BY, axis] = np.correlate(each, shares, "valid")
     most = NEW_AT_MOST * robust_std(new)
     new[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0

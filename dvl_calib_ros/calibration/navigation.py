@@ -176,7 +176,7 @@ def dead_reckoned(
         deviation=heading_deviation(recording.dvl.times[use], after.yaw[use], heading)
         if on_a_map and heading is not None
         else None,
-        followed=left_over(recording.dvl.times[use], *(each[use] for each in after.whole)) if on_a_map else None,
+        followed=_followed(recording, after, use) if on_a_map else None,
     )
 
 
@@ -214,6 +214,13 @@ class _Level(NamedTuple):
             for level, body in ((self.velocity, seen.body), (self.error, seen.error)):
                 level[some, :2] = body[:, :2]
                 level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]
+
+
+def _followed(recording: ThinnedRecording, after: _Level, use: Index) -> LeftOver | None:
+    """As of `left_over`, of the samples that are used."""
+    rotation, velocity, error, rates = (each[use] for each in after.whole)
+    interval_s = float(median(np.diff(recording.reference.times)))
+    return left_over(recording.dvl.times[use], rotation, velocity, error, rates, interval_s)
 
 
 def _steps(times: Array) -> Array:

@@ -36,7 +36,7 @@ class Vehicle:
         self.rates[:, 2] = self.yaw_rate
         self.noise = rng.normal(0.0, 0.03, self.body.shape), rng.normal(0.0, 0.01, self.body.shape)
 
-    def found(self, dvl=None, reference=None, turns=None):
+    def found(self, dvl=None, reference=None, turns=None, interval_s=0.0):
         """By a DVL (N, 3) in the body, a reference (N, 3) in the earth and an IMU; what is not given is right."""
         turns = self.turns if turns is None else turns
         seen = (self.earth if reference is None else reference) + self.noise[0]
@@ -46,7 +46,7 @@ class Vehicle:
         moving = body - error
         lean = np.cross(moving, np.eye(3)[:, None]).transpose(1, 2, 0)
         x = np.linalg.lstsq(lean.reshape(-1, 3), error.reshape(-1), rcond=None)[0]
-        return left_over(self.time, turns, body, error - lean @ x, self.rates)
+        return left_over(self.time, turns, body, error - lean @ x, self.rates, interval_s)
 
 
 def smoothed(values, seconds):
@@ -224,6 +224,20 @@ def test_waves_between_samples_of_a_slow_reference_do_not_make_it_a_smoothed_one
     vehicle.body = np.einsum("nji,nj->ni", vehicle.turns, vehicle.earth)
     at = vehicle.time[:: round(interval_s / STEP_S)]
     read = vehicle.earth[:: round(interval_s / STEP_S)]
-    found = vehicle.found(reference=np.column_stack([np.interp(vehicle.time, at, each) for each in read.T]))
-    assert found.smoothed == pytest.approx(interval_s**2 / 12.0, abs=0.03)
+    between = np.column_stack([np.interp(vehicle.time, at, each) for each in read.T])
+    assert vehicle.found(reference=between).smoothed == pytest.approx(interval_s**2 / 12.0, abs=0.03)
+    found = vehicle.found(reference=between, interval_s=interval_s)
+    assert found.smoothed == pytest.approx(0.0, abs=0.03)
     assert "VELOCITY_SMOOTHED" not in {each.code for each in left_over_advice(found)}
+
+
+def test_waves_between_samples_of_a_slow_reference_are_no_tilt_that_is_not_followed():
+    """A line between samples 1 s apart leaves as much of the heave of waves as half a degree of tilt makes of speed."""
+    vehicle = Vehicle(np.random.default_rng(3), wave_deg=0.5)
+    vehicle.noise = 0.0 * vehicle.noise[0], vehicle.noise[1]
+    vehicle.earth += 0.3 * np.outer(np.sin(vehicle.time * 0.9 + 1.0), [0.0, 0.0, 1.0])
+    vehicle.body = np.einsum("nji,nj->ni", vehicle.turns, vehicle.earth)
+    between = np.column_stack([np.interp(vehicle.time, vehicle.time[::5], each) for each in vehicle.earth[::5].T])
+    (said,) = left_over_advice(vehicle.found(reference=between))
+    assert said.code == "TILT_NOT_FOLLOWED"
+    assert left_over_advice(vehicle.found(reference=between, interval_s=1.0)) == []
