@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import examples, performance, positions, sea, trials
+from . import examples, performance, played, positions, sea, trials
 from .registry import MEASUREMENTS
 
-__all__ = ["MEASUREMENTS", "examples", "performance", "positions", "sea", "trials"]
+__all__ = ["MEASUREMENTS", "examples", "performance", "played", "positions", "sea", "trials"]
