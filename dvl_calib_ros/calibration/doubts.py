@@ -8,7 +8,7 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .advice import one_heading_advice
 from .heading_deviation import heading_advice, how_bad
-from .left_over import finds_nothing, lag_of, left_over_advice
+from .left_over import finds_nothing, lag_of, left_over_advice, std_along
 from .navigation import Navigation
 from .parameters import Parameters
 from .positions import are_positions
@@ -47,5 +47,10 @@ def doubts(
         found.append(heading_advice(navigation.deviation).weighed(how_bad(navigation.deviation, estimate)))
     if in_earth:
         found += one_heading_advice(estimate, parameters, navigation.speed)
-    lag_s = lag_of(estimate, parameters)
-    return found + left_over_advice(navigation.followed, are_positions(parameters), lag_s, finds_nothing(estimate))
+    return found + left_over_advice(
+        navigation.followed,
+        are_positions(parameters),
+        lag_of(estimate, parameters),
+        finds_nothing(estimate),
+        std_along(estimate, parameters),
+    )

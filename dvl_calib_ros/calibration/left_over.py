@@ -16,6 +16,7 @@ sign. (Long, because all of it is asked of one fit.)
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -57,8 +58,8 @@ TILT_SHOWN = 0.2
 SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
 # A share from here on is no levelled velocity, but a sign.
 WRONG_SIGN_FROM = 1.6
-# An error of a mounting (rad) that is worth a word, and one that no answer is given beside.
-SAID_FROM, WRONG_FROM = math.radians(0.2), math.radians(0.5)
+# An error of a mounting (rad) that is worth a word, and one that no answer is given beside unless so many σ hold it.
+SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 1.5
 # Smoothing (s, time constant) that is worth a word, and one beside which no answer is given.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # A velocity so many times further off than usual is an outlier.
@@ -235,13 +236,26 @@ def finds_nothing(estimate: Estimate) -> bool:
     return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, BY_CHANCE * arm)).any()
 
 
+def std_along(estimate: Estimate, parameters: Parameters) -> Array:
+    """σ (3,) of what a bias along each axis of the body looks like: scale ahead, and turns (rad) in pitch and yaw."""
+    terms, dvl_from_body = MODELS[estimate.model].error_terms_from_state, parameters.rotation_dvl_from_body
+    p = terms @ estimate.recording_covariance @ terms.T
+    ahead = dvl_from_body[:, 0] ** 2
+    turned = np.diag(dvl_from_body.T @ p[:3, :3] @ dvl_from_body)
+    return np.sqrt([float(ahead @ p[3:, 3:] @ ahead), turned[2], turned[1]])
+
+
 def left_over_advice(
-    found: LeftOver | None, of_positions: bool = False, lag_s: float = 0.0, is_nil: bool = False
+    found: LeftOver | None,
+    of_positions: bool = False,
+    lag_s: float = 0.0,
+    is_nil: bool = False,
+    along: Sequence[float] | Array = (0.0, 0.0, 0.0),
 ) -> list[Reason]:
     """What to say of it, as bad as it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
-    lag_s, is_nil: as of `lag_of` and `finds_nothing`.
+    lag_s, is_nil, along: as of `lag_of`, `finds_nothing` and `std_along`.
     """
     if found is None:
         return []
@@ -279,8 +293,9 @@ def left_over_advice(
             if shown[i]
         )
         turned = float(size[shown].max()) / found.speed
-        is_sure = bool((size > SURELY_BIASED * found.bias_std)[shown].any())
-        word = Severity.REJECT if turned > WRONG_FROM and is_sure else Severity.MARGINAL
+        is_sure = size > SURELY_BIASED * found.bias_std
+        is_wrong = size > np.maximum(WRONG_FROM, WITHIN * np.asarray(along)) * found.speed
+        word = Severity.REJECT if (shown & is_wrong).any() and (shown & is_sure).any() else Severity.MARGINAL
         said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
     elif float(found.bias_std[:2].max()) > BIAS_OPEN:
         share = SEEN_BIAS / found.speed

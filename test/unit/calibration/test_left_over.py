@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.calibration.left_over import left_over, left_over_advice
+from dvl_calib_ros.calibration.left_over import left_over, left_over_advice, std_along
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.verdict.kinds import Severity
 
 STEP_S = 0.2
@@ -119,6 +123,30 @@ def test_a_bias_that_is_not_beyond_doubt_is_marginal(rng):
     for bias, words in ((0.027, [Severity.MARGINAL]), (0.02, []), (0.03, [Severity.REJECT])):
         biased = found._replace(bias=np.array([0.0, bias, 0.0]), bias_std=np.full(3, 0.0067))
         assert [each.severity for each in left_over_advice(biased) if each.code == "DVL_BIAS"] == words
+
+
+@pytest.mark.parametrize(("axis", "word"), [(0, Severity.REJECT), (1, Severity.MARGINAL), (2, Severity.REJECT)])
+def test_a_bias_that_sigma_of_its_own_axis_holds_is_said_and_no_reject(rng, axis, word):
+    """28 ± 2 mm/s ahead, beside a scale of 1.7 ± 1.5 %, were a reject."""
+    bias = np.zeros(3)
+    bias[axis] = 0.028
+    found = Vehicle(rng).found()._replace(bias=bias, bias_std=np.full(3, 0.002), speed=1.6)
+    along = [0.002, 0.0146, 0.002]
+    (said,) = [each for each in left_over_advice(found, along=along) if each.code == "DVL_BIAS"]
+    assert said.severity is word
+    (said,) = [each for each in left_over_advice(found) if each.code == "DVL_BIAS"]
+    assert said.severity is Severity.REJECT
+
+
+def test_what_a_bias_looks_like_is_by_the_axes_of_the_body():
+    """Of a DVL at 90 degrees a turn about its own x is a pitch of the body."""
+    names = MODELS["G1"].state_names
+    p = np.zeros((len(names), len(names)))
+    p[0, 0], p[2, 2] = 0.01**2, 0.02**2
+    estimate: Any = SimpleNamespace(model="G1", recording_covariance=p)
+    turned = std_along(estimate, Parameters(mounting_rpy=(0.0, 0.0, math.pi / 2.0)))
+    assert turned == pytest.approx([0.0, 0.02, 0.01], abs=1e-12)
+    assert std_along(estimate, Parameters()) == pytest.approx([0.0, 0.02, 0.0], abs=1e-12)
 
 
 def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
