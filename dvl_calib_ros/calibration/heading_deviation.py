@@ -22,8 +22,9 @@ from .results import Estimate
 SAID_FROM, CHANCE = math.radians(0.3), 1e-3
 # From here on (rad), and so many times its σ, the compass is to be calibrated first (QRev's rule).
 FIRST, SURELY = math.radians(3.0), 3.0
-# ... and where more than this share of the samples was gated, which are those that it turns most.
-GATED_FROM = 0.1
+# ... and, of at least so much (rad), where more than this share of the samples was gated: those that it turns most, so
+# it may be larger.
+GATED_FIRST, GATED_FROM = math.radians(1.0), 0.1
 # A drift of so much (rad, rms; 1.2° from first to last) is no yaw to accept, whatever its σ holds: nobody knows when a
 # heading that drifts was right.
 DRIFTS_FROM = math.radians(0.35)
@@ -76,10 +77,11 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
 
 def how_bad(found: HeadingDeviation, estimate: Estimate) -> Severity:
     """To a verdict: reject where the compass is to be calibrated before an estimate is worth anything."""
-    if found.rms > max(FIRST, SURELY * found.std) or estimate.gated > GATED_FROM * (estimate.used + estimate.gated):
+    is_cut = estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
+    if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, SURELY * found.std):
         return Severity.REJECT
     is_drift = found.by_time and found.rms > max(DRIFTS_FROM, SURELY * found.std)
-    return Severity.MARGINAL if is_drift else Severity.WARNING
+    return Severity.MARGINAL if is_drift or is_cut else Severity.WARNING
 
 
 def heading_advice(found: HeadingDeviation) -> Reason:

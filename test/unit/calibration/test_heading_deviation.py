@@ -103,6 +103,9 @@ def test_a_compass_whose_worst_headings_are_gated_comes_first_whatever_is_left(d
     assert found is not None and not found.by_time
     severity = how_bad(found._replace(rms=math.radians(2.0)), estimate)
     assert severity is (Severity.REJECT if is_first else Severity.WARNING)
+    # where the reference is so good that 0.7 degrees are gated, σ of yaw holds them
+    severity = how_bad(found._replace(rms=math.radians(0.7)), estimate)
+    assert severity is (Severity.MARGINAL if is_first else Severity.WARNING)
 
 
 @pytest.mark.parametrize("degrees", [2.0, 4.0])
