@@ -9,7 +9,7 @@ import numpy as np
 
 from . import kalman
 from .chi_square import chi2_cdf, chi2_isf
-from .correction_parameters import PriorOnErrors, to_correction, to_errors
+from .correction_parameters import PriorOnErrors, of_unseen_roll, to_correction, to_errors
 from .frames import Array
 from .kalman import GaussianState
 from .models import Model
@@ -38,13 +38,14 @@ class Assembler:
         begun = initial or {}
         self._starts = [begun.get(model.name) or known for model, known in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
+        self._roll = of_unseen_roll(parameters.rotation_dvl_from_body)
         held = [
-            to_correction(state) if model.in_correction_parameters else _without(floor, state)
+            to_correction(state, self._roll) if model.in_correction_parameters else _without(floor, state)
             for model, floor, state in zip(self.models, self._floors, self._starts, strict=True)
         ]
         self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
         self._prior_on_errors = {
-            index: PriorOnErrors(held[index], self._starts[index])
+            index: PriorOnErrors(held[index], self._starts[index], self._roll)
             for index, model in enumerate(self.models)
             if model.in_correction_parameters
         }
@@ -69,7 +70,7 @@ class Assembler:
             floor = self._floors[index]
             return held if floor is None else GaussianState(held.x, held.p + floor)
         if self.process_rate is not None:  # what the prior still weighs is then not known
-            return to_errors(held)
+            return to_errors(held, self._roll)
         return self._prior_on_errors[index].to_errors(held)
 
     def measurements(self, seen: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:

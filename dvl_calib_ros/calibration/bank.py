@@ -143,14 +143,20 @@ class Group:
         if self._heave is None:
             after = self._after(data, process, every)
             self._x, self._p, states, known_at = after.x, after.p, after.at, every
+            of_heave: list[tuple[HeaveSums, Array]] = []
         else:
             rows = self._assembler.heave_rows(seen)
-            after, states = self._with_heave(stamps_ns, rows, data, process, every, shown)
+            after, states, of_heave = self._with_heave(stamps_ns, rows, data, process, every, shown)
             known_at = shown
         if self._scatter is not None and len(cuts):
             assert every is not None and known_at is not None and after.at is not None and states is not None
             at, last = np.searchsorted(every, cuts), int(np.searchsorted(known_at, cuts[-1]))
-            self._scatter.add(cuts, after.at.x[at], after.at.p[at], GaussianState(states.x[last], states.p[last]))
+            at_last = GaussianState(states.x[last], states.p[last])
+            beside = None
+            if of_heave:
+                sums, variance = of_heave[last]
+                beside = sums.with_terms(variance, self._up[:3])
+            self._scatter.add(cuts, after.at.x[at], after.at.p[at], at_last, beside)
         self._states.clear()
         self._of_recording.clear()
         if self._folds is not None:
@@ -180,7 +186,7 @@ class Group:
         self._x, self._p = after
         if self._scatter is not None:
             try:
-                self._scatter.end_day(before, after, self._of_day, self._now())
+                self._scatter.end_day(before, after, self._of_day, *self._now_told())
             except np.linalg.LinAlgError:  # numbers that ran away: it looks at the new day alone
                 self._scatter = self._new_scatter()
         if self._folds is not None:
@@ -197,10 +203,11 @@ class Group:
         process: Array | None,
         every: Ends | None,
         shown: Ends | None,
-    ) -> tuple[kalman.Updated, GaussianState | None]:
+    ) -> tuple[kalman.Updated, GaussianState | None, list[tuple[HeaveSums, Array]]]:
         """Take a block, and its rows of heave.
 
-        Returns the filter's states after `every` so many samples, and with heave those after `shown`, some of these.
+        Returns the filter's states after `every` so many samples, with heave those after `shown`, some of these, and
+        what rows there were then, with their variances (K,).
         """
         assert self._heave is not None
         n_samples = len(stamps_ns)
@@ -210,6 +217,7 @@ class Group:
         none = np.zeros(0, dtype=np.intp)
         wanted, with_rows = none if every is None else every, none if shown is None else shown
         parts, found = [], []
+        told: list[tuple[HeaveSums, Array]] = []
         for start, end in pairwise(cuts):
             if start in starts:
                 self._heave.close()
@@ -226,9 +234,11 @@ class Group:
             if after.at is not None and len(own_shown):
                 places = np.searchsorted(own, own_shown)
                 states = GaussianState(after.at.x[places], after.at.p[places])
-                found.append(_joined(states, HeaveSums.stacked(sums), self._parameters.motion_std))
-        joined = GaussianState(*map(np.concatenate, zip(*found, strict=True))) if found else None
-        return kalman.one_after_another(parts), joined
+                joined, variances = _joined(states, HeaveSums.stacked(sums), self._parameters.motion_std)
+                found.append(joined)
+                told += zip(sums, variances, strict=True)
+        all_joined = GaussianState(*map(np.concatenate, zip(*found, strict=True))) if found else None
+        return kalman.one_after_another(parts), all_joined, told
 
     def _absorb_heave(self) -> None:
         assert self._heave is not None
@@ -279,8 +289,16 @@ class Group:
 
     def _now(self) -> GaussianState:
         """The filter's states x (K, n), P (K, n, n), with heave where models have it."""
+        return self._now_told()[0]
+
+    def _now_told(self) -> tuple[GaussianState, tuple[Array, Array] | None]:
+        """`_now`, and what rows of heave told of it and terms, as of `HeaveSums.with_terms`."""
         state = GaussianState(self._x, self._p)
-        return state if self._heave is None else _joined(state, self._heave.sums(), self._parameters.motion_std)
+        if self._heave is None:
+            return state, None
+        sums = self._heave.sums()
+        state, variance = _joined(state, sums, self._parameters.motion_std)
+        return state, sums.with_terms(variance, self._up[:3])
 
     def _process_noise(self, stamps_ns: Stamps) -> Array | None:
         rate = self._assembler.process_rate
@@ -364,7 +382,8 @@ class Group:
                 without = self._folds.state(fold, index)
                 if self._heave is not None:
                     sums = self._heave.sums(without=fold)
-                    x, p = _joined(GaussianState(*(each[None] for each in without)), sums, self._parameters.motion_std)
+                    of_one = GaussianState(*(each[None] for each in without))
+                    (x, p), _ = _joined(of_one, sums, self._parameters.motion_std)
                     without = GaussianState(x[index], p[index])
                 state = self._published(index, *without)
             found.append(state or self.state(name))
@@ -389,13 +408,13 @@ def _joined_ends(cuts: Ends, ends: Ends | None) -> Ends | None:
     return ends if not len(cuts) else np.array(sorted({*cuts.tolist(), *([] if ends is None else ends.tolist())}))
 
 
-def _joined(state: GaussianState, sums: HeaveSums, motion_std: float) -> GaussianState:
-    """`with_heave`; as they are where numbers have run away."""
+def _joined(state: GaussianState, sums: HeaveSums, motion_std: float) -> tuple[GaussianState, Array]:
+    """`with_heave`; where numbers have run away they are as they are, and rows tell nothing (σ² is infinite)."""
     with suppress(np.linalg.LinAlgError):
-        found, _ = with_heave(state, sums, motion_std)
+        found, variance = with_heave(state, sums, motion_std)
         if _is_sound(*found):
-            return found
-    return state
+            return found, variance
+    return state, np.full(state.x.shape[:-1], math.inf)
 
 
 def _filtered(

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 
 import numpy as np
 
-from .block_terms import BlockTerms, MeanBias, TermsOfBlock, all_told, with_terms
+from .block_terms import BlockTerms, TermsOfBlock, all_told, with_terms
 from .frames import Array
 from .heading_states import HeadingEvidence, HeadingStates, heading_states
 from .kalman import GaussianState
@@ -33,7 +32,7 @@ class BlockScatter:
         self._blocks = TimeBlocks()
         self._length_ns = round(seconds * 1e9)
         self._terms, self._std = terms, std
-        self._mean = MeanBias(x.shape[-1])
+        self._beside: tuple[Array, Array] | None = None
         self._last: int | None = None
         self._state = GaussianState(x, p)
         self._told = self._state.information
@@ -55,31 +54,44 @@ class BlockScatter:
         self._last = int(blocks[-1])
         return np.flatnonzero(np.diff(blocks, prepend=before))
 
-    def add(self, cuts: Index, x: Array, p: Array, last: GaussianState) -> None:
+    def add(self, cuts: Index, x: Array, p: Array, last: GaussianState, beside: tuple[Array, Array] | None) -> None:
         """Take the states at the cuts, x (E, K, n), P (E, K, n, n).
 
-        last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by.
+        last: x (K, n), P (K, n, n) at the last of them with all that is known beside what blocks are judged by, which
+        told Λ (K, n + 9, n + 9) and y (K, n + 9) of states and terms.
         """
         terms: Sequence[TermsOfBlock | None] = [None] * len(cuts) if self._terms is None else self._terms.upto(cuts)
-        self._add(terms, x, p, last)
+        self._add(terms, x, p, last, beside)
 
-    def _add(self, terms: Iterable[TermsOfBlock | None], x: Array, p: Array, last: GaussianState) -> None:
+    def _add(
+        self,
+        terms: Iterable[TermsOfBlock | None],
+        x: Array,
+        p: Array,
+        last: GaussianState,
+        beside: tuple[Array, Array] | None,
+    ) -> None:
         for own, now in zip(terms, _informations(x, p), strict=True):
             if now is None:
                 continue
             told = now[0] - self._told[0], now[1] - self._told[1]
-            if own is not None:
-                self._mean.add(own.of_states)
             information, vector = told if own is None else with_terms(*told, own)
             self._blocks.add(information, vector, 1.0)
             self._told = now
-        self._state = last
+        self._state, self._beside = last, beside
         self._found.clear()
 
-    def end_day(self, before: GaussianState, after: GaussianState, of_day: Index, last: GaussianState) -> None:
+    def end_day(
+        self,
+        before: GaussianState,
+        after: GaussianState,
+        of_day: Index,
+        last: GaussianState,
+        beside: tuple[Array, Array] | None,
+    ) -> None:
         """Go on with states `after` the end of a day, x (K, n), P (K, n, n), from those `before`. of_day: which (u,) of
-        them were of the day. last: those `after`, as in `add`."""
-        self._add([None if self._terms is None else self._terms.rest()], before.x[None], before.p[None], last)
+        them were of the day. last, beside: of those `after`, as in `add`."""
+        self._add([None if self._terms is None else self._terms.rest()], before.x[None], before.p[None], last, beside)
         known = self._told if self._terms is None else all_told(*self._told, self._blocks)
         self._blocks.end_day(of_day, *known, np.arange(len(before.x)))
         self._told = after.information
@@ -91,11 +103,8 @@ class BlockScatter:
         if index not in self._found:
             of_one = GaussianState(*(each[index : index + 1] for each in self._state))
             beside = None
-            if self._terms is not None:
-                rows = (each[index : index + 1] for each in self._told)
-                with suppress(np.linalg.LinAlgError):  # numbers that ran away
-                    more = (all_of - own for all_of, own in zip(of_one.information, rows, strict=True))
-                    beside = self._mean.told(*more)
+            if self._terms is not None and self._beside is not None:
+                beside = self._beside[0][index : index + 1], self._beside[1][index : index + 1]
             seen = HeadingEvidence.of(self._blocks, of_one, np.array([index]), 0, beside)
             self._found[index] = heading_states([seen], self._std)[0]
         return self._found[index]

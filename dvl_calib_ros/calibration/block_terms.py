@@ -96,27 +96,6 @@ def _heading_terms(earth_in_body: Array, weight: Array, seconds: float) -> Array
     )
 
 
-class MeanBias:
-    """What a bias does in the mean of all blocks, for rows that are of no block: heave's (heave.py).
-
-    That a vehicle does not heave is held against the DVL's velocity, with the bias in it. Were that left out, heave and
-    reference would contradict each other where there is one, and where there is trim, one would be invented.
-    """
-
-    def __init__(self, n: int) -> None:
-        self._sum, self._count = np.zeros((n, N_TERMS)), 0
-
-    def add(self, of_states: Array) -> None:
-        """Take U (n, 9) of a block."""
-        self._sum[:, :N_BIAS] += of_states[:, :N_BIAS]
-        self._count += 1
-
-    def told(self, information: Array, vector: Array) -> tuple[Array, Array]:
-        """What Λ (K, n, n), y (K, n) of such rows tell of states and terms."""
-        none = TermsOfBlock.none(np.zeros(len(self._sum)))
-        return with_terms(information, vector, none._replace(of_states=self._sum / max(self._count, 1)))
-
-
 class BlockTerms:
     """Terms of blocks of time that end where they are said to, from samples in order."""
 
@@ -172,11 +151,18 @@ def with_terms(information: Array, vector: Array, terms: TermsOfBlock) -> tuple[
     return both, y
 
 
-def all_told(information: Array, vector: Array, blocks: TimeBlocks) -> tuple[Array, Array]:
-    """All that is known of K times n states, Λ (K, n, n) and y (K, n), with what blocks tell of the terms."""
+def all_told(
+    information: Array, vector: Array, blocks: TimeBlocks, beside: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
+    """All that is known of K times n states, Λ (K, n, n) and y (K, n), with what blocks tell of the terms.
+
+    beside: what else tells of them, as of `with_terms`.
+    """
     n = vector.shape[1]
     if not blocks.count:
         return with_terms(information, vector, TermsOfBlock.none(np.zeros(n)))
     both, y = (each.copy() for each in blocks.total)
+    if beside is not None:
+        both, y = both + beside[0], y + beside[1]
     both[:, :n, :n], y[:, :n] = information, vector
     return both, y

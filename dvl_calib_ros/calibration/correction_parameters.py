@@ -5,6 +5,11 @@ errors are defined (models.md). With B = (I - [ψ×] - diag(κ))⁻¹: δk_i = B
 diag(1 + δk)⁻¹ B. To first order φ = ψ and δk = κ; at 5 degrees the difference is 0.4 per cent of the speed.
 
 Scales are those of x and y. A DVL looks down and a vehicle hardly heaves, so no motion shows that of z; κ_z is zero.
+
+A vehicle moves along its x axis, n in the DVL's frame, and what turns about n (roll) changes no velocity along it. Of a
+DVL that is mounted askew it changes B_ii all the same, by -ψ_n² (1 - n_i²): a scale larger than its prior expects would
+be taken for a roll that nothing shows. So of axes that motion ahead moves along δk_i is B_ii - 1 + ψ_n² (1 - n_i²), as
+B makes of n.
 """
 
 from __future__ import annotations
@@ -21,6 +26,8 @@ from .kalman import GaussianState
 from .samples import Index
 
 _N = 5  # three angles, two scales
+# Motion ahead moves along an axis of which this share of it is. What is less askew than that is so by rounding.
+ALONG_FROM, _NOT_ASKEW = 0.4, 1e-9
 # d([ψ×] + diag(κ)) / d(ψ, κ): (5, 3, 3)
 _GENERATORS: Array = np.concatenate([skew(np.eye(3)), [np.diag(axis) for axis in np.eye(3)]])[:_N]
 _IDENTITY: Array = np.eye(3)
@@ -43,11 +50,28 @@ class Mapped(NamedTuple):
     jacobian: Array
 
 
-def errors_from_correction(correction: Array) -> Mapped:
+def of_unseen_roll(rotation_dvl_from_body: Array) -> Array | None:
+    """Q (2, 3, 3), ψᵀQ_i ψ being what δk_i is more than B_ii - 1; None of a DVL that is mounted along the vehicle."""
+    ahead = rotation_dvl_from_body[:, 0]
+    share = np.where(np.abs(ahead[:2]) > ALONG_FROM, 1.0 - ahead[:2] ** 2, 0.0)
+    return share[:, None, None] * np.outer(ahead, ahead) if share.max() > _NOT_ASKEW else None
+
+
+def errors_from_correction(correction: Array, roll: Array | None = None) -> Mapped:
     """ψ (3) and κ (2) as one vector (..., 5) -> φ, δk with their derivatives.
 
-    Raises numpy.linalg.LinAlgError where there is no such B.
+    roll: (2, 3, 3) of `of_unseen_roll`. Raises numpy.linalg.LinAlgError where there is no such B.
     """
+    mapped = _by_inverse(correction)
+    if roll is not None:
+        slope = product(roll, correction[..., None, :3])
+        mapped.errors[..., 3:] += (slope * correction[..., None, :3]).sum(axis=-1)
+        mapped.jacobian[..., 3:, :3] += 2.0 * slope
+    return mapped
+
+
+def _by_inverse(correction: Array) -> Mapped:
+    """φ, and B_ii - 1 for δk."""
     if correction.ndim == 1:
         try:
             return _errors_from_one_correction(correction)
@@ -62,7 +86,7 @@ def errors_from_correction(correction: Array) -> Mapped:
     return Mapped(np.concatenate([_skew_part(c), scale - 1.0], axis=-1)[..., :_N], np.swapaxes(derivative, -1, -2))
 
 
-def _curvature(correction: Array) -> Array:
+def _curvature(correction: Array, roll: Array | None) -> Array:
     """ψ, κ (..., 5) -> second derivatives of φ and δk (..., 5, 5, 5), the last axis theirs.
 
     d²B = B G_i B G_j B + B G_j B G_i B, and those of the quotients c_ij = b_ij / b_ii.
@@ -77,7 +101,10 @@ def _curvature(correction: Array) -> Array:
     crossed = dscale[..., :, None, :, None] * dc[..., None, :, :, :]
     d2c = d2b - d2scale[..., None] * c[..., None, None, :, :] - crossed - np.swapaxes(crossed, -4, -3)
     d2c /= scale[..., None, None, :, None]
-    return np.concatenate([_skew_part(d2c), d2scale], axis=-1)[..., :_N]
+    found: Array = np.concatenate([_skew_part(d2c), d2scale], axis=-1)[..., :_N]
+    if roll is not None:
+        found[..., :3, :3, 3:] += 2.0 * np.moveaxis(roll, 0, -1)
+    return found
 
 
 def _errors_from_one_correction(correction: Array) -> Mapped:
@@ -121,11 +148,14 @@ def _slopes(row: Sequence[float], column: Sequence[float]) -> tuple[float, float
     return left_z * y - left_y * z, left_x * z - left_z * x, left_y * x - left_x * y, left_x * x, left_y * y
 
 
-def correction_from_errors(errors: Array) -> Array:
-    """φ, δk (..., 5) -> ψ, κ, by Newton's method from the first-order solution."""
+def correction_from_errors(errors: Array, roll: Array | None = None) -> Array:
+    """φ, δk (..., 5) -> ψ, κ, by Newton's method from the first-order solution.
+
+    roll: as in `errors_from_correction`.
+    """
     correction = np.array(errors, dtype=float)
     for _ in range(_NEWTON_STEPS):
-        mapped = errors_from_correction(correction)
+        mapped = errors_from_correction(correction, roll)
         step = _solve(mapped.jacobian, errors - mapped.errors)
         correction += step
         if np.abs(step).max() < 1e-16:
@@ -133,18 +163,18 @@ def correction_from_errors(errors: Array) -> Array:
     return correction
 
 
-def to_errors(held: GaussianState) -> GaussianState:
-    """States (..., n) whose first five are ψ and κ -> the same with φ and δk."""
-    mapped = errors_from_correction(held.x[..., :_N])
+def to_errors(held: GaussianState, roll: Array | None) -> GaussianState:
+    """States (..., n) whose first five are ψ and κ -> the same with φ and δk. roll: as in `errors_from_correction`."""
+    mapped = errors_from_correction(held.x[..., :_N], roll)
     jacobian = _extended(mapped.jacobian, held.x.shape[-1])
     x = np.concatenate([mapped.errors, held.x[..., _N:]], axis=-1)
     return GaussianState(x, _propagated(jacobian, held.p))
 
 
-def to_correction(state: GaussianState) -> GaussianState:
+def to_correction(state: GaussianState, roll: Array | None) -> GaussianState:
     """The inverse of `to_errors`."""
-    correction = correction_from_errors(state.x[..., :_N])
-    jacobian = np.linalg.inv(errors_from_correction(correction).jacobian)
+    correction = correction_from_errors(state.x[..., :_N], roll)
+    jacobian = np.linalg.inv(errors_from_correction(correction, roll).jacobian)
     x = np.concatenate([correction, state.x[..., _N:]], axis=-1)
     return GaussianState(x, _propagated(_extended(jacobian, x.shape[-1]), state.p))
 
@@ -158,8 +188,9 @@ class PriorOnErrors:
     by Gauss-Newton, and by Newton where that does not end, exact as the data is linear in ψ and κ.
     """
 
-    def __init__(self, start: GaussianState, prior: GaussianState) -> None:
-        """Both (n,), or (K, n) for filters with a prior each."""
+    def __init__(self, start: GaussianState, prior: GaussianState, roll: Array | None) -> None:
+        """Both (n,), or (K, n) for filters with a prior each. roll: as in `errors_from_correction`."""
+        self._roll = roll
         self._started, self._started_state = start.information
         self._information = np.linalg.inv(prior.p)
         self._mean = prior.x
@@ -180,7 +211,7 @@ class PriorOnErrors:
         gained, gained_state = information - self._started, state - self._started_state
         x = held.x
         for n in range(_STEPS):
-            mapped = errors_from_correction(x[..., :_N])
+            mapped = errors_from_correction(x[..., :_N], self._roll)
             errors = np.concatenate([mapped.errors, x[..., _N:]], axis=-1)
             jacobian = _extended(mapped.jacobian, x.shape[-1])
             weighted = np.swapaxes(jacobian, -1, -2) @ self._information
@@ -208,7 +239,7 @@ class PriorOnErrors:
         """
         curved = information.copy()
         pull = product(self._information, errors - self._mean)[..., :_N]
-        curved[..., :_N, :_N] += (_curvature(x[..., :_N]) @ pull[..., None, :, None])[..., 0]
+        curved[..., :_N, :_N] += (_curvature(x[..., :_N], self._roll) @ pull[..., None, :, None])[..., 0]
         curvature, along = np.linalg.eigh(curved)
         curvature = np.abs(curvature)
         curvature = np.maximum(curvature, np.finfo(float).eps * curvature.max(axis=-1, keepdims=True))
@@ -218,7 +249,8 @@ class PriorOnErrors:
         """Steps (..., n), halved until the posterior is not less after them than before."""
 
         def cost(at: Array) -> Array:
-            off = np.concatenate([errors_from_correction(at[..., :_N]).errors, at[..., _N:]], axis=-1) - self._mean
+            errors = errors_from_correction(at[..., :_N], self._roll).errors
+            off = np.concatenate([errors, at[..., _N:]], axis=-1) - self._mean
             found: Array = 0.5 * (at * product(gained, at) + off * product(self._information, off)) - gained_state * at
             return found.sum(axis=-1, keepdims=True)
 

@@ -74,7 +74,7 @@ class HeadingEvidence(NamedTuple):
     """M hypotheses as they stood once: x (M, n), P (M, n, n) without a deviation, and what blocks of time told of them.
 
     best: place of the one that says how large it is. information (M, n + 9, n + 9), vector (M, n + 9): of all blocks
-    `with_terms`, and what `MeanBias` makes of the rest. blocks: those of the best one.
+    `with_terms`, and of rows of heave. blocks: those of the best one.
     """
 
     states: GaussianState

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .block_terms import N_BIAS, N_TERMS
 from .folds import FoldSums, folds_of
 from .frames import Array, product
 from .kalman import GaussianState
@@ -42,11 +43,12 @@ class HeaveSums(NamedTuple):
     """Of rows m = (H, z) with weights w, the length of the block in 20 s, at most 1.
 
     told: Σ w m mᵀ (..., K, n+1, n+1), what they tell at σ² = 1. scatter: Σ w² m mᵀ, in which blocks count by their
-    length. weight: Σ w (..., 1).
+    length. mean: Σ w (m, 1) (..., K, n+2), of the rows in `told`. weight: Σ w (..., 1).
     """
 
     told: Array
     scatter: Array
+    mean: Array
     weight: Array
 
     @staticmethod
@@ -54,9 +56,24 @@ class HeaveSums(NamedTuple):
         """Along a new first axis."""
         return HeaveSums(*(np.stack(each) for each in zip(*sums, strict=True)))
 
+    def with_terms(self, variance: Array | float, upwards: Array) -> tuple[Array, Array]:
+        """What they tell of states and terms, Λ (K, n + 9, n + 9) and y (K, n + 9), as of `block_terms.with_terms`.
 
-# Place of what rows told among them.
-_TOLD = 0
+        A bias b of the DVL is -u·b in each z. variance: (K,) or one for all, of σ². upwards: u (3,) in the DVL's frame.
+        """
+        k, n = self.mean.shape[0], self.mean.shape[1] - 2
+        both, y = np.zeros((k, n + N_TERMS, n + N_TERMS)), np.zeros((k, n + N_TERMS))
+        of_bias = -self.mean[:, :, None] * upwards
+        both[:, :n, :n], y[:, :n] = self.told[:, :n, :n], self.told[:, :n, n]
+        both[:, :n, n : n + N_BIAS], y[:, n : n + N_BIAS] = of_bias[:, :n], of_bias[:, n]
+        both[:, n : n + N_BIAS, :n] = of_bias[:, :n].swapaxes(1, 2)
+        both[:, n : n + N_BIAS, n : n + N_BIAS] = -of_bias[:, n + 1, None] * upwards[:, None]
+        of_one = np.broadcast_to(variance, (k,))
+        return both / of_one[:, None, None], y / of_one[:, None]
+
+
+# Places of what rows told among them.
+_TOLD, _MEAN = 0, 2
 
 
 class HeaveRows:
@@ -69,7 +86,7 @@ class HeaveRows:
     def __init__(self, k: int, n: int, parameters: Parameters) -> None:
         self._parameters = parameters
         size = k, n + 1, n + 1
-        self._folds = FoldSums(size, size, (1,))  # of `HeaveSums`
+        self._folds = FoldSums(size, size, (k, n + 2), (1,))  # of `HeaveSums`
         self._sum = np.zeros((k, n + 1))
         self._sums: dict[int | None, HeaveSums] = {}  # as asked for since the last change
         self._start()
@@ -150,7 +167,7 @@ class HeaveRows:
         weight = min(self._seconds * 1e9 / BLOCK_NS, 1.0)
         told = weight * mean[:, :, None] * mean[:, None, :]
         return int(folds_of(np.array([self._last_ns]), self._parameters)[0]), HeaveSums(
-            told, weight * told, np.array([weight])
+            told, weight * told, weight * np.append(mean, np.ones((len(mean), 1)), axis=1), np.array([weight])
         )
 
     def sums(self, without: int | None = None) -> HeaveSums:
@@ -169,7 +186,9 @@ class HeaveRows:
         Returns the rows, and what they tell by folds (FOLDS, K, n+1, n+1).
         """
         self._sums.clear()
-        return HeaveSums(*self._folds.total), self._folds.taken(_TOLD)
+        rows = HeaveSums(*self._folds.total)
+        self._folds.taken(_MEAN)
+        return rows, self._folds.taken(_TOLD)
 
     def learn_from(self, source: Index) -> None:
         """Let each of K take what was told from others. source: (K,) from which of those there are."""

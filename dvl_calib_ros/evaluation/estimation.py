@@ -214,8 +214,8 @@ def heave_joined(
         taken = HeaveRows(1, rows.shape[-1] - 1, parameters)
         found = taken.add(stamps[at], own[at], use[at], [int(number[end]) for end in ends])
         sums.append(HeaveSums.stacked(found))
-    told, scatter, weight = (np.stack(each, axis=1)[:, :, 0] for each in zip(*sums, strict=True))
-    return with_heave(after, HeaveSums(told, scatter, weight), parameters.motion_std)[0]
+    of_all = HeaveSums(*(np.stack(each, axis=1)[:, :, 0] for each in zip(*sums, strict=True)))
+    return with_heave(after, of_all, parameters.motion_std)[0]
 
 
 def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:

@@ -18,6 +18,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 RATE_HZ, EPOCH_S = 50.0, 1_771_000_000
+# m/s: the rms of the DVL's constant error that the beam biases of the published data make along an axis.
+DVL_BIAS_STD = 0.008
 FLIP = Rotation.from_euler("x", np.pi)
 NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 A50 = "dvl_msgs/msg/DVL"
@@ -38,7 +40,7 @@ Vector = np.ndarray
 
 @dataclass(frozen=True)
 class Drawn:
-    """What a survey is. Angles in degrees, lengths in m, times in s."""
+    """What a survey is. Angles in degrees, lengths in m, times in s, bias in m/s along the DVL's axes."""
 
     seed: int
     manoeuvre: str
@@ -59,6 +61,7 @@ class Drawn:
     dvl_type: str
     reference: str
     reference_std: float
+    dvl_bias: tuple[float, float, float]
 
 
 def draw(seed: int) -> Drawn:
@@ -70,6 +73,10 @@ def draw(seed: int) -> Drawn:
 
     def three(*bounds: float) -> tuple[float, float, float]:
         x, y, z = (float(rng.uniform(-each, each)) for each in bounds)
+        return x, y, z
+
+    def normal_three(std: float) -> tuple[float, float, float]:
+        x, y, z = (float(each) for each in rng.normal(0.0, std, 3))
         return x, y, z
 
     return Drawn(
@@ -96,6 +103,7 @@ def draw(seed: int) -> Drawn:
         str(rng.choice([TWIST, STAMPED, A50])),
         str(rng.choice(["enu", "ned", "body", "fix", "enu without covariance"], p=[0.3, 0.15, 0.2, 0.15, 0.2])),
         float(rng.choice([0.02, 0.05, 0.1])),
+        normal_three(DVL_BIAS_STD),
     )
 
 
@@ -259,7 +267,7 @@ def _write_dvl(drawn: Drawn, motion: Motion, mounted: Rotation, bag: Bag, rng: n
     times = np.arange(1.0, drawn.seconds - 2.0, 0.2)
     _, body, rates, _ = motion.at(times)
     measured = mounted.inv().apply(body + np.cross(rates, drawn.arm)) * (1.0 + drawn.scale)
-    measured += rng.normal(0.0, 0.01, measured.shape)
+    measured += rng.normal(0.0, 0.01, measured.shape) + drawn.dvl_bias
     wild = rng.random(len(times)) < drawn.outliers
     measured[wild] += rng.normal(0.0, 1.0, (int(wild.sum()), 3))
     if drawn.dvl_type == A50:

@@ -18,8 +18,8 @@ from functools import reduce
 
 import numpy as np
 
-from ..block_terms import MeanBias, all_told, block_terms, upwards, with_terms
-from ..correction_parameters import PriorOnErrors, to_correction
+from ..block_terms import all_told, block_terms, upwards, with_terms
+from ..correction_parameters import PriorOnErrors, of_unseen_roll, to_correction
 from ..dvl_bias import OfBias
 from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
 from ..frames import Array, product
@@ -72,6 +72,7 @@ class DelayBank:
         self._gate = gate
         self._process_rate = process_rate
         self._solved: Hypotheses | None = None
+        self._roll = of_unseen_roll(parameters.rotation_dvl_from_body)
         self._begin_day()
         information, vector = self._start.information
         self._ended: list[Ended] = []
@@ -86,7 +87,6 @@ class DelayBank:
         self._nis_sum = 0.0
         self.blocks = TimeBlocks()
         self._up = upwards(parameters.rotation_dvl_from_body, N_STATE)
-        self._mean_bias = MeanBias(N_STATE)
         self._std_beside = prior_std(parameters.heading_deviation_std, parameters.dvl_bias_std)
         self._epoch_ns: int | None = None  # of the first row
         self._folds = FoldInformation(self._start) if verified else None
@@ -95,8 +95,8 @@ class DelayBank:
         """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
         prior = self.prior
         self.compared: Index = STEPS
-        self._start = _around_each_delay(to_correction(prior))
-        self._prior_on_errors = PriorOnErrors(self._start, _around_each_delay(prior))
+        self._start = _around_each_delay(to_correction(prior, self._roll))
+        self._prior_on_errors = PriorOnErrors(self._start, _around_each_delay(prior), self._roll)
         # of a delay's deviation from the prior's mean
         variance = prior.p[DELAY, DELAY] + CELL_STD_S**2
         self._log_prior = -0.5 * (DELAYS_S - prior.x[DELAY]) ** 2 / variance
@@ -140,7 +140,7 @@ class DelayBank:
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
         begins = [_around_each_delay(with_states_of(each, self._unknown, OF_DAY)).information for each in known]
-        total = all_told(found.information, found.vector, self.blocks)
+        total = all_told(found.information, found.vector, self.blocks, self._of_heave())
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
         self.blocks.end_day(OF_DAY, *total, source)
@@ -208,9 +208,8 @@ class DelayBank:
             self._count(expected.nis[0], expected.use[0])  # it goes on as before these rows
             return [After(self.used, self.gated, self.mean_nis, self.known())]
         after = []
-        for (rows, stamps_ns, _), use, nis, told, (sums, found) in zip(
-            blocks, expected.use, expected.nis, expected.told, expected.steps, strict=True
-        ):
+        taken = zip(blocks, expected.use, expected.nis, expected.told, expected.steps, strict=True)
+        for number, ((rows, stamps_ns, _), use, nis, told, (sums, found)) in enumerate(taken):
             self._count(nis, use)
             self._sums, self._solved = sums, found
             self._regressor_noise = self._regressor_noise + rows.weight[use] @ rows.regressor_noise[use]
@@ -220,13 +219,12 @@ class DelayBank:
             seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
             velocity, off = rows.motion.velocities(rows.body_from_dvl)
             terms = block_terms(rows.motion.earth, velocity, off, weight, seconds, self._up, N_ERRORS)
-            # of the likeliest: which of the others are still there depends on how many blocks came at once
-            self._mean_bias.add(terms.of_states[int(np.argmax(found.log_evidence))])
-            self.blocks.add(*with_terms(*told.parts[:2], terms), told.weight)
+            information, vector, _ = told.parts
+            self.blocks.add(*with_terms(information, vector, terms), told.weight)
             if self._folds is not None:
                 for fold, of_fold in told.by_fold:
                     self._folds.add_told(fold, of_fold)
-            after.append(After(self.used, self.gated, self.mean_nis, self.known()))
+            after.append(After(self.used, self.gated, self.mean_nis, self.known(expected.rows[number])))
         self._heave = expected.heave
         return after
 
@@ -303,7 +301,7 @@ class DelayBank:
         at = np.arange(len(best)), best
         p = np.linalg.inv(information[at])
         x = product(p, vector[at])
-        own = HeaveSums(heave.told[at], heave.scatter[at], heave.weight[:, 0])
+        own = HeaveSums(heave.told[at], heave.scatter[at], heave.mean[at], heave.weight[:, 0])
         try:
             _, variance = with_heave(GaussianState(x, 0.5 * (p + p.swapaxes(1, 2))), own, self._parameters.motion_std)
         except np.linalg.LinAlgError:
@@ -395,23 +393,26 @@ class DelayBank:
         shares: Array = found.log_evidence / self._level(found, weight)[..., None] + self._log_prior
         return shares
 
-    def known(self) -> Known:
-        """What is known as of now, to be `found`."""
+    def known(self, heave: HeaveSums | None = None) -> Known:
+        """What is known as of now, to be `found`. heave: its rows by now, if not all that there are."""
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
         kept, share = _likely(log_share)
         likely = GaussianState(found.x[kept], found.p[kept])
         place = int(np.searchsorted(kept, best))
-        seen = None if self._process_rate is not None else self._seen(found, likely, kept, place)
+        seen = None if self._process_rate is not None else self._seen(likely, kept, place, heave)
         return Known(likely, kept, share, best, found.information[best], self._regressor_noise, seen)
 
-    def _seen(self, found: Hypotheses, states: GaussianState, numbers: Index, best: int) -> HeadingEvidence:
-        """By blocks of time and by heave, of some hypotheses (M,)."""
-        heave = (
-            found.information[numbers] - self._sums.information[numbers],
-            found.vector[numbers] - self._sums.vector[numbers],
-        )
-        return HeadingEvidence.of(self.blocks, states, numbers, best, self._mean_bias.told(*heave))
+    def _seen(
+        self, states: GaussianState, numbers: Index, best: int, heave: HeaveSums | None = None
+    ) -> HeadingEvidence:
+        """By blocks of time and by heave, of some hypotheses (M,). heave: as in `known`."""
+        of_heave = self._of_heave(heave)
+        return HeadingEvidence.of(self.blocks, states, numbers, best, (of_heave[0][numbers], of_heave[1][numbers]))
+
+    def _of_heave(self, heave: HeaveSums | None = None) -> tuple[Array, Array]:
+        """What rows of heave tell of all hypotheses, as of `HeaveSums.with_terms`. heave: as in `known`."""
+        return (heave or self._heave.sums()).with_terms(self._sums.heave_variance, self._up[:3])
 
     def found(self, known: Sequence[Known]) -> list[Likely | None]:
         """What was known at times of this day, with what that makes of the heading; None where numbers ran away."""
@@ -541,7 +542,7 @@ class DelayBank:
         if self._process_rate is not None:
             return np.ones(N_STATE)
         of_one = np.array([best])
-        seen = self._seen(found, GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
+        seen = self._seen(GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
         return heading_states([seen], self._std_beside)[0].inflation
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
@@ -587,7 +588,7 @@ class _Expected:
     expected to be used at first; the states by that say which are, and again, until nothing changes: every time one
     block more is settled, and nearly always all of them are.
 
-    use (J,), nis (J,), told, steps: of each block. heave: rows of heave with theirs.
+    use (J,), nis (J,), told, steps: of each block. heave: rows of heave with theirs; rows: what they were by then.
     """
 
     def __init__(self, bank: DelayBank, blocks: Sequence[BlockRows]) -> None:
@@ -606,11 +607,11 @@ class _Expected:
             if not self.is_finite:
                 return
             self.heave = bank.heave.copy() if last else bank.heave
-            rows = [self._heave_after(number) for number in range(last)]
+            self.rows = [self._heave_after(number) for number in range(last)]
             # of the one that was settled last other rows are used than the time before
             first = max(settled - 1, 0)
             start = self.steps[first - 1][0] if first else bank.sums
-            self.steps = self.steps[:first] + bank.steps(start, self.told[first:], rows[first:])
+            self.steps = self.steps[:first] + bank.steps(start, self.told[first:], self.rows[first:])
             for number in range(settled, last + 1):
                 before = self.steps[number - 1][1] if number else bank.hypotheses
                 state = GaussianState(before.x, before.p)
@@ -627,7 +628,8 @@ class _Expected:
         self.is_finite = self.told[last].is_finite
         if self.is_finite:
             start = self.steps[-1][0] if last else bank.sums
-            self.steps += bank.steps(start, self.told[last:], [self._heave_after(last)])
+            self.rows.append(self._heave_after(last))
+            self.steps += bank.steps(start, self.told[last:], self.rows[last:])
 
     def _heave_after(self, number: int) -> HeaveSums:
         rows, stamps_ns, _ = self._blocks[number]

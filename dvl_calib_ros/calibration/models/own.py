@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..correction_parameters import ALONG_FROM
 from ..frames import Array, skew, turned_skew
 from ..observations import Observations
 from ..samples import Mask
@@ -14,9 +15,9 @@ from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuis
 
 # A DVL axis shows its scale from this speed along it, m/s: a DVL noise of 0.01 m/s then pulls by 0.1 per cent at most,
 # while a scale error of 0.5 per cent that is left out costs 1.5 mm/s.
-# ... and, of a vehicle that is so fast, one that is mounted along its way by this share of it: whether the velocity is
-# along it says each sample's own noise as well, and of samples chosen by their noise a mean is off by that.
-SCALE_SHOWN_FROM, ALONG_FROM = 0.3, 0.4
+# ... and, of a vehicle that is so fast, one that is along its way by ALONG_FROM: whether the velocity is along it says
+# each sample's own noise as well, and of samples chosen by their noise a mean is off by that.
+SCALE_SHOWN_FROM = 0.3
 
 
 def linearise_g1(seen: Observations) -> Linearised:

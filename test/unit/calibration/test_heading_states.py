@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration import heading_states as module
-from dvl_calib_ros.calibration.block_terms import N_BIAS, BlockTerms, MeanBias, TermsOfBlock, block_terms, with_terms
+from dvl_calib_ros.calibration.block_terms import N_BIAS, BlockTerms, TermsOfBlock, block_terms, with_terms
 from dvl_calib_ros.calibration.frames import skew
 from dvl_calib_ros.calibration.heading_states import HeadingEvidence, heading_states, prior_std
+from dvl_calib_ros.calibration.heave import HeaveSums
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.time_blocks import TimeBlocks
 
@@ -245,12 +246,13 @@ def test_what_says_that_a_vehicle_does_not_heave_makes_no_bias_of_trim(rng):
     total = 7.0 * h.T @ h + heave[0] + np.eye(N) / PRIOR**2
     p = np.linalg.inv(total)
     state = GaussianState((p @ of_heave[0])[None], p[None])
-    mean = MeanBias(N)
-    mean.add(terms.of_states)
+    one_row = np.concatenate([0.03 * row, [0.03 * off]])[None]
+    outer = one_row[:, :, None] * one_row[:, None]
+    rows = HeaveSums(outer, outer, np.append(one_row, [[1.0]], axis=1), np.ones(1))
     where = np.zeros(1, dtype=int), 0
     wider = [
         heading_states([HeadingEvidence.of(told, state, *where, beside)], prior_std(STD, BIAS))[0].of_bias
-        for beside in (None, mean.told(heave, of_heave))
+        for beside in (None, rows.with_terms(0.03**2, np.array([0.0, 0.0, 1.0])))
     ]
     a_bias = BIAS / 1.5  # of pitch
     std = [math.sqrt(each.covariance[0, 1, 1]) for each in wider]
