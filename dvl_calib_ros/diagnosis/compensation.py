@@ -55,7 +55,7 @@ def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | N
             values["reference_velocity_offset"] = (east - found["east_mps"], north - found["north_mps"])
         elif effect.name == "clock_drift":
             values["dvl_clock_drift"] = parameters.dvl_clock_drift + found["seconds_per_hour"] / 3600.0
-        elif effect.name == "time_offset_jump":
+        elif effect.name == "time_offset_jump" and "again_seconds" not in found:  # of two, one would leave the other
             offset = values.get("dvl_time_offset", parameters.dvl_time_offset)
             first_ns = diagnosis.recordings[recording or 0][1]
             values["dvl_time_jump"] = found["seconds"]

@@ -36,7 +36,7 @@ from .settings import SETTINGS
 from .shown import somewhere
 from .standing import is_borne_out, matters, settled
 from .twin import twins
-from .unexplained import Unexplained, unexplained
+from .unexplained import Unexplained, moved_by, unexplained
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -107,6 +107,9 @@ def diagnose_recordings(
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
     covariance = selection.fit.covariance(blocks_of(selection.fitter.problem))
+    if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
+        moved = moved_by(selection.fit, rest)
+        covariance = covariance + np.outer(moved, moved)
     found = tuple(_found(selection, each, covariance, len(testable), gap) for each in selection.selected)
     columns = rest.columns
     if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and rest.found):
@@ -229,8 +232,9 @@ def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: in
     fit, problem = selection.fit, selection.fitter.problem
     columns = [fit.columns]
     std = [prior_std(fit.hypothesis)]
-    if effect in fit.effects:
-        at = 6 + sum(len(fit.hypothesis.parameters_of(e)) for e in fit.effects[: fit.effects.index(effect)])
+    names = [each.name for each in fit.effects]
+    if effect.name in names:
+        at = 6 + sum(len(fit.hypothesis.parameters_of(e)) for e in fit.effects[: names.index(effect.name)])
     else:
         at = fit.columns.shape[2]
         columns.append(problem.columns(fit.hypothesis, fit.seen, effect, somewhere(effect, problem)))

@@ -265,6 +265,13 @@ class Fitter:
             self.problem.fitted[what] = [self._fits[key].hypothesis]
         return self._fits[key]
 
+    def straight_on(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
+        """Misfit that one step leaves, as straight lines tell it, and what it leads to; start: alike in the data."""
+        columns = self.columns(start, fit.seen)
+        system = self._system(fit.noise, columns, fit.residual, start)
+        step = system.solution()
+        return system.misfit(step), start.moved(step)
+
     def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
         """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
         for step in steps:

@@ -40,6 +40,10 @@ SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
 ROUNDS = 4
 # Deviance within which the usual is preferred
 AS_WELL = 2.0
+# Standard deviations from which on a second time that something happens stands without being tried without
+CLEAR = 6.0
+# What is taken back but for this share of it, or within a step of the grid, may be anything that is there for a while
+TAKEN_BACK = 0.25
 # Fits with outliers drawn in about the one before, from the first guess on
 ROBUST_ROUNDS = 3
 
@@ -96,7 +100,7 @@ def started(
     with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-    effects = shown_parts(effects, problem)
+    effects = shown_parts({name: effect.once for name, effect in effects.items()}, problem)
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
@@ -131,6 +135,7 @@ def select(
     for _ in range(ROUNDS):
         candidates = _proposed(fitter, fit, effects)
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
+        fits += _happening_again(fitter, fits, every, effects)
         finer = _finer_steps(problem)
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = fitter.refined_as_white(fitter.refined(_best(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
@@ -362,10 +367,11 @@ def _told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect
 
 
 def _leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
-    """Whether there is a leap, and in each recording before the first of the times that are tried for it."""
+    """Whether there is one leap, and in each recording before the first of the times that are tried for it."""
     leaps = fit.values.get(LEAP, ())
     first = [recording.seconds / WINDOW_STEPS for recording in fitter.problem.recordings]
-    return bool(leaps) and all(leap["at_s"] < at for leap, at in zip(leaps, first, strict=True))
+    twice = any(np.isfinite(leap.get("again_at_s", np.inf)) for leap in leaps)
+    return bool(leaps) and not twice and all(leap["at_s"] < at for leap, at in zip(leaps, first, strict=True))
 
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
@@ -426,6 +432,92 @@ def _hypothesis(fitter: Fitter, fit: Fit, table: _Table, chosen: Sequence[int]) 
     return fit.hypothesis.with_effects(effects, n, start)
 
 
+def _happening_again(
+    fitter: Fitter, fits: Sequence[Fit], every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> list[Fit]:
+    """Of what may happen twice, the best fit in which it happens once with a second time, where that promises to be
+    worth it, and the best in which it happens twice with either alone, where the other is small.
+
+    every: effects with what they are the second time.
+    """
+    found: list[Fit] = []
+    for name, whole in every.items():
+        own = [fit for fit in fits if whole.again and name in fit.values]
+        if not own:
+            continue
+        best = _best(own, effects)
+        if whole.again.keys() <= best.values[name][0].keys():
+            starts = _either_alone(best, effects[name], whole)
+        else:
+            n = len(best.seen)
+            once, twice = (price(each, len(effects), n, _tried(each)) for each in (effects[name], whole))
+            limit = best.deviance + once - twice
+            starts = _a_second_time(fitter, best, whole, limit)
+        found += [fitter.fit(start, best.noise) for start in starts]
+    return [fit for fit in found if not any(_is_taken_back(fitter, fit, effect) for effect in fit.effects)]
+
+
+def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
+    """The likeliest starts with a second time, one straight step about a fit, in the order of time, that are to leave
+    less deviance than a limit."""
+    others = [effect for effect in fit.effects if effect.name != whole.name]
+    (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
+    seconds = max(recording.seconds for recording in fitter.problem.recordings)
+    left = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
+    tried = []
+    for at in np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist():
+        values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
+        start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
+        misfit, start = fitter.straight_on(fit, start)
+        if misfit + left > limit:
+            continue
+        if at < values[0][whole.again[again]]:
+            names = {**whole.again, **{first: second for second, first in whole.again.items()}}
+            values = tuple({names[key]: value for key, value in each.items()} for each in start.values[whole.name])
+            start = start.with_effects(start.effects, len(values), {whole.name: values})
+        tried.append((misfit, start))
+    return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
+
+
+def _is_taken_back(fitter: Fitter, fit: Fit, effect: Effect) -> bool:
+    """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording."""
+    own = {spec.name for spec in effect.parameters}
+    if not effect.again.keys() <= own or not effect.again:
+        return False
+    step = max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
+
+    def is_undone(values: Values) -> bool:
+        near = False
+        for second, first in effect.again.items():
+            spec = next(each for each in effect.parameters if each.name == second)
+            if is_time_of_run(spec):
+                near |= values[second] - values[first] < step
+            else:
+                largest = max(abs(values[first]), abs(values[second]))
+                near |= abs(values[first] + values[second]) < TAKEN_BACK * largest
+        return near
+
+    return all(is_undone(values) for values in fit.values[effect.name])
+
+
+def _either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
+    """What happens twice in a fit, as the first alone and as the second, each where the other is not clear."""
+    std = np.sqrt(np.diag(fit.system.covariance()))
+    clear = {
+        each.spec.name
+        for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
+        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
+    }
+    others = [effect for effect in fit.effects if effect.name != whole.name]
+    back = {first: second for second, first in whole.again.items()}
+    starts = []
+    for kept, out in (({first: first for first in back}, set(whole.again)), (back, set(back))):
+        if not out & clear:
+            values = tuple({first: each[name] for first, name in kept.items()} for each in fit.values[whole.name])
+            starts.append(fit.hypothesis.with_effects([*others, once], len(values), {whole.name: values}))
+    return starts
+
+
 def _finer_steps(problem: Problem) -> list[float]:
     seconds = max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
     steps: list[float] = []
@@ -484,6 +576,7 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             (rest.deviance, rest)
             for effect, rest in rests
             if _log_p(fit, rest, effect) > threshold
+            or _is_taken_back(fitter, fit, effect)
             or _is_ghost(effect, rest.deviance - fit.deviance, explained, fit.deviance)
         ]
         if not weak:

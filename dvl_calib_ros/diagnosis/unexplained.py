@@ -18,7 +18,7 @@ from ..calibration.frames import Array
 from ..verdict.reasons import Reason, finding
 from .composed import Problem, Seen
 from .dictionary import ALTERNATIVES, dictionary
-from .fitting import Fit, Fitter
+from .fitting import Fit, Fitter, prior_std
 from .folds import stretch_of
 from .least_squares import WhitenedLeastSquares
 from .made_up import made_up
@@ -237,6 +237,22 @@ def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     return told_elsewhere(problem, noise, fit.columns, rest.clearest, fit.residual)
 
 
+def moved_by(fit: Fit, rest: Unexplained) -> Array:
+    """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
+    noise, raw = fit.noise, rest.clearest
+    if noise.is_coloured:
+        noise = _recoloured(noise, fit.columns, raw, fit.residual)[2]
+    size, at = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12), fit.columns.shape[2]
+    white = noise.whiten(np.concatenate([fit.columns, raw / size], axis=2))
+    std = np.concatenate([prior_std(fit.hypothesis), np.full(raw.shape[2], _likely(raw, fit.residual))])
+    return _solved(white, noise.whiten(-fit.residual), std)[:at]
+
+
+def _likely(raw: Array, residual: Array) -> float:
+    """Size of each of columns (M, A, c) of unit size that all together are no larger than a residual (M, A)."""
+    return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
+
+
 def told_elsewhere(problem: Problem, noise: Noise, known: Array, raw: Array, residual: Array) -> float:
     """Whitened squares of a residual (M, A) that columns raw (M, A, c), beside known ones, explain on stretches of time
     that they were not fitted to.
@@ -249,8 +265,7 @@ def told_elsewhere(problem: Problem, noise: Noise, known: Array, raw: Array, res
     white = noise.whiten(np.concatenate([known / sizes[0], raw / sizes[1]], axis=2))
     series = noise.whiten(residual)
     # all together are no larger than the residual: else stretches without a turn would be told of any size
-    likely = float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
-    std = np.concatenate([np.full(known.shape[2], WIDE), np.full(raw.shape[2], likely)])
+    std = np.concatenate([np.full(known.shape[2], WIDE), np.full(raw.shape[2], _likely(raw, residual))])
     rows = np.repeat(fold, residual.shape[1])
     gain = 0.0
     for held in np.unique(fold):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -46,21 +48,29 @@ class DvlTimeOffset(_DvlClock):
 
 
 class TimeOffsetJump(_DvlClock):
-    """The DVL's clock is set at some instant: from then on its stamps are later (or earlier)."""
+    """The DVL's clock is set at some instant, or at two: from then on its stamps are later (or earlier)."""
 
     name = "time_offset_jump"
-    summary = "the DVL's stamps are later by τ from at_s on, as after its clock was set"
-    remedy = "--apply writes dvl_time_jump; keep who sets the DVL's clock from doing it during a run"
+    summary = "the DVL's stamps are later by τ from at_s on, as after its clock was set; by more from again_at_s on"
+    remedy = "--apply writes dvl_time_jump where it is one; keep who sets the DVL's clock from doing it during a run"
     manoeuvre = "turns and changes of speed before and after"
     parameters = (
         *_seconds("how much later a stamp is from then on"),
         EffectParameter("at_s", "s", 0.0, 0.0, np.inf, "when, since the start", linear=False, said="at"),
+        replace(
+            *_seconds("how much later still from a second time on"), name="again_seconds", typical=0.2, said="again"
+        ),
+        EffectParameter(
+            "again_at_s", "s", 0.0, 0.0, np.inf, "when that is, since the start", np.inf, linear=False, said="at"
+        ),
     )
+    again: ClassVar[Mapping[str, str]] = {"again_seconds": "seconds", "again_at_s": "at_s"}
     confounded_with = ("dvl_time_offset", "clock_drift")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """τ from at_s on."""
-        return np.where(elapsed >= values["at_s"], values["seconds"], 0.0)
+        """τ from at_s on, and more from again_at_s on."""
+        first = np.where(elapsed >= values["at_s"], values["seconds"], 0.0)
+        return first + np.where(elapsed >= values["again_at_s"], values["again_seconds"], 0.0)
 
 
 class ClockDrift(_DvlClock):

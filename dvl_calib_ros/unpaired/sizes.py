@@ -157,7 +157,7 @@ def is_testable(effect: Effect, selection: EffectSelection) -> bool:
 
 def _some_time(effect: Effect, seconds: float) -> Values:
     """Defaults; what begins in the midst of a run is tried in its middle."""
-    times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
+    times = [spec.name for spec in effect.once.parameters if is_time_of_run(spec)]
     return effect.defaults | ({times[0]: 0.5 * seconds} if len(times) == 1 else {})
 
 

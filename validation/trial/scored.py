@@ -23,7 +23,7 @@ FAMILY_LEVEL = 0.01
 # Faults that even the likelihood would confuse more often than this are not told apart by anybody
 CONFUSED = 0.02
 # Change points have no regular interval
-NOT_SCORED_PARAMETERS = frozenset({"from_s", "to_s", "at_s", "from_recording", "again_seconds", "again_at_s"})
+NOT_SCORED_PARAMETERS = frozenset({"from_s", "to_s", "at_s", "from_recording", "again_at_s"})
 
 
 @dataclass(frozen=True)

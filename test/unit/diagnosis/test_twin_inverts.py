@@ -64,7 +64,7 @@ def test_times_stay_in_order_for_a_leap_that_was_not_there(recording):
     problem = make_problem([replace(recording, dvl=dvl)], np.eye(3), np.zeros(3), [Offsets()])
     jump, lag = EFFECTS["time_offset_jump"], EFFECTS["reference_lag"]
     assert problem.grids[0].clock is jump.acts_on
-    start = {jump.name: ({"seconds": 3.0, "at_s": 60.0},), lag.name: ({"time_constant_s": 0.003},)}
+    start = {jump.name: (jump.defaults | {"seconds": 3.0, "at_s": 60.0},), lag.name: ({"time_constant_s": 0.003},)}
     (seen,) = problem.all_seen(no_effect().with_effects([jump, lag], 1, start))
     assert np.diff(seen.motion.time).min() > 0.04
     assert np.isclose(np.diff(seen.motion.time), 0.1).sum() > 1000  # but for the time of the leap, as measured

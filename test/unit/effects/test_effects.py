@@ -73,8 +73,8 @@ CASES = {
     ),
     "time_offset_jump": (
         circle(acceleration=0.01),
-        {"seconds": LATE, "at_s": 40.0},
-        np.where(TIME >= 40.0, 1.0, 0.0)[:, None] * steady(-0.01 * LATE),
+        {"seconds": LATE, "at_s": 40.0, "again_seconds": 2.0 * LATE, "again_at_s": 50.0},
+        (np.where(TIME >= 40.0, 1.0, 0.0) + np.where(TIME >= 50.0, 2.0, 0.0))[:, None] * steady(-0.01 * LATE),
     ),
     "clock_drift": (circle(acceleration=0.01), {"seconds_per_hour": 20.0}, steady(-0.01 * 20.0 * HOURS)),
     "mounting_moved": (circle(), {"x_rad": 1e-3, "z_rad": 2e-3}, steady(0, 2e-3 * SPEED, -1e-3 * SPEED)),
