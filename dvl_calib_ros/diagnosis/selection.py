@@ -438,9 +438,11 @@ def _happening_again(
     """Of what may happen twice, the best fit in which it happens once with a second time, where that promises to be
     worth it, and the best in which it happens twice with either alone, where the other is small.
 
-    every: effects with what they are the second time.
+    every: effects with what they are the second time. Several recordings share their times, which two of a day do not.
     """
     found: list[Fit] = []
+    if len(fitter.problem.recordings) > 1:
+        return found
     for name, whole in every.items():
         own = [fit for fit in fits if whole.again and name in fit.values]
         if not own:

@@ -238,6 +238,19 @@ def test_a_second_leap_that_is_not_there_is_taken_back():
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
 
 
+def test_two_recordings_are_not_asked_for_a_second_leap_at_one_time_of_both():
+    """Three runs of a boat had leaps of 0.1 to 1.7 s at 48 s and at 521 s, each."""
+    text = "time_offset_jump:seconds=0.8,at_s=100,again_seconds=-1.4,again_at_s=200"
+    both = [recording_of(simulate(scenario(effects=[text], seed=seed)), name=str(seed)) for seed in (1, 2)]
+    problem = make_problem(both, np.eye(3), np.zeros(3), [Offsets()] * 2)
+    once = {name: effect.once for name, effect in EFFECTS.items()}
+    leap = once["time_offset_jump"]
+    start = no_effect().with_effects([leap], 2, {leap.name: ({"seconds": 0.8, "at_s": 100.0},) * 2})
+    fitter = Fitter(problem)
+    fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
+    assert _happening_again(fitter, [fit], EFFECTS, once) == []
+
+
 @pytest.mark.parametrize("seconds", [-2.7, 0.3, 1.2])
 def test_a_lever_arm_and_a_delay_a_hundred_times_the_noise_are_exact(seconds):
     diagnosis = diagnosed(effects=[LEVER, f"dvl_time_offset:seconds={seconds}"], gnss_std=0.02)
