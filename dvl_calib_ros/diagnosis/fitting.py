@@ -1,4 +1,7 @@
-"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still."""
+"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still.
+
+(Long, because what a fit is, how it is reached and what its intervals hold belong together.)
+"""
 
 from __future__ import annotations
 

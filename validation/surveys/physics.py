@@ -64,8 +64,8 @@ class Drawn:
     dvl_bias: tuple[float, float, float]
 
 
-def draw(seed: int) -> Drawn:
-    """The survey of this seed."""
+def draw(seed: int, dvl_bias_std: float = 0.0) -> Drawn:
+    """The survey of this seed, its DVL's bias being of this σ, m/s."""
     rng = np.random.default_rng(seed)
 
     def sometimes(share: float, value: Callable[[], float]) -> float:
@@ -103,7 +103,7 @@ def draw(seed: int) -> Drawn:
         str(rng.choice([TWIST, STAMPED, A50])),
         str(rng.choice(["enu", "ned", "body", "fix", "enu without covariance"], p=[0.3, 0.15, 0.2, 0.15, 0.2])),
         float(rng.choice([0.02, 0.05, 0.1])),
-        normal_three(DVL_BIAS_STD),
+        normal_three(dvl_bias_std),
     )
 
 
