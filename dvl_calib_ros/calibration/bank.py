@@ -289,15 +289,15 @@ class Group:
 
     def _now(self) -> GaussianState:
         """The filter's states x (K, n), P (K, n, n), with heave where models have it."""
-        return self._now_told()[0]
+        state = GaussianState(self._x, self._p)
+        return state if self._heave is None else _joined(state, self._heave.sums(), self._parameters.motion_std)[0]
 
     def _now_told(self) -> tuple[GaussianState, tuple[Array, Array] | None]:
         """`_now`, and what rows of heave told of it and terms, as of `HeaveSums.with_terms`."""
-        state = GaussianState(self._x, self._p)
         if self._heave is None:
-            return state, None
+            return self._now(), None
         sums = self._heave.sums()
-        state, variance = _joined(state, sums, self._parameters.motion_std)
+        state, variance = _joined(GaussianState(self._x, self._p), sums, self._parameters.motion_std)
         return state, sums.with_terms(variance, self._up[:3])
 
     def _process_noise(self, stamps_ns: Stamps) -> Array | None:

@@ -140,7 +140,7 @@ class DelayBank:
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
         begins = [_around_each_delay(with_states_of(each, self._unknown, OF_DAY)).information for each in known]
-        total = all_told(found.information, found.vector, self.blocks, self._of_heave())
+        total = all_told(found.information, found.vector, self.blocks, self._of_heave(slice(None)))
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
         self.blocks.end_day(OF_DAY, *total, source)
@@ -407,12 +407,13 @@ class DelayBank:
         self, states: GaussianState, numbers: Index, best: int, heave: HeaveSums | None = None
     ) -> HeadingEvidence:
         """By blocks of time and by heave, of some hypotheses (M,). heave: as in `known`."""
-        of_heave = self._of_heave(heave)
-        return HeadingEvidence.of(self.blocks, states, numbers, best, (of_heave[0][numbers], of_heave[1][numbers]))
+        return HeadingEvidence.of(self.blocks, states, numbers, best, self._of_heave(numbers, heave))
 
-    def _of_heave(self, heave: HeaveSums | None = None) -> tuple[Array, Array]:
-        """What rows of heave tell of all hypotheses, as of `HeaveSums.with_terms`. heave: as in `known`."""
-        return (heave or self._heave.sums()).with_terms(self._sums.heave_variance, self._up[:3])
+    def _of_heave(self, numbers: Index | slice, heave: HeaveSums | None = None) -> tuple[Array, Array]:
+        """What rows of heave tell of some hypotheses (M,), as of `HeaveSums.with_terms`. heave: as in `known`."""
+        sums = heave or self._heave.sums()
+        some = sums._replace(told=sums.told[numbers], mean=sums.mean[numbers])
+        return some.with_terms(self._sums.heave_variance, self._up[:3])
 
     def found(self, known: Sequence[Known]) -> list[Likely | None]:
         """What was known at times of this day, with what that makes of the heading; None where numbers ran away."""
