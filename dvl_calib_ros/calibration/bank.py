@@ -20,7 +20,7 @@ import numpy as np
 from . import kalman
 from .assembly import Assembler
 from .block_scatter import BlockScatter
-from .block_terms import BlockTerms, upwards
+from .block_terms import BlockTerms, turns_of
 from .dvl_bias import OfBias
 from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .frames import Array
@@ -102,7 +102,8 @@ class Group:
         still = self._assembler.process_rate is None
         # the paper's models are as they are published
         self._deviates = self.needs is Needs.REFERENCE and models[0].in_correction_parameters
-        self._up = upwards(parameters.rotation_dvl_from_body, models[0].n_state)
+        self._turns = turns_of(parameters.rotation_dvl_from_body, models[0].n_state)
+        self._up = self._turns[:, 2]
         self._n_errors = models[0].n_errors
         self._scatter = self._new_scatter() if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
@@ -120,7 +121,7 @@ class Group:
 
     def _new_scatter(self) -> BlockScatter:
         """Blocks of time from now on."""
-        terms = BlockTerms(self._up, self._n_errors) if self._deviates else None
+        terms = BlockTerms(self._turns, self._n_errors) if self._deviates else None
         std = prior_std(self._parameters.heading_deviation_std, self._parameters.dvl_bias_std)
         return BlockScatter(self._x, self._p, BLOCK_S, terms, std)
 

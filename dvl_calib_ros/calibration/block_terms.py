@@ -1,7 +1,8 @@
 """Terms of blocks of time: what changes with heading, time or velocity as no mounting does, told without a column more.
 
 A block of time told Λ_b, y_b of the states. An error δ of the heading turns a reference in an earth frame as a
-misalignment about the body's vertical u does. A bias b of the DVL is to velocities v that are nearly one another's the
+misalignment about the earth's vertical u does, which leans as the vehicle does: one that leans into its turns, where
+alone it has sway, would take what that makes of the vertical velocity for a roll. A bias b of the DVL is to velocities v that are nearly one another's the
 same as a misalignment v × b / |v|² and a scale v·b / |v|²: large where it is slow, small where it is fast. So what
 either does in a block is what states x = U_b d do, with d the coefficients of the terms and U_b (n, 9) of that block:
 three of the bias, six of the heading. The block tells of states and coefficients together
@@ -22,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import Array, product, skew
+from .frames import Array, cross, product, skew
 from .robust import median
 from .samples import Index, Stamps
 from .time_blocks import TimeBlocks
@@ -34,16 +35,16 @@ N_BIAS, N_TERMS = 3, 9
 LEAST, OUTLYING = 1e-12, 5.0
 
 
-def upwards(rotation_dvl_from_body: Array, n: int) -> Array:
-    """Of n states, the misalignment first, those that turn about the body's vertical: u (n,)."""
-    u = np.zeros(n)
-    u[:3] = rotation_dvl_from_body[:, 2]
-    return u
+def turns_of(rotation_dvl_from_body: Array, n: int) -> Array:
+    """Of n states, the misalignment first, those that turn about each axis of the body: (n, 3)."""
+    turns = np.zeros((n, 3))
+    turns[:3] = rotation_dvl_from_body
+    return turns
 
 
 class TermsOfBlock(NamedTuple):
     """Of a block. of_states: U (..., n, 9). pull: (..., 3), what noise takes of y of the bias for each unit of
-    information on the yaw. up: (n,) as of `upwards`."""
+    information on the yaw. up: (n,), the states that turn about the body's vertical, the last of `turns_of`."""
 
     of_states: Array
     pull: Array
@@ -56,11 +57,11 @@ class TermsOfBlock(NamedTuple):
 
 
 def block_terms(
-    earth_in_body: Array, velocity_dvl: Array, off: Array, weight: Array, seconds: float, up: Array, n_errors: int
+    earth_in_body: Array, velocity_dvl: Array, off: Array, weight: Array, seconds: float, turns: Array, n_errors: int
 ) -> TermsOfBlock:
     """Those of a block of N references: `Observations.earth_in_body` (N, 3, 2); velocity of the DVL, and reference less
-    that, (..., N, 3) m/s in the DVL's frame; weight (N,), and its time (s). up: (n,) as of `upwards`. n_errors: of the
-    n, misalignment and scales.
+    that, (..., N, 3) m/s in the DVL's frame; weight (N,), and its time (s). turns: (n, 3) as of `turns_of`. n_errors: of
+    the n, misalignment and scales.
     """
     # not by what is an outlier, which no filter takes
     size = np.abs(off - median(off.swapaxes(0, -2))[..., None, :]).sum(axis=-1)
@@ -73,10 +74,10 @@ def block_terms(
     moved, off_moved = velocity_dvl - mean[..., None, :], off - off_mean[..., None, :]
     noise = -(_mean(in_turn, moved) * _mean(in_turn, off_moved)).sum(axis=-1)
     by_square = mean / square[..., None]
-    terms = np.zeros((*mean.shape[:-1], len(up), N_TERMS))
+    terms = np.zeros((*mean.shape[:-1], len(turns), N_TERMS))
     terms[..., :3, :N_BIAS], terms[..., 3:n_errors, :N_BIAS] = skew(by_square), by_square[..., None, :]
-    terms[..., N_BIAS:] = np.outer(up, _heading_terms(earth_in_body, weight, seconds))
-    return TermsOfBlock(terms, (noise / square)[..., None] * by_square, up)
+    terms[..., N_BIAS:] = turns @ _heading_terms(earth_in_body, weight, seconds)
+    return TermsOfBlock(terms, (noise / square)[..., None] * by_square, turns[:, 2])
 
 
 def _mean(share: Array, values: Array) -> Array:
@@ -86,22 +87,23 @@ def _mean(share: Array, values: Array) -> Array:
 
 
 def _heading_terms(earth_in_body: Array, weight: Array, seconds: float) -> Array:
+    """(3, 6), about which axes of the body each of the terms of the heading turns a block, in the mean."""
     ahead = earth_in_body[:, 0]
     length = np.sqrt((ahead * ahead).sum(axis=1))
     share = np.where(length > 0.0, weight, 0.0) / max(float(weight.sum()), 1e-300)
     east, north = (ahead / np.where(length > 0.0, length, 1.0)[:, None]).T
-    one = share.sum()
-    return np.array(
-        [share @ north, share @ east, 2.0 * (share @ (north * east)), share @ (east**2 - north**2), seconds * one, one]
-    )
+    one = np.ones(len(share))
+    each = np.column_stack([north, east, 2.0 * north * east, east**2 - north**2, seconds * one, one])
+    vertical = cross(earth_in_body[:, :, 0], earth_in_body[:, :, 1])
+    return np.asarray((share[:, None] * vertical).T @ each)
 
 
 class BlockTerms:
     """Terms of blocks of time that end where they are said to, from samples in order."""
 
-    def __init__(self, up: Array, n_errors: int) -> None:
-        """up, n_errors: as in `block_terms`."""
-        self._up, self._n_errors = up, n_errors
+    def __init__(self, turns: Array, n_errors: int) -> None:
+        """turns, n_errors: as in `block_terms`."""
+        self._turns, self._n_errors = turns, n_errors
         self._epoch_ns: int | None = None
         self._waiting: list[tuple[Stamps, Array, Array, Array]] = []
 
@@ -128,11 +130,11 @@ class BlockTerms:
 
     def _terms(self, block: list[tuple[Stamps, Array, Array, Array]]) -> TermsOfBlock:
         if not sum(len(stamps_ns) for stamps_ns, *_ in block):
-            return TermsOfBlock.none(self._up)
+            return TermsOfBlock.none(self._turns[:, 2])
         assert self._epoch_ns is not None
         stamps_ns, earth, velocity, off = (np.concatenate(each) for each in zip(*block, strict=True))
         seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
-        return block_terms(earth, velocity, off, np.ones(len(earth)), seconds, self._up, self._n_errors)
+        return block_terms(earth, velocity, off, np.ones(len(earth)), seconds, self._turns, self._n_errors)
 
 
 def with_terms(information: Array, vector: Array, terms: TermsOfBlock) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ from .parameters import Parameters
 from .results import Estimate
 from .robust import median, robust_std
 from .samples import Index
+from .time_blocks import alike_of, of_few
 from .told_arm import ARM
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
@@ -41,9 +42,10 @@ STRETCH_S, ENOUGH = 15.0, 12
 # So many σ are no chance; of a bias, whose σ holds all else that is likely, fewer (of 300 combinations without one none
 # had more than 3.6), and from fewer still it is named.
 SURELY, SURELY_BIASED, NAMED_FROM = 6.0, 4.2, 3.7
-# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s); and errors
-# of the heading that change with it, once and twice around (rad), which look like a bias, but not like what is quick.
-KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3)
+# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s), and of the
+# heading (rad), which turns about the vertical of the earth: not as a yaw does where the vehicle leans; and errors of
+# the heading that change with it, once and twice around (rad), which look like a bias, but not like what is quick.
+KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3 + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2)
 # ... and of what is looked for: shares of tilt, and bend (s²); a bias (m/s), looked for in means of so long, s.
 QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
@@ -58,8 +60,9 @@ TILT_SHOWN = 0.2
 SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
 # A share from here on is no levelled velocity, but a sign.
 WRONG_SIGN_FROM = 1.6
-# An error of a mounting (rad) that is worth a word, and one that no answer is given beside unless so many σ hold it.
-SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 1.5
+# An error of a mounting (rad) that is worth a word, and one that no answer is given beside unless so many σ of the
+# answer, which has been told of a bias, hold the least that it is likely to be.
+SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 2.0
 # Smoothing (s, time constant) that is worth a word, and one beside which no answer is given.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # A velocity so many times further off than usual is an outlier.
@@ -173,7 +176,7 @@ def left_over(
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # of a mean its own noise is what the reference is further on: that alone would be a scale, and a bias against it
     beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
-    by_heading = beside[:, :, 2, None] * around[:, None]
+    by_heading = beside[:, :, -1, None] * around[:, None]
     means = [_means(each, starts) for each in (time, np.concatenate([beside, by_heading, constant], axis=2), error)]
     slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, BY_HEADING, CONSTANT]))
     if fast is None or slow is None:
@@ -195,13 +198,14 @@ def left_over(
 
 
 def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
-    """Columns (N, 3, 12) of what a calibration may have left, by velocity, turn rate, acceleration (N, 3), body."""
+    """Columns (N, 3, 13) of what a calibration may have left, by velocity, turn rate, acceleration (N, 3), body."""
     known = np.zeros((len(moving), 3, len(KNOWN)))
     known[:, :, :3] = skew(moving)
     known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
     known[:, :, 5:8] = skew(rates)
     known[:, :, 8] = slope
-    known[:, :, 9:] = body_from_enu
+    known[:, :, 9:12] = body_from_enu
+    known[:, :, 12] = cross(moving, body_from_enu[:, :, 2])
     return known
 
 
@@ -294,7 +298,7 @@ def left_over_advice(
         )
         turned = float(size[shown].max()) / found.speed
         is_sure = size > SURELY_BIASED * found.bias_std
-        is_wrong = size > np.maximum(WRONG_FROM, WITHIN * np.asarray(along)) * found.speed
+        is_wrong = size - found.bias_std > np.maximum(WRONG_FROM, WITHIN * np.asarray(along)) * found.speed
         word = Severity.REJECT if (shown & is_wrong).any() and (shown & is_sure).any() else Severity.MARGINAL
         said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
     elif float(found.bias_std[:2].max()) > BIAS_OPEN:
@@ -326,9 +330,11 @@ def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | 
         x = p @ (weighted.reshape(-1, n).T @ z)
         rest = error - columns @ x
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
+    told = np.add.reduceat(np.square(weighted @ p).sum(axis=1), starts, axis=0)
     # what is not looked for may be there as far as it is likely, and the data do not say that it is not
     beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
-    return _Fit(x, np.sqrt(_std(p @ scores.T) ** 2 + (beside**2).sum(axis=1)), p, weight, rest, starts)
+    std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T)
+    return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, rest, starts)
 
 
 def _std(scatter: Array) -> Array:

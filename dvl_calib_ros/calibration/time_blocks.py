@@ -159,13 +159,13 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
         m = scores.shape[1]
         scatter = p @ scores.swapaxes(1, 2)
         longer = _lasting(scatter, lasts)
-        alike = _alike(parts)
+        alike = alike_of(parts)
         found = (scatter**2).sum(axis=2) * (alike / (alike - 1.0)) * longer
         by_chance = claimed * (chi2_isf(CHANCE, m - 1) / (m - 1))
         beyond = found - claimed
         if rarely is not None:
             surely = np.maximum(found - claimed * (chi2_isf(rarely, m - 1) / (m - 1)), 0.0)
-            beyond = beyond + surely * (_of_few(alike - 1.0) ** 2 - 1.0)
+            beyond = beyond + surely * (of_few(alike - 1.0) ** 2 - 1.0)
         # the prior's part of P is not the data's to judge
         more = 1.0 + beyond / np.maximum(variance, 1e-300)
         factor = np.maximum(factor, np.where(found > by_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
@@ -182,13 +182,13 @@ def _paired(values: Array) -> Array:
     return pairs
 
 
-def _alike(parts: Array) -> Array:
+def alike_of(parts: Array) -> Array:
     """Of how many alike blocks a sum (S, r) of parts (S, m, r) is: those that tell most of it may be few."""
     number = parts.sum(axis=1) ** 2 / np.maximum((parts**2).sum(axis=1), 1e-300)
     return np.clip(number, FEWEST_ALIKE, parts.shape[1])
 
 
-def _of_few(dof: Array) -> Array:
+def of_few(dof: Array) -> Array:
     """By how much 3 σ has to be more where σ is of so few: Student's t (Cornish and Fisher)."""
     return np.asarray(1.0 + 2.5 / dof + 5.75 / dof**2)
 

@@ -18,7 +18,7 @@ from functools import reduce
 
 import numpy as np
 
-from ..block_terms import all_told, block_terms, upwards, with_terms
+from ..block_terms import all_told, block_terms, turns_of, with_terms
 from ..correction_parameters import PriorOnErrors, of_unseen_roll, to_correction
 from ..dvl_bias import OfBias
 from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
@@ -86,7 +86,8 @@ class DelayBank:
         self.used = self.gated = 0
         self._nis_sum = 0.0
         self.blocks = TimeBlocks()
-        self._up = upwards(parameters.rotation_dvl_from_body, N_STATE)
+        self._turns = turns_of(parameters.rotation_dvl_from_body, N_STATE)
+        self._up = self._turns[:, 2]
         self._std_beside = prior_std(parameters.heading_deviation_std, parameters.dvl_bias_std)
         self._epoch_ns: int | None = None  # of the first row
         self._folds = FoldInformation(self._start) if verified else None
@@ -218,7 +219,7 @@ class DelayBank:
                 self._epoch_ns = int(stamps_ns[0])
             seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())
             velocity, off = rows.motion.velocities(rows.body_from_dvl)
-            terms = block_terms(rows.motion.earth, velocity, off, weight, seconds, self._up, N_ERRORS)
+            terms = block_terms(rows.motion.earth, velocity, off, weight, seconds, self._turns, N_ERRORS)
             information, vector, _ = told.parts
             self.blocks.add(*with_terms(information, vector, terms), told.weight)
             if self._folds is not None:

@@ -125,6 +125,22 @@ def test_a_bias_that_is_not_beyond_doubt_is_marginal(rng):
         assert [each.severity for each in left_over_advice(biased) if each.code == "DVL_BIAS"] == words
 
 
+def test_few_turns_show_a_bias_or_a_filter_no_more_surely_than_few_can():
+    """Of six legs a bias of nothing was found at 3.8 σ, and smoothing at 2.9, from which on a filter is believed."""
+    found = [Vehicle(np.random.default_rng(seed), seconds=250.0, wave_deg=0.1).found() for seed in range(60)]
+    assert max(abs(each.smoothed) / each.smoothed_std for each in found) < 2.4
+    assert np.max([np.abs(each.bias) / each.bias_std for each in found]) < 3.7
+    assert np.std([each.smoothed / each.smoothed_std for each in found]) > 0.5
+
+
+def test_a_bias_as_large_as_the_answers_own_sigma_expects_is_no_reject(rng):
+    """18 ± 3 mm/s ahead at 0.8 m/s, beside a scale of 1.7 ± 1.0 % that had been told of a bias, were a reject."""
+    found = Vehicle(rng).found()._replace(bias=np.array([0.018, 0.0, 0.0]), bias_std=np.full(3, 0.003), speed=0.8)
+    for along, word in ((0.0104, Severity.MARGINAL), (0.009, Severity.REJECT)):
+        (said,) = [each for each in left_over_advice(found, along=[along] * 3) if each.code == "DVL_BIAS"]
+        assert said.severity is word
+
+
 @pytest.mark.parametrize(("axis", "word"), [(0, Severity.REJECT), (1, Severity.MARGINAL), (2, Severity.REJECT)])
 def test_a_bias_that_sigma_of_its_own_axis_holds_is_said_and_no_reject(rng, axis, word):
     """28 ± 2 mm/s ahead, beside a scale of 1.7 ± 1.5 %, were a reject."""
