@@ -32,6 +32,7 @@ class BlockScatter:
         self._blocks = TimeBlocks()
         self._length_ns = round(seconds * 1e9)
         self._terms, self._std = terms, std
+        self._up = np.zeros(x.shape[-1]) if terms is None else terms.up
         self._beside: tuple[Array, Array] | None = None
         self._last: int | None = None
         self._state = GaussianState(x, p)
@@ -106,7 +107,7 @@ class BlockScatter:
             if self._terms is not None and self._beside is not None:
                 beside = self._beside[0][index : index + 1], self._beside[1][index : index + 1]
             seen = HeadingEvidence.of(self._blocks, of_one, np.array([index]), 0, beside)
-            self._found[index] = heading_states([seen], self._std)[0]
+            self._found[index] = heading_states([seen], self._std, self._up)[0]
         return self._found[index]
 
 

@@ -1,11 +1,11 @@
 """Terms of blocks of time: what changes with heading, time or velocity as no mounting does, told without a column more.
 
 A block of time told Λ_b, y_b of the states. An error δ of the heading turns a reference in an earth frame as a
-misalignment about the earth's vertical u does, which leans as the vehicle does: one that leans into its turns, where
-alone it has sway, would take what that makes of the vertical velocity for a roll. A bias b of the DVL is to velocities v that are nearly one another's the
-same as a misalignment v × b / |v|² and a scale v·b / |v|²: large where it is slow, small where it is fast. So what
-either does in a block is what states x = U_b d do, with d the coefficients of the terms and U_b (n, 9) of that block:
-three of the bias, six of the heading. The block tells of states and coefficients together
+misalignment about the earth's vertical does, which leans as the vehicle does: one that leans into its turns, where
+alone it has sway, would take what that makes of the vertical velocity for a roll. A bias b of the DVL is to velocities
+v that are nearly one another's the same as a misalignment v × b / |v|² and a scale v·b / |v|²: large where it is slow,
+small where it is fast. So what either does in a block is what states x = U_b d do, with d the coefficients of the terms
+and U_b (n, 9) of that block: three of the bias, six of the heading. The block tells of states and coefficients together
 
     | Λ_b       Λ_b U_b     |   | y_b      |
     | U_bᵀ Λ_b  U_bᵀ Λ_b U_b |   | U_bᵀ y_b |
@@ -33,6 +33,8 @@ from .time_blocks import TimeBlocks
 N_BIAS, N_TERMS = 3, 9
 # Mean square of velocities that are not zero, (m/s)²; what is so many times further off than usual is an outlier.
 LEAST, OUTLYING = 1e-12, 5.0
+# A turn about the velocity itself shows by this share of its square, which noise of a hundredth of it makes.
+LEAST_SHOWN = 1e-4
 
 
 def turns_of(rotation_dvl_from_body: Array, n: int) -> Array:
@@ -60,8 +62,8 @@ def block_terms(
     earth_in_body: Array, velocity_dvl: Array, off: Array, weight: Array, seconds: float, turns: Array, n_errors: int
 ) -> TermsOfBlock:
     """Those of a block of N references: `Observations.earth_in_body` (N, 3, 2); velocity of the DVL, and reference less
-    that, (..., N, 3) m/s in the DVL's frame; weight (N,), and its time (s). turns: (n, 3) as of `turns_of`. n_errors: of
-    the n, misalignment and scales.
+    that, (..., N, 3) m/s in the DVL's frame; weight (N,), and its time (s). turns: (n, 3) as of `turns_of`. n_errors:
+    of the n, misalignment and scales.
     """
     # not by what is an outlier, which no filter takes
     size = np.abs(off - median(off.swapaxes(0, -2))[..., None, :]).sum(axis=-1)
@@ -76,7 +78,7 @@ def block_terms(
     by_square = mean / square[..., None]
     terms = np.zeros((*mean.shape[:-1], len(turns), N_TERMS))
     terms[..., :3, :N_BIAS], terms[..., 3:n_errors, :N_BIAS] = skew(by_square), by_square[..., None, :]
-    terms[..., N_BIAS:] = turns @ _heading_terms(earth_in_body, weight, seconds)
+    terms[..., :3, N_BIAS:] = _heading_terms(earth_in_body, velocity_dvl, weight, seconds, turns[:3])
     return TermsOfBlock(terms, (noise / square)[..., None] * by_square, turns[:, 2])
 
 
@@ -86,16 +88,31 @@ def _mean(share: Array, values: Array) -> Array:
     return found
 
 
-def _heading_terms(earth_in_body: Array, weight: Array, seconds: float) -> Array:
-    """(3, 6), about which axes of the body each of the terms of the heading turns a block, in the mean."""
+def _heading_terms(
+    earth_in_body: Array, velocity_dvl: Array, weight: Array, seconds: float, dvl_from_body: Array
+) -> Array:
+    """(..., 3, 6), the misalignment that is to the velocities of a block, in least squares, what each term is.
+
+    That is the mean of the axis about which a term turns, as far as the velocities show one; where sway and lean come
+    and go together, as in turns, it is what the one makes of the other.
+    """
     ahead = earth_in_body[:, 0]
     length = np.sqrt((ahead * ahead).sum(axis=1))
     share = np.where(length > 0.0, weight, 0.0) / max(float(weight.sum()), 1e-300)
     east, north = (ahead / np.where(length > 0.0, length, 1.0)[:, None]).T
     one = np.ones(len(share))
-    each = np.column_stack([north, east, 2.0 * north * east, east**2 - north**2, seconds * one, one])
-    vertical = cross(earth_in_body[:, :, 0], earth_in_body[:, :, 1])
-    return np.asarray((share[:, None] * vertical).T @ each)
+    of_term = np.column_stack([north, east, 2.0 * north * east, east**2 - north**2, seconds * one, one])
+    vertical = cross(earth_in_body[:, :, 0], earth_in_body[:, :, 1]) @ dvl_from_body.T
+    turned = (share[:, None] * vertical).T @ of_term
+    # of v × u the least squares misalignment: [Σ |v|² I - v vᵀ]⁻¹ Σ (|v|² u - v vᵀ u)
+    each = share[:, None] * of_term
+    square = (velocity_dvl * velocity_dvl).sum(axis=-1)
+    along = (velocity_dvl * vertical).sum(axis=-1)
+    across = velocity_dvl.swapaxes(-1, -2)
+    found = (square[..., None, :] * vertical.T - across * along[..., None, :]) @ each
+    total = (square @ share)[..., None, None]
+    known = total * (1.0 + LEAST_SHOWN) * np.eye(3) - (across * share) @ velocity_dvl
+    return np.asarray(np.linalg.solve(known + LEAST * np.eye(3), found + (LEAST_SHOWN * total + LEAST) * turned))
 
 
 class BlockTerms:
@@ -104,6 +121,7 @@ class BlockTerms:
     def __init__(self, turns: Array, n_errors: int) -> None:
         """turns, n_errors: as in `block_terms`."""
         self._turns, self._n_errors = turns, n_errors
+        self.up: Array = turns[:, 2]
         self._epoch_ns: int | None = None
         self._waiting: list[tuple[Stamps, Array, Array, Array]] = []
 
@@ -130,7 +148,7 @@ class BlockTerms:
 
     def _terms(self, block: list[tuple[Stamps, Array, Array, Array]]) -> TermsOfBlock:
         if not sum(len(stamps_ns) for stamps_ns, *_ in block):
-            return TermsOfBlock.none(self._turns[:, 2])
+            return TermsOfBlock.none(self.up)
         assert self._epoch_ns is not None
         stamps_ns, earth, velocity, off = (np.concatenate(each) for each in zip(*block, strict=True))
         seconds = 1e-9 * float((stamps_ns - self._epoch_ns).mean())

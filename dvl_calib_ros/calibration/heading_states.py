@@ -8,6 +8,10 @@ one speed a bias and roll, pitch or yaw and scale: σ of these holds both. On re
 deviation averages out; several speeds show a bias. How large coefficients of the heading are is said by
 `heading_deviation_std`, until headings show it to be more or less (empirical Bayes); of the bias by `dvl_bias_std`.
 
+A constant error of the heading is in the yaw, but for what it turns about the earth's vertical and a yaw does not: a
+vehicle that leans into its turns, where alone it has sway, has it in the vertical velocity, where it would be a roll.
+So it is a state beside the yaw, of which it holds nothing.
+
 Coefficients of the heading are taken off the states, as a heading that deviates does so whatever is done with the
 result. The bias is considered, and not taken off: nobody takes a bias off velocities, and a mounting without it would
 be worse at the speeds driven than one with it.
@@ -32,12 +36,16 @@ from .time_blocks import BlocksOfOne, TimeBlocks, inflations
 # last.
 _SHARE = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
 N_HEADING = len(_SHARE)
-# Those of the bias come first.
-N_COEFFICIENTS = N_BIAS + N_HEADING
+# Of a constant error, rad, which no other coefficient says anything of: a magnetic declination that nobody has set.
+_CONSTANT_STD = 0.05
+# Those of the bias come first, then the constant.
+N_BEFORE = N_BIAS + 1
+N_COEFFICIENTS = N_BEFORE + N_HEADING
 # A compass deviates with the heading, a gyro drifts: what one of them shows says nothing of the other.
 _DRIFT = np.arange(N_COEFFICIENTS) == N_COEFFICIENTS - 1
 _BIAS = np.arange(N_COEFFICIENTS) < N_BIAS
-_CYCLES = ~_BIAS & ~_DRIFT
+_CONSTANT = np.arange(N_COEFFICIENTS) == N_BIAS
+_CYCLES = ~_BIAS & ~_CONSTANT & ~_DRIFT
 # How large they may be instead of what the parameter says, which is the root of their mean square, and how likely each
 # is: a factor of 4 is one σ of its logarithm. Most headings are better than it, a few are much worse.
 _WIDTH = np.log(4.0)
@@ -109,14 +117,14 @@ class HeadingEvidence(NamedTuple):
 
 
 def prior_std(heading: float, bias: float) -> Array:
-    """Prior σ of the coefficients (8,), by `heading_deviation_std` (rad) and `dvl_bias_std` (m/s)."""
-    return np.concatenate([np.full(N_BIAS, bias), heading * _SHARE])
+    """Prior σ of the coefficients (9,), by `heading_deviation_std` (rad) and `dvl_bias_std` (m/s)."""
+    return np.concatenate([np.full(N_BIAS, bias), [_CONSTANT_STD if heading else 0.0], heading * _SHARE])
 
 
-def heading_states(seen: Sequence[HeadingEvidence], std: Array) -> list[HeadingStates]:
+def heading_states(seen: Sequence[HeadingEvidence], std: Array, up: Array) -> list[HeadingStates]:
     """The deviation each time; none where blocks are without terms, which say no more than `inflation`.
 
-    std: (8,) of `prior_std`.
+    std: (9,) of `prior_std`. up: (n,) states that turn about the body's vertical, as of `TermsOfBlock`.
     """
     found: dict[int, HeadingStates] = {}
     with_them = [number for number, each in enumerate(seen) if each.has_terms]
@@ -124,7 +132,7 @@ def heading_states(seen: Sequence[HeadingEvidence], std: Array) -> list[HeadingS
         sound = {}
         for number in with_them:
             with suppress(np.linalg.LinAlgError):  # numbers that ran away
-                deviation = _Deviation.of(seen[number])
+                deviation = _Deviation.of(seen[number], up)
                 if _is_definite(deviation.information, std):
                     sound[number] = deviation
         states = _deviating([*sound.values()], std) if sound else []
@@ -143,8 +151,9 @@ def _none(seen: HeadingEvidence) -> HeadingStates:
 
 
 class _Deviation(NamedTuple):
-    """What M hypotheses know of the coefficients. onto: (8, 9), from terms to coefficients. turned: (M, 8, n), by how
-    much the states turn them. information (M, 8, 8), scores (M, 8): theirs, whatever the states are."""
+    """What M hypotheses know of the coefficients. onto: (9, n + 9), from states and terms to coefficients. turned:
+    (M, 9, n), by how much the states turn them. information (M, 9, 9), scores (M, 9): theirs, whatever the states are.
+    """
 
     seen: HeadingEvidence
     onto: Array
@@ -153,13 +162,16 @@ class _Deviation(NamedTuple):
     scores: Array
 
     @staticmethod
-    def of(seen: HeadingEvidence) -> _Deviation:
-        """By what was seen."""
+    def of(seen: HeadingEvidence, up: Array) -> _Deviation:
+        """By what was seen. up: (n,) as of `heading_states`."""
         x, p = seen.states
         n, told = x.shape[1], seen.information
-        onto = _onto_coefficients(told[seen.best, n:, n:], seen.blocks.information[:, -1, -2:])
-        beside, both = onto @ told[:, n:, :n], onto @ told[:, n:, n:] @ onto.T
-        across, of_terms = beside.swapaxes(1, 2), seen.vector[:, n:] @ onto.T
+        onto = np.zeros((N_COEFFICIENTS, n + N_TERMS))
+        onto[:, n:] = _onto_coefficients(told[seen.best, n:, n:], seen.blocks.information[:, -1, -2:])
+        if told[seen.best, -1, -1] > 0.0:  # a reference in the body turns with no heading
+            onto[_CONSTANT, :n] = -up
+        beside, both = onto @ told[:, :, :n], onto @ told @ onto.T
+        across, of_terms = beside.swapaxes(1, 2), seen.vector @ onto.T
         turned = beside @ p
         return _Deviation(seen, onto, turned, both - turned @ across, of_terms - product(beside, x))
 
@@ -180,14 +192,14 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     n, of_best = x.shape[1], told[best]
     to_terms = np.zeros((len(each), n + N_TERMS, n + N_COEFFICIENTS))
     to_terms[:, :n, :n] = np.eye(n)
-    to_terms[:, n:, n:] = onto.swapaxes(1, 2)
+    to_terms[:, :, n:] = onto.swapaxes(1, 2)
 
     as_claimed: Array = np.ones((len(each), N_COEFFICIENTS))
 
     def deviating(root: Array, level: Array, at: Index) -> tuple[GaussianState, GaussianState]:
         """Coefficients, and what they add to the states, of some hypotheses.
 
-        Their prior has σ root (S, 8), and what data say of them has a variance so many times what it claims (S, 8).
+        Their prior has σ root (S, 9), and what data say of them has a variance so many times what it claims (S, 9).
         """
         std_of, share = root[owner[at]], 1.0 / level[owner[at]]
         worth = np.sqrt(share)
@@ -200,10 +212,10 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         return GaussianState(x, _symmetric(p)), of_states
 
     def inflation(root: Array) -> tuple[GaussianState, Array]:
-        """Of the best ones: coefficients, and by how much σ (S, n + 8) of states and them grow."""
+        """Of the best ones: coefficients, and by how much σ (S, n + 9) of states and them grow."""
         found, (shift, more) = deviating(root, as_claimed, best)
         # by how much what a block tells of states and terms moves coefficients and states
-        moved = found.p @ np.concatenate([-turned[best], onto], axis=2)
+        moved = found.p @ (onto - np.concatenate([turned[best], np.zeros((*turned[best].shape[:2], N_TERMS))], axis=2))
         of_states = np.concatenate([p, np.zeros((*p.shape[:2], N_TERMS))], axis=2) - turned[best].swapaxes(1, 2) @ moved
         at = product(to_terms, np.concatenate([x + shift, found.x], axis=1))
         variance = np.concatenate([np.diagonal(of, axis1=1, axis2=2) for of in (p + more, found.p)], axis=1)
@@ -216,13 +228,13 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         return np.asarray((inflation(widest)[1][:, n:][:, which] ** 2).mean(axis=1))
 
     without_bias = np.where(_BIAS, 0.0, std)
-    level = level_of(~_BIAS, without_bias)
+    level = level_of(_CYCLES | _DRIFT, without_bias)
     # and a constant beside, of any size: a yaw that its own prior does not expect is no deviation for that
-    free = np.concatenate([onto, np.broadcast_to(np.eye(N_TERMS)[-1:], (len(each), 1, N_TERMS))], axis=1)
-    across = free.swapaxes(1, 2)
-    beside = free @ of_best[:, n:, :n]
-    own_free = free @ of_best[:, n:, n:] @ across - beside @ p @ beside.swapaxes(1, 2)
-    scores_free = product(free, vector[best, n:]) - product(beside, x)
+    constant = np.broadcast_to(np.eye(n + N_TERMS)[-1:], (len(each), 1, n + N_TERMS))
+    free = np.concatenate([onto, constant], axis=1)
+    beside = free @ of_best[:, :, :n]
+    own_free = free @ of_best @ free.swapaxes(1, 2) - beside @ p @ beside.swapaxes(1, 2)
+    scores_free = product(free, vector[best]) - product(beside, x)
     root = without_bias * as_claimed
     for which in (_CYCLES, _DRIFT):
         size = _size(own_free / level[:, None, None], scores_free / level[:, None], root, which)
@@ -242,12 +254,12 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     states = []
     for number, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True)):
         at = slice(end - size, end)
-        one, p_one = found.x[number, N_BIAS:], found.p[number, N_BIAS:, N_BIAS:]
+        one, p_one = found.x[number, N_BEFORE:], found.p[number, N_BEFORE:, N_BEFORE:]
         # at any time of the recording, as far as data show
         is_turned = bool(of_best[number, -1, -1] > 0.0)
         drifted = (one[-1] ** 2 + p_one[-1, -1]) / 12.0 if is_turned else 0.0
         in_time = np.append(np.ones(N_HEADING - 1), onto[number, -1, -2])
-        of_one = GaussianState(one * in_time, p_one * np.outer(in_time, in_time)).raised(factor[number, n + N_BIAS :])
+        of_one = GaussianState(one * in_time, p_one * np.outer(in_time, in_time)).raised(factor[number, n + N_BEFORE :])
         states.append(
             HeadingStates(
                 of_one if is_turned else None,
@@ -272,7 +284,7 @@ def _symmetric(p: Array) -> Array:
 
 
 def _is_definite(information: Array, std: Array) -> bool:
-    """Whether information (M, 8, 8) on the coefficients is that, rounding aside."""
+    """Whether information (M, 9, 9) on the coefficients is that, rounding aside."""
     widest = _FACTORS[-1] * std
     try:
         np.linalg.cholesky(np.eye(N_COEFFICIENTS) + widest[:, None] * information * widest)
@@ -282,12 +294,14 @@ def _is_definite(information: Array, std: Array) -> bool:
 
 
 def _onto_coefficients(square: Array, times: Array) -> Array:
-    """(8, 9): from sums over the terms to those over coefficients, whose drift has no mean and ends with 1.
+    """(9, 9): from sums over the terms to those over coefficients, whose drift has no mean and ends with 1.
 
     square: (9, 9) of the terms. times: (B, 2) of blocks, information of yaw times its time (s), and that information.
     """
     onto = np.zeros((N_COEFFICIENTS, N_TERMS))
-    onto[: N_TERMS - 2, : N_TERMS - 2] = np.eye(N_TERMS - 2)
+    onto[_BIAS, :N_BIAS] = np.eye(N_BIAS)
+    onto[_CYCLES, N_BIAS:-2] = np.eye(N_HEADING - 1)
+    onto[_CONSTANT, -1] = 1.0
     told = times[times[:, 1] > NOTHING * times[:, 1].max()]
     if len(told):
         at = told[:, 0] / told[:, 1]
@@ -297,9 +311,9 @@ def _onto_coefficients(square: Array, times: Array) -> Array:
 
 
 def _size(information: Array, scores: Array, root: Array, which: Mask) -> Array:
-    """How many times larger (S,) the prior σ root (S, 8) of some coefficients is, by the evidence: root mean square.
+    """How many times larger (S,) the prior σ root (S, 9) of some coefficients is, by the evidence: root mean square.
 
-    information (S, 9, 9), scores (S, 9): of the coefficients and a constant, without their prior. which: (8,).
+    information (S, 10, 10), scores (S, 10): of the coefficients and a constant, without their prior. which: (9,).
     """
     factors = np.where(which, _FACTORS[:, None], 1.0)
     roots = np.full((len(root), *factors.shape[:1], N_COEFFICIENTS + 1), _ANY)

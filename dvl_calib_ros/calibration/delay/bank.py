@@ -427,7 +427,7 @@ class DelayBank:
 
     def _found(self, known: Sequence[Known]) -> Iterator[Likely]:
         seen = [each.seen for each in known if each.seen is not None]
-        deviations = heading_states(seen, self._std_beside)
+        deviations = heading_states(seen, self._std_beside, self._up)
         inflations: Array = np.ones((len(known), N_STATE))
         if deviations:
             inflations = np.stack([each.inflation for each in deviations])
@@ -545,7 +545,7 @@ class DelayBank:
             return np.ones(N_STATE)
         of_one = np.array([best])
         seen = self._seen(GaussianState(found.x[of_one], found.p[of_one]), of_one, 0)
-        return heading_states([seen], self._std_beside)[0].inflation
+        return heading_states([seen], self._std_beside, self._up)[0].inflation
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """All hypotheses as one, in the errors."""

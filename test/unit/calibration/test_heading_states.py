@@ -11,13 +11,14 @@ import pytest
 from dvl_calib_ros.calibration import heading_states as module
 from dvl_calib_ros.calibration.block_terms import N_BIAS, BlockTerms, TermsOfBlock, block_terms, with_terms
 from dvl_calib_ros.calibration.frames import skew
-from dvl_calib_ros.calibration.heading_states import HeadingEvidence, heading_states, prior_std
+from dvl_calib_ros.calibration.heading_states import N_BEFORE, HeadingEvidence, heading_states, prior_std
 from dvl_calib_ros.calibration.heave import HeaveSums
 from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.time_blocks import TimeBlocks
 
 N, ROWS, STD, PRIOR = 4, 30, math.radians(0.5), math.radians(5.0)
-UP = np.array([0.0, 0.0, 1.0, 0.0])
+TURNS = np.eye(N, 3)  # of a DVL along the vehicle's axes
+UP = TURNS[:, 2]
 DRIFT_S = 10.0
 EXACT = prior_std(STD, 0.0)  # of a DVL without a bias
 BIAS = 0.01
@@ -39,7 +40,7 @@ def columns(yaw, seconds, span, centre):
 def heading_only(yaw, seconds):
     """TermsOfBlock of a block on one heading, of which no bias is told."""
     return block_terms(
-        earth_in_body(np.full(ROWS, yaw)), np.zeros((ROWS, 3)), np.zeros((ROWS, 3)), np.ones(ROWS), seconds, UP, N
+        earth_in_body(np.full(ROWS, yaw)), np.zeros((ROWS, 3)), np.zeros((ROWS, 3)), np.ones(ROWS), seconds, TURNS, N
     )
 
 
@@ -74,15 +75,15 @@ def test_it_equals_least_squares_with_columns_of_its_own(rng, monkeypatch):
     monkeypatch.setattr(module, "_LOG_LIKELY", np.zeros(1))
     headings = rng.uniform(-math.pi, math.pi, 7)  # too few for σ to be raised
     blocks, h, z, number = blocks_of(headings, rng, np.radians([1.0, -0.5, 0.2, 0.1, 0.3]))
-    found = heading_states([HeadingEvidence.of(blocks, without_deviation(h, z), np.zeros(1, dtype=int), 0)], EXACT)[0]
+    alone = without_deviation(h, z)
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT, UP)[0]
     span, informed = DRIFT_S * 6.0, np.bincount(number, (h @ UP) ** 2)
     centre = (informed @ (DRIFT_S * np.arange(7))) / informed.sum()
     own = np.array([columns(headings[b], DRIFT_S * b, span, centre) for b in number])
     wide = np.hstack([h, (h @ UP)[:, None] * own])
-    std = np.concatenate([np.full(N, PRIOR), EXACT[N_BIAS:]])
+    std = np.concatenate([np.full(N, PRIOR), EXACT[N_BEFORE:]])
     p = np.linalg.inv(wide.T @ wide + np.diag(std**-2.0))
     x = p @ (wide.T @ z)
-    alone = without_deviation(h, z)
     np.testing.assert_allclose(alone.x[0] + found.shift[0], x[:N], rtol=1e-8, atol=1e-12)
     assert found.drifted == pytest.approx((x[-1] ** 2 + p[-1, -1]) / 12.0)  # when it was right is not known
     np.testing.assert_allclose(alone.p[0] + found.more[0], p[:N, :N], rtol=1e-8, atol=1e-14)
@@ -99,7 +100,7 @@ ONE = np.full(24, math.radians(10.0))
 def yaw_of(headings, rng, truth, **more):
     blocks, h, z, _ = blocks_of(headings, rng, truth, **more)
     alone = without_deviation(h, z)
-    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT)[0]
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT, UP)[0]
     x, p = alone.x[0] + found.shift[0], alone.p[0] + found.more[0]
     return x[2], math.hypot(math.sqrt(p[2, 2]) * found.inflation[2], math.sqrt(found.drifted)), found
 
@@ -135,14 +136,14 @@ def test_a_reference_in_the_body_says_nothing_of_the_heading_and_changes_nothing
     body = TimeBlocks()
     for information, vector in zip(*blocks.kept, strict=True):
         body.add(*with_terms(information[:, :N, :N], vector[:, :N], TermsOfBlock.none(UP)), ROWS)
-    found = heading_states([HeadingEvidence.of(body, without_deviation(h, z), np.zeros(1, dtype=int), 0)], EXACT)[0]
+    found = heading_states([HeadingEvidence.of(body, without_deviation(h, z), np.zeros(1, dtype=int), 0)], EXACT, UP)[0]
     assert not found.shift.any() and not found.more.any()
 
 
 def test_terms_of_blocks_are_the_same_however_samples_come(rng):
     yaw, stamps_ns = rng.uniform(-3.0, 3.0, 40), np.arange(40) * 10**9
     earth, velocity = earth_in_body(yaw), rng.normal(0.0, 1.0, (40, 3))
-    at_once, one_by_one = BlockTerms(UP, N), BlockTerms(UP, N)
+    at_once, one_by_one = BlockTerms(TURNS, N), BlockTerms(TURNS, N)
     at_once.add(stamps_ns, earth, velocity, -velocity)
     expected = at_once.upto(np.array([15, 30]))
     found = []
@@ -164,9 +165,39 @@ def test_a_yaw_that_its_prior_does_not_expect_is_no_deviation(rng):
         terms = heading_only(ONE[b], DRIFT_S * b)
         blocks.add(*with_terms((h[own].T @ h[own])[None], (h[own].T @ z[own])[None], terms), ROWS)
     alone = without_deviation(h, z, math.radians(3.0))
-    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT)[0]
+    found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT, UP)[0]
     assert abs(found.shift[0, 2]) < math.radians(0.7)
     assert math.sqrt(alone.p[0, 2, 2] + found.more[0, 2, 2]) < 2.0 * STD
+
+
+@pytest.mark.parametrize(("constant", "by_heading"), [(3.0, 0.0), (-3.0, 0.0), (0.0, 1.5), (0.0, 0.0)])
+def test_a_heading_that_is_wrong_is_no_roll_of_a_vehicle_that_leans_into_its_turns(constant, by_heading):
+    """It turns about the vertical of the earth. A declination of 4 degrees was 1.7 of roll at sigma 0.17."""
+    off = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        blocks, all_h, all_z = TimeBlocks(), [], []
+        for b in range(24):
+            yaw = b * 1.7 + np.linspace(0.0, 0.8, ROWS)
+            turning = (np.arange(ROWS) > rng.integers(5, 25)) * (1.0 if b % 3 else -1.0)
+            roll, velocity = math.radians(3.0) * turning, np.zeros((ROWS, 3))
+            velocity[:, 0], velocity[:, 1] = 1.5, -0.06 * turning + rng.normal(0.0, 0.01, ROWS)
+            lean = np.array([[[1, 0, 0], [0, math.cos(r), math.sin(r)], [0, -math.sin(r), math.cos(r)]] for r in roll])
+            earth = lean @ earth_in_body(yaw)
+            vertical = np.cross(earth[:, :, 0], earth[:, :, 1])
+            delta = np.radians(constant + by_heading * np.sin(yaw))
+            h = np.concatenate([rows_at(each) for each in velocity]) / 0.01
+            z = (np.cross(velocity, vertical) * delta[:, None]).ravel() / 0.01 + rng.normal(0.0, 1.0, 3 * ROWS)
+            terms = block_terms(earth, velocity, np.zeros((ROWS, 3)), np.ones(ROWS), DRIFT_S * b, TURNS, N)
+            blocks.add(*with_terms((h.T @ h)[None], (h.T @ z)[None], terms), ROWS)
+            all_h.append(h)
+            all_z.append(z)
+        alone = without_deviation(np.concatenate(all_h), np.concatenate(all_z))
+        found = heading_states([HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)], EXACT, UP)[0]
+        of = GaussianState(alone.x[0] + found.shift[0], alone.p[0] + found.more[0]).raised(found.inflation)
+        off.append(of.x[0] / math.sqrt(of.p[0, 0]))
+        assert of.x[2] == pytest.approx(math.radians(constant), abs=math.radians(0.5))  # it is in the yaw
+    assert math.sqrt(np.mean(np.square(off))) < 1.7 and np.abs(off).max() < 3.0
 
 
 def rows_at(velocity):
@@ -176,7 +207,7 @@ def rows_at(velocity):
 
 def bias_terms(velocity):
     return block_terms(
-        np.zeros((ROWS, 3, 2)), np.tile(velocity, (ROWS, 1)), np.zeros((ROWS, 3)), np.ones(ROWS), 0.0, UP, N
+        np.zeros((ROWS, 3, 2)), np.tile(velocity, (ROWS, 1)), np.zeros((ROWS, 3)), np.ones(ROWS), 0.0, TURNS, N
     )
 
 
@@ -197,7 +228,7 @@ def biased(speeds, bias, rng, noise=0.03):
         all_z.append(z)
     alone = without_deviation(np.concatenate(all_h), np.concatenate(all_z))
     seen = HeadingEvidence.of(blocks, alone, np.zeros(1, dtype=int), 0)
-    found = heading_states([seen], prior_std(STD, BIAS))[0]
+    found = heading_states([seen], prior_std(STD, BIAS), UP)[0]
     of = GaussianState(alone.x[0] + found.shift[0], alone.p[0] + found.more[0]).raised(found.inflation)
     return found.of_bias.at(0).added_to(of), found, alone
 
@@ -251,7 +282,7 @@ def test_what_says_that_a_vehicle_does_not_heave_makes_no_bias_of_trim(rng):
     rows = HeaveSums(outer, outer, np.append(one_row, [[1.0]], axis=1), np.ones(1))
     where = np.zeros(1, dtype=int), 0
     wider = [
-        heading_states([HeadingEvidence.of(told, state, *where, beside)], prior_std(STD, BIAS))[0].of_bias
+        heading_states([HeadingEvidence.of(told, state, *where, beside)], prior_std(STD, BIAS), UP)[0].of_bias
         for beside in (None, rows.with_terms(0.03**2, np.array([0.0, 0.0, 1.0])))
     ]
     a_bias = BIAS / 1.5  # of pitch
