@@ -548,11 +548,14 @@ class CalibrationNode(AnsweringNode):
 
     # ------------------------------------------------------------------ end
 
-    def finish(self) -> None:
-        """Save the result if a file is named for it; print it if it cannot be saved, so that it is not lost."""
+    def finish(self) -> bool:
+        """Save the result if a file is named for it; print it if it cannot be saved, so that it is not lost.
+
+        Returns whether the file holds all that there is to save.
+        """
         path = self._calibrator.parameters.result_file
         if not path:
-            return
+            return True
         try:
             self._save(Path(path))
             say(f"calibration_node: saved to {path}")
@@ -561,6 +564,8 @@ class CalibrationNode(AnsweringNode):
         except InputError as error:
             result = result_text(self._result_document())
             say(f"calibration_node: {error}. The result follows.\n{result}")
+            return False
+        return True
 
     def destroy_node(self) -> None:
         """Leave ROS, and end what solves G2's blocks."""

@@ -22,7 +22,11 @@ ENDS_WITH_STDIN = "--ends-with-stdin"
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; 0, or 2 on a bad configuration, said in one line on standard error."""
+    """Run the node until it is told to stop.
+
+    0; 1 where the result could not be saved, which is printed then; 2 on a bad configuration, said in one line on
+    standard error.
+    """
     try:
         from ..streams import open_streams
         from .ending import Ending
@@ -57,7 +61,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         rclpy.init(args=["calibration_node", *args], signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
         return _refused(error)
-    node = None
+    node, is_saved = None, True
     give_back_at_once()
     sys.setswitchinterval(GIVES_WAY_S)
     try:
@@ -73,10 +77,10 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     finally:
         ending.heard()
         if node is not None:
-            node.finish()
+            is_saved = node.finish()
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    return 0 if is_saved else 1
 
 
 def parameter_files(args: Sequence[str]) -> list[Path]:

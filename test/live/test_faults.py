@@ -526,7 +526,7 @@ def test_a_result_file_whose_folder_goes_comes_back_or_becomes_something_else_co
         file.rmdir()
         assert node.saved()["used"] and os.listdir(folder) == ["result.yaml"]
         shutil.rmtree(folder)
-    assert process.returncode == 0 and "Traceback" not in process.output
+    assert process.returncode == 1 and "Traceback" not in process.output
     printed = process.output.partition("The result follows.\n")[2]
     file.parent.mkdir()
     file.write_text(printed)
