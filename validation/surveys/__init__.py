@@ -12,16 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from ..drawn import Judge, Result
-from .physics import DVL_BIAS_STD, draw, write_survey
+from .physics import DECLINATION, DVL_BIAS_STD, draw, write_survey
 
 
 def _write(seed: int, path: Path) -> Result:
-    return write_survey(draw(seed, DVL_BIAS_STD), path)
+    return write_survey(draw(seed, DVL_BIAS_STD, DECLINATION), path)
 
 
 def _said(drawn: Mapping[str, Any]) -> str:
     what = [drawn["manoeuvre"], drawn["reference"], "tf" if drawn["transform"] else "no tf"]
-    what += [f"{name} {drawn[name]:.2f}" for name in ("dvl_late", "reference_late", "compass") if drawn[name]]
+    what += [
+        f"{name} {drawn[name]:.2f}" for name in ("dvl_late", "reference_late", "compass", "declination") if drawn[name]
+    ]
     what += ["lasting noise"] * drawn["lasting"] + ["antenna"] * any(drawn["antenna"])
     return f"{', '.join(what)}; mounted at {drawn['mounting_yaw']:g}"
 
