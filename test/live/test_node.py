@@ -137,7 +137,7 @@ def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_l
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         until(lambda: diagnostics, "the node to run")
         folder.rmdir()
-    assert process.returncode == 0
+    assert process.returncode == 1
     assert "could not be written" in process.output
     assert "models:" in process.output and "covariance:" in process.output
 
