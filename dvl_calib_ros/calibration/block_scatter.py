@@ -26,7 +26,7 @@ class BlockScatter:
     def __init__(self, x: Array, p: Array, seconds: float, terms: BlockTerms | None, std: Array) -> None:
         """Start from states x (K, n), P (K, n, n).
 
-        seconds: length of a block. terms: None for filters that heading and bias are not looked for by. std: (8,) of
+        seconds: length of a block. terms: None for filters that heading and bias are not looked for by. std: (9,) of
         `heading_states.prior_std`.
         """
         self._blocks = TimeBlocks()
