@@ -25,12 +25,13 @@ from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
 from .fitting import Fit, prior_std
+from .intervals import Times, Triple, covariance_of
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
 from .recordings import RecordedStreams, load_recordings
 from .registered import check_clocks
 from .results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
-from .selection import EffectSelection, Selected, blocks_of, select
+from .selection import EffectSelection, Selected, select
 from .series import collect_series
 from .settings import SETTINGS
 from .shown import somewhere
@@ -50,7 +51,6 @@ POWER = 0.8
 MATERIAL = 0.2
 # What is left beyond the noise is told in the sentence from this share of the noise on
 WORTH_TELLING = 0.3
-Triple = tuple[float, float, float]
 
 
 def diagnose(
@@ -106,11 +106,11 @@ def diagnose_recordings(
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
-    covariance = selection.fit.covariance(blocks_of(selection.fitter.problem))
+    covariance, times = covariance_of(selection)
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
         moved = moved_by(selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
-    found = tuple(_found(selection, each, covariance, len(testable), gap) for each in selection.selected)
+    found = tuple(_found(selection, each, covariance, times, len(testable), gap) for each in selection.selected)
     columns = rest.columns
     if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and rest.found):
         columns = selection.fit.columns[:, :, 6:]
@@ -252,7 +252,14 @@ def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
     return any(size <= VISIBLE_TIMES_TYPICAL * typical[name] for name, size in sizes.items())
 
 
-def _found(selection: EffectSelection, selected: Selected, covariance: Array, n_tested: int, gap: Gap) -> FoundEffect:
+def _found(
+    selection: EffectSelection,
+    selected: Selected,
+    covariance: Array,
+    times: Times,
+    n_tested: int,
+    gap: Gap,
+) -> FoundEffect:
     fit, effect = selection.fit, selected.effect
     stds = np.sqrt(np.diag(covariance))[6:].tolist()
     by_recording: dict[int, dict[str, Triple]] = {}
@@ -261,9 +268,8 @@ def _found(selection: EffectSelection, selected: Selected, covariance: Array, n_
             of_recording = by_recording.setdefault(parameter.recording or 0, {})
             of_recording[parameter.spec.name] = _interval(fit.hypothesis.value(parameter), std)
     for recording, parameters in by_recording.items():
-        for spec in effect.parameters:
-            if is_time_of_run(spec):
-                parameters[spec.name] = selection.fitter.time_interval(fit, effect, spec.name, recording)
+        for spec in filter(is_time_of_run, effect.parameters):
+            parameters[spec.name] = times[effect.name, recording, spec.name]
     ordered = {
         recording: {spec.name: parameters[spec.name] for spec in effect.parameters}
         for recording, parameters in by_recording.items()

@@ -38,6 +38,8 @@ SURELY, BENT = 2.0, 0.2
 # A burst: bins beyond so many standard deviations of what is usually left, those about them that are beyond fewer, and
 # the share of a recording up to which all of them are taken for errors of an instrument
 BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
+# Standard deviations from the middle to the ends of an interval of 95 per cent
+OF_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
 
 
@@ -235,6 +237,13 @@ class Fitter:
         found = replace(system, gram=gram)
         return found if found.is_definite else system
 
+    def step_of(self, other: Problem, seen: Sequence[Seen], residual: Array, fit: Fit) -> Array:
+        """(6 + p,) the step that a fit's hypothesis would take in another problem, seen through it, with a residual."""
+        fitter = replace(self, problem=other, outliers=0.0, _fits={})
+        columns = fitter.columns(fit.hypothesis, seen)
+        system = fitter._system(fit.noise, columns, residual, fit.hypothesis)
+        return fitter._without_own_noise(system, fit.hypothesis, fit.noise, columns, residual).solution()
+
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """(S n,) whitened, what made-up noise of the velocities makes in the residual (M, A) of a hypothesis."""
         white = [
@@ -329,11 +338,7 @@ class Fitter:
         for sign in (-1.0, 1.0):
             step = 0.5 * self.problem.interval
             while 0.0 <= (at := value + sign * step) <= seconds:
-                per = tuple(
-                    {**each, name: at} if index == recording else each
-                    for index, each in enumerate(fit.values[effect.name])
-                )
-                moved = replace(fit.hypothesis, values={**fit.values, effect.name: per})
+                moved = _with_time(fit, effect, name, recording, at)
                 worse = fit.deviance + float(chi2_isf(0.05, 1))
                 if self._is_surely_worse(moved, fit.noise, worse) or self.fit(moved, fit.noise, 2).deviance > worse:
                     as_good.append(at)  # the first that is worse bounds those that are as good
@@ -341,6 +346,23 @@ class Fitter:
                 as_good.append(at)
                 step *= 1.6
         return value, min(as_good), max(as_good)
+
+    def moved_by_time(self, fit: Fit, effect: Effect, name: str, recording: int, ends: Sequence[float]) -> Array:
+        """(6 + p, 6 + p) what is not known of a time adds to the covariance. ends: of its interval (95 per cent), s."""
+        added = np.zeros((len(fit.hypothesis.vector()),) * 2)
+        for at in ends:
+            if np.isfinite(at) and at != fit.values[effect.name][recording][name]:
+                moved = self.fit(_with_time(fit, effect, name, recording, at), fit.noise, 3).hypothesis.vector()
+                moved = (moved - fit.hypothesis.vector()) / OF_INTERVAL
+                added += np.outer(moved, moved) / len(ends)
+        return added
+
+
+def _with_time(fit: Fit, effect: Effect, name: str, recording: int, at: float) -> Hypothesis:
+    """The hypothesis of a fit with another time, s, at which an effect begins or ends in one recording."""
+    per = fit.values[effect.name]
+    moved = tuple({**each, name: at} if index == recording else each for index, each in enumerate(per))
+    return replace(fit.hypothesis, values={**fit.values, effect.name: moved})
 
 
 def _length(step: Array, before: Array, length: float) -> float:

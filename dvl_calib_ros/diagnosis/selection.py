@@ -10,7 +10,7 @@ winner it is asked again, with the noise that is left by everything together: so
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from .clock_or_arm import ARM, guessed_arm, is_open, with_arm, with_clocks
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
+from .leaps import LEAP, leaping
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
@@ -44,6 +45,8 @@ AS_WELL = 2.0
 CLEAR = 6.0
 # What is taken back but for this share of it, or within a step of the grid, may be anything that is there for a while
 TAKEN_BACK = 0.25
+# and where it explains as much as an unknown cause would not without being seen, but for this share
+TAKEN_BACK_EXACTLY = 0.05
 # Fits with outliers drawn in about the one before, from the first guess on
 ROBUST_ROUNDS = 3
 
@@ -135,6 +138,8 @@ def select(
     for _ in range(ROUNDS):
         candidates = _proposed(fitter, fit, effects)
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
+        leapt = [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
+        fits += [each for each in leapt if not _is_taken_back(fitter, each, LEAP, fit.deviance - each.deviance)]
         fits += _happening_again(fitter, fits, every, effects)
         finer = _finer_steps(problem)
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
@@ -147,6 +152,7 @@ def select(
             break
         seen_before.add(names)
     fit = _borne_out(fitter, _called_for(fitter, fit, len(effects)), len(effects))
+    fit = _once_borne_out(fitter, fit, every, effects)
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
@@ -329,7 +335,6 @@ def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[H
 
 
 CLOCKS = ("dvl_time_offset", "reference_time_offset", "attitude_time_offset")
-LEAP = "time_offset_jump"
 
 
 def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
@@ -455,8 +460,9 @@ def _happening_again(
             once, twice = (price(each, len(effects), n, _tried(each)) for each in (effects[name], whole))
             limit = best.deviance + once - twice
             starts = _a_second_time(fitter, best, whole, limit)
-        found += [fitter.fit(start, best.noise) for start in starts]
-    return [fit for fit in found if not any(_is_taken_back(fitter, fit, effect) for effect in fit.effects)]
+        tried = [fitter.fit(start, best.noise) for start in starts]
+        found += [fit for fit in tried if not _is_taken_back(fitter, fit, name, best.deviance - fit.deviance)]
+    return found
 
 
 def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
@@ -481,11 +487,16 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
 
 
-def _is_taken_back(fitter: Fitter, fit: Fit, effect: Effect) -> bool:
-    """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording."""
+def _is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float) -> bool:
+    """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
+
+    drop: deviance that it explains. What explains much may be nearly undone, but not exactly.
+    """
+    effect = next(each for each in fit.effects if each.name == name)
     own = {spec.name for spec in effect.parameters}
     if not effect.again.keys() <= own or not effect.again:
         return False
+    nearly = TAKEN_BACK_EXACTLY if drop > SETTINGS.instead_of else TAKEN_BACK
     step = max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
 
     def is_undone(values: Values) -> bool:
@@ -496,20 +507,25 @@ def _is_taken_back(fitter: Fitter, fit: Fit, effect: Effect) -> bool:
                 near |= values[second] - values[first] < step
             else:
                 largest = max(abs(values[first]), abs(values[second]))
-                near |= abs(values[first] + values[second]) < TAKEN_BACK * largest
+                near |= abs(values[first] + values[second]) < nearly * largest
         return near
 
     return all(is_undone(values) for values in fit.values[effect.name])
 
 
-def _either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
-    """What happens twice in a fit, as the first alone and as the second, each where the other is not clear."""
-    std = np.sqrt(np.diag(fit.system.covariance()))
-    clear = {
-        each.spec.name
-        for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
-        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
-    }
+def _either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] | None = None) -> list[Hypothesis]:
+    """What happens twice in a fit, as the first alone and as the second, each where the other is not clear.
+
+    clear: names of the parameters that are; by default those many standard deviations large.
+    """
+    if clear is None:
+        std = np.sqrt(np.diag(fit.system.covariance()))
+        clear = {
+            each.spec.name
+            for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
+            if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
+        }
+    clear = {name for name in clear if not any(is_time_of_run(s) for s in whole.parameters if s.name == name)}
     others = [effect for effect in fit.effects if effect.name != whole.name]
     back = {first: second for second, first in whole.again.items()}
     starts = []
@@ -578,8 +594,11 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             (rest.deviance, rest)
             for effect, rest in rests
             if _log_p(fit, rest, effect) > threshold
-            or _is_taken_back(fitter, fit, effect)
-            or _is_ghost(effect, rest.deviance - fit.deviance, explained, fit.deviance)
+            or _is_taken_back(fitter, fit, effect.name, rest.deviance - fit.deviance)
+            or (
+                _is_ghost(effect, rest.deviance - fit.deviance, explained, fit.deviance)
+                and not _is_late_before_a_leap(fit, effect)
+            )
         ]
         if not weak:
             return fit
@@ -594,6 +613,20 @@ def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> boo
     return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
 
 
+def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
+    """Whether an effect is that the DVL's clock is late before it leaps, by as much as nothing of the leap could be.
+
+    It tells of the time before the leap alone, which may be short, and so of little of what all of them explain.
+    """
+    if effect.name != CLOCKS[0] or LEAP not in fit.values:
+        return False
+    late, leap = fit.values[effect.name], fit.values[LEAP]
+    return any(
+        abs(own["seconds"]) > TAKEN_BACK * max(abs(each["seconds"]), abs(each.get("again_seconds", 0.0)))
+        for own, each in zip(late, leap, strict=True)
+    )
+
+
 def _borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """A fit without effects that the scatter of the blocks does not bear out, whatever the noise's colour."""
     block = blocks_of(fitter.problem)
@@ -606,15 +639,35 @@ def _borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def _robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp]) -> float:
-    """p of a Wald test with the covariance that blocks show."""
+def _once_borne_out(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
+    """A fit in which what happens twice happens once, where the scatter of the blocks does not bear out the other."""
+    block = blocks_of(fitter.problem)
+    for effect in fit.effects:
+        own = {spec.name for spec in effect.parameters}
+        if not effect.again or not effect.again.keys() <= own:
+            continue
+        doubtful = {
+            each.spec.name
+            for each in fit.hypothesis.parameters_of(effect)
+            if _robust_p(fit, effect, block, each.spec.name) >= SETTINGS.robust_level
+        }
+        starts = _either_alone(fit, effects[effect.name], every[effect.name], clear=own - doubtful)
+        found = [fitter.refined(fitter.fit(start, fit.noise), _finer_steps(fitter.problem)) for start in starts]
+        return min(found, key=lambda each: each.deviance, default=fit)
+    return fit
+
+
+def _robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "") -> float:
+    """p of a Wald test with the covariance that blocks show, of all parameters of an effect or of one by name."""
     at, start = np.zeros(0, dtype=int), 6
     for other in fit.effects:
         p = len(fit.hypothesis.parameters_of(other))
         if other is effect:
             at = np.arange(start, start + p)
         start += p
-    defaults = np.array([each.spec.default for each in fit.hypothesis.parameters_of(effect)])
+    own = fit.hypothesis.parameters_of(effect)
+    is_asked = np.array([not name or each.spec.name == name for each in own])
+    at, defaults = at[is_asked], np.array([each.spec.default for each in own])[is_asked]
     values = fit.hypothesis.vector()[at] - defaults
     covariance = fit.covariance(block)[np.ix_(at, at)]
     wald = float(values @ np.linalg.solve(covariance, values)) / len(at)

@@ -14,18 +14,27 @@ from command_line import fail, succeed
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.diagnosis import intervals
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
-from dvl_calib_ros.diagnosis.fitting import Fit, Fitter
+from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
 from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.selection import _by_fewer_clocks, _clock_or_arm, _happening_again, _selected
+from dvl_calib_ros.diagnosis.selection import (
+    _by_fewer_clocks,
+    _clock_or_arm,
+    _happening_again,
+    _is_late_before_a_leap,
+    _is_taken_back,
+    _once_borne_out,
+    _selected,
+)
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -227,6 +236,49 @@ def test_a_clock_that_leaps_twice_is_one_effect_with_both_leaps_and_no_single_on
     assert compensated(Parameters(), diagnosis).dvl_time_jump == 0.0
 
 
+def as_sent(run: Run) -> Run:
+    """A driver drops what its clock, set back, stamps before what it has sent."""
+    newest = np.maximum.accumulate([0, *(sample.stamp_ns for sample in run.dvl)])
+    return replace(run, dvl=[each for each, before in zip(run.dvl, newest, strict=False) if each.stamp_ns > before])
+
+
+LAGGING = "reference_lag:time_constant_s=1.3"
+SET_BACK_TWICE = "time_offset_jump:seconds=-1.68,at_s=155,again_seconds=-1.99,again_at_s=277"
+
+
+def test_leaps_of_seconds_are_found_beside_a_lag_and_a_clock_that_is_late_before_them():
+    """It was refused, for a clock that drifts by 36 s an hour."""
+    effects = ["dvl_time_offset:seconds=-1.71", SET_BACK_TWICE, LAGGING, "lever_arm:x_m=-0.7,y_m=-0.2"]
+    given = scenario(effects=effects, gnss_std=0.02)
+    diagnosis = diagnose_recordings([recording_of(as_sent(simulate(given)), given.gnss_frame)], Parameters())
+    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
+    assert set(found(diagnosis)) == {text.split(":")[0] for text in effects}
+    assert_within(diagnosis, "dvl_time_offset", seconds=-1.71)
+    assert_within(diagnosis, "time_offset_jump", seconds=-1.68, again_seconds=-1.99)
+
+
+def test_a_clock_that_is_late_before_it_leaps_is_no_ghost_of_the_leap_unless_it_is_next_to_nothing():
+    """Half a second for the first 96 s was 1 in 1500 of what a lag, an arm and two leaps explained."""
+    clock, leap = EFFECTS["dvl_time_offset"], EFFECTS["time_offset_jump"]
+    for late, is_late in ((-0.51, True), (0.05, False)):
+        values = {clock.name: ({"seconds": late},), leap.name: ({"seconds": -1.3, "again_seconds": 1.0},)}
+        fit = Mock(spec=Fit, values=values)
+        assert _is_late_before_a_leap(fit, clock) is is_late and not _is_late_before_a_leap(fit, leap)
+    assert not _is_late_before_a_leap(Mock(spec=Fit, values={clock.name: ({"seconds": 1.0},)}), clock)
+
+
+@pytest.mark.parametrize(("drop", "is_taken_back"), [(200.0, True), (5000.0, False)])
+def test_a_clock_that_is_nearly_set_right_again_has_leapt_twice_where_nothing_else_explains_as_much(
+    drop, is_taken_back
+):
+    """A leap of -1.30 s and one back by 1.00 s were not named, beside a lag and an arm."""
+    leap = EFFECTS["time_offset_jump"]
+    values = {"seconds": -1.3, "at_s": 96.0, "again_seconds": 1.004, "again_at_s": 220.0}
+    problem = SimpleNamespace(recordings=[SimpleNamespace(seconds=370.0)])
+    fit = Mock(spec=Fit, effects=(leap,), values={leap.name: (values,)})
+    assert _is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop) is is_taken_back
+
+
 def test_a_second_leap_that_is_not_there_is_taken_back():
     fitter, fit, _ = fitted(
         scenario(effects=["time_offset_jump:seconds=0.8,at_s=100"], gnss_std=0.02),
@@ -236,6 +288,42 @@ def test_a_second_leap_that_is_not_there_is_taken_back():
     (alone,) = _happening_again(fitter, [fit], EFFECTS, once)
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
+
+
+def test_a_first_leap_that_the_blocks_do_not_bear_out_is_dropped_and_the_other_stands_alone():
+    """A leap of 75 ms at 233 s was the second, and one of 16 ms at 46 s the first."""
+    fitter, fit, _ = fitted(
+        scenario(effects=["time_offset_jump:seconds=0.8,at_s=200"], gnss_std=0.02),
+        {"time_offset_jump": {"seconds": 0.02, "at_s": 60.0, "again_seconds": 0.8, "again_at_s": 200.0}},
+    )
+    once = {name: effect.once for name, effect in EFFECTS.items()}
+    alone = _once_borne_out(fitter, fit, EFFECTS, once)
+    assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
+    assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
+    assert alone.values["time_offset_jump"][0]["at_s"] == pytest.approx(200.0, abs=20.0)  # on a straight leg
+
+
+def test_what_is_not_known_of_the_time_of_a_leap_is_in_the_intervals_of_all_sizes():
+    fitter, fit, _ = fitted(
+        scenario(effects=["time_offset_jump:seconds=0.8,at_s=200"], gnss_std=0.02),
+        {"time_offset_jump": {"seconds": 0.8, "at_s": 200.0}},
+    )
+    (leap,) = fit.effects
+    assert not fitter.moved_by_time(fit, leap, "at_s", 0, (200.0, 200.0)).any()
+    moved = fitter.fit(_with_time(fit, leap, "at_s", 0, 170.0), fit.noise, 3).hypothesis.vector()[6:]
+    added = fitter.moved_by_time(fit, leap, "at_s", 0, (170.0, 200.0))[6:, 6:]
+    assert np.diag(added) == pytest.approx(((moved - fit.hypothesis.vector()[6:]) / 1.96) ** 2 / 2.0)
+
+
+def test_what_fits_to_made_up_recordings_are_off_by_is_in_the_intervals_where_it_is_no_chance(monkeypatch):
+    """At 1 Hz a flexure of the mount was 4 standard deviations off, which recordings made up from the fit showed."""
+    monkeypatch.setattr(intervals, "made_up", lambda problem, fit, count: ((None, [], None) for _ in range(count)))
+    scatter = np.tile([1.0, -1.0], intervals.MADE_UP // 2)
+    steps = np.column_stack([0.3 + 0.5 * scatter, 4.0 + 0.5 * scatter, 3.0 * scatter])
+    fitter = Mock(spec=Fitter, problem=None, step_of=Mock(side_effect=list(steps)))
+    grown = intervals._with_samples(fitter, Mock(spec=Fit), np.eye(3))
+    expected = [1.0, 1.0 + (4.0 / 2.0) ** 2, steps[:, 2].var(ddof=1)]
+    assert np.diag(grown) == pytest.approx(expected)
 
 
 def test_two_recordings_are_not_asked_for_a_second_leap_at_one_time_of_both():

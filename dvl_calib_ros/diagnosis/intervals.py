@@ -1,0 +1,53 @@
+"""How well the sizes of effects are known: by noise, by the times at which effects begin, by what fits do with samples.
+
+A fit's own covariance takes its times of the run and its curves between samples for true. Both are guesses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..calibration.frames import Array
+from .composed import is_time_of_run
+from .fitting import Fit, Fitter
+from .made_up import made_up
+from .selection import EffectSelection, blocks_of
+
+Triple = tuple[float, float, float]
+Times = dict[tuple[str, int, str], Triple]
+
+# Made-up recordings that show what a fit does with samples, and from how many σ on that is not by chance: of the mean
+# of what it is off by, three of its own; of the scatter, what one of thirty sets of as many is beyond
+MADE_UP, OFF_BY, SCATTER = 12, 1.0, 1.35
+# Motion between samples goes some way between the two that are fitted and made up, so half of what these differ by
+HALF_WAY = 0.5
+
+
+def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
+    """(6 + p, 6 + p) of calibration and effects of a selection; and the times at which its effects begin or end, by
+    effect, recording and name, with their intervals of 95 per cent."""
+    fitter, fit = selection.fitter, selection.fit
+    covariance = fit.covariance(blocks_of(fitter.problem))
+    if not selection.selected:
+        return covariance, {}
+    covariance = _with_samples(fitter, fit, covariance)
+    times: Times = {}
+    for effect in fit.effects:
+        for spec in filter(is_time_of_run, effect.parameters):
+            for recording in dict.fromkeys(each.recording or 0 for each in fit.hypothesis.parameters_of(effect)):
+                found = fitter.time_interval(fit, effect, spec.name, recording)
+                times[effect.name, recording, spec.name] = found
+                covariance = covariance + fitter.moved_by_time(fit, effect, spec.name, recording, found[1:])
+    return covariance, times
+
+
+def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
+    """A covariance (n, n) with what fits to made-up recordings are off by, and scatter beyond it."""
+    steps = np.array(
+        [fitter.step_of(other, seen, left, fit) for other, seen, left in made_up(fitter.problem, fit, MADE_UP)]
+    )
+    std = np.sqrt(np.diag(covariance))
+    off, scatter = steps.mean(axis=0), steps.std(axis=0, ddof=1) / std
+    off = np.where(np.abs(off) > OFF_BY * std, HALF_WAY * off, 0.0)
+    grown = np.where(scatter > SCATTER, scatter, 1.0)
+    return np.asarray(covariance * np.outer(grown, grown) + np.outer(off, off))

@@ -1,0 +1,120 @@
+"""Where the DVL's clock leaps: how late its stamps are in each part of a run, looked for over all delays at once.
+
+Columns of a leap are straight lines about the delays of a fit. With leaps of seconds these lie between those of the
+parts, where a straight line tells of none of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.frames import Array
+from ..effects.base import ActsOn, Effect
+from .clock_or_arm import ARM
+from .composed import Hypothesis, Values
+from .fitting import Fit, Fitter
+from .settings import SETTINGS
+
+LEAP, DVL_CLOCK = "time_offset_jump", "dvl_time_offset"
+# Effects of time, of which one is wrong where a clock leaps, and of these such as stand in for a leap
+OF_TIME = (DVL_CLOCK, "reference_time_offset", "attitude_time_offset", "reference_lag", "clock_drift", LEAP)
+STANDS_IN = (DVL_CLOCK, "clock_drift", LEAP)
+# Delays that are tried, s, about those of the fit; parts of the run between which one leap may lie
+DELAYS = np.arange(-4.0, 4.01, 0.25)
+PARTS = 60
+# Squares of white noise that a leap takes off, from which on it is fitted, and a delay that is none, s
+WORTH_FITTING, NO_DELAY = 40.0, 0.13
+
+
+@dataclass(frozen=True)
+class Delays:
+    """How late the DVL is, s, in one part of the run after another, and where (part) each but the first begins."""
+
+    seconds: tuple[float, ...]
+    begins: tuple[int, ...]
+
+
+def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]) -> list[Hypothesis]:
+    """Hypotheses with the leaps that the delays of parts of one recording show, in place of what stands in for them.
+
+    once, every: effects, with a leap that happens once, and twice. None without an effect of time in the fit.
+    """
+    present = {effect.name for effect in fit.effects}
+    if len(fit.seen) > 1 or LEAP not in once or not present & {*OF_TIME}:
+        return []
+    rest = [effect for effect in fit.effects if effect.name not in STANDS_IN]
+    squares, ends = _squares(fitter, fit, rest, every[DVL_CLOCK])
+    found = _found(squares)
+    if not found.begins:
+        return []
+    times = [_time(fitter, ends, part, late) for part, late in zip(found.begins, found.seconds[1:], strict=True)]
+    steps = np.diff(found.seconds).tolist()
+    values = {"seconds": steps[0], "at_s": times[0]}
+    if len(steps) > 1:
+        values |= {"again_seconds": steps[1], "again_at_s": max(times[1], times[0])}
+    leap = every[LEAP] if len(steps) > 1 else once[LEAP]
+    return _hypotheses(fit, rest, once, leap, values, found.seconds[0])
+
+
+def _hypotheses(
+    fit: Fit, rest: Sequence[Effect], once: Mapping[str, Effect], leap: Effect, values: Values, before: float
+) -> list[Hypothesis]:
+    """With a leap and, before it, a clock that is late and one that is not; beside all else, and what is usual."""
+    usual = [effect for effect in rest if effect.name in (*OF_TIME, ARM)]
+    if ARM in once and ARM not in {effect.name for effect in usual}:
+        usual.append(once[ARM])
+    made: dict[frozenset[str], Hypothesis] = {}
+    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > NO_DELAY and DVL_CLOCK in once else [{}]
+    for others, clock in itertools.product((list(rest), usual), clocks):
+        effects = [*others, *(once[name] for name in clock), leap]
+        start: dict[str, tuple[Values, ...]] = {leap.name: (values,)}
+        start |= {name: ({"seconds": seconds},) for name, seconds in clock.items()}
+        if len(effects) <= SETTINGS.max_effects:
+            names = frozenset(effect.name for effect in effects)
+            made.setdefault(names, fit.hypothesis.with_effects(effects, 1, start))
+    return list(made.values())
+
+
+def _squares(fitter: Fitter, fit: Fit, rest: Sequence[Effect], clock: Effect) -> tuple[Array, Array]:
+    """(D, P) whitened squares that each delay leaves in each part of the run, and the (P,) last bins of these."""
+    white = fit.noise.white
+    ends = np.linspace(0, len(fit.residual), PARTS + 1).astype(int)
+    squares = np.zeros((len(DELAYS), PARTS))
+    for number, seconds in enumerate(DELAYS.tolist()):
+        tried = fit.hypothesis.with_effects([*rest, clock], 1, {clock.name: ({"seconds": seconds},)})
+        each = white.whiten(fitter.evaluated(tried)[1]).reshape(len(fit.residual), -1)
+        squares[number] = np.add.reduceat((each**2).sum(axis=1), ends[:-1])
+    return squares, ends[1:]
+
+
+def _found(squares: Array) -> Delays:
+    """The delays with no leap, one or two: with as many as each takes off enough."""
+    until = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
+    n = squares.shape[1]
+
+    def best(a: int, b: int) -> tuple[float, int]:
+        left = until[:, b] - until[:, a]
+        return float(left.min()), int(left.argmin())
+
+    none = best(0, n)
+    one = min((best(0, m)[0] + best(m, n)[0], m) for m in range(1, n))
+    two = min((best(0, m)[0] + best(m, k)[0] + best(k, n)[0], m, k) for m, k in itertools.combinations(range(1, n), 2))
+    edges = [0, n]
+    if one[0] - two[0] > WORTH_FITTING and none[0] - two[0] > 2.0 * WORTH_FITTING:
+        edges = [0, two[1], two[2], n]
+    elif none[0] - one[0] > WORTH_FITTING:
+        edges = [0, one[1], n]
+    delays = tuple(float(DELAYS[best(a, b)[1]]) for a, b in itertools.pairwise(edges))
+    return Delays(delays, tuple(edges[1:-1]))
+
+
+def _time(fitter: Fitter, ends: Array, part: int, late: float) -> float:
+    """When a part begins, s of the run by a true clock, in which the DVL is late."""
+    problem = fitter.problem
+    (grid,) = problem.grids
+    at = float(problem.time[min(int(ends[part - 1]), len(problem.time) - 1)])
+    return max(0.0, at + grid.late - late) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, at)
