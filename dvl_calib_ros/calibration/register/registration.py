@@ -44,6 +44,9 @@ SAID_FROM_S = 0.1
 # So many σ from which a clock is said to be off. In chi-square: what one more clock that is off has to gain, and by how
 # much the next explanation has to be worse to be ruled out.
 SIGMAS, ONE_MORE, TOLD_APART = 4.0, 12.0, 8.0
+# ... and for a calibration to be refused that has it in time, where σ holds as much: the same streams, cut and thinned
+# otherwise, differ by so much that what was not taken off of all of them may be told apart in what was calibrated with.
+REFUSED_FROM = 16.0
 # In chi-square: what clocks in time may cost for no other explanation to be tried.
 NO_DOUBT = 3.0
 # Places whose misfit is so much more than the best one's are none: of it, and a share of the squares.
@@ -99,7 +102,8 @@ class Registration:
     unsteady: a clock that drifts or leaps beside the others; all else is what holds with that taken off.
     open_late: σ (s) of the reference's clock by the data alone; open_by: (7,) by how much the DVL's turn (rad, body),
     the lever arm (m) and the DVL's delay (s) are others for each second of it. turn_open: (3,) rad, body, what it
-    leaves open of the turn where the lever arm is as told.
+    leaves open of the turn where the lever arm is as told. next_worse: by how much (chi-square) the next explanation is
+    worse than the one that is taken.
     """
 
     dvl: Clock
@@ -120,6 +124,7 @@ class Registration:
     open_late: float
     open_by: Array
     turn_open: Array
+    next_worse: float
     unsteady: Unsteady | None = None
 
     @property
@@ -165,13 +170,17 @@ class Registration:
         if self.unsteady is not None:
             return self.unsteady.reason
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
-        if not clock.is_shown:
+        if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
             return self.not_told_apart
         offset = round(getattr(parameters, name) + clock.late, 2)
         off = {"seconds": abs(clock.late), "way": _way(clock), "parameter": name, "offset": offset}
         if clock is self.reference and self.dvl.is_shown:
             return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.late), dvl_way=_way(self.dvl), **off)
         return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
+
+    def _holds(self, clock: Clock) -> bool:
+        """Whether σ of a calibration with a clock in time holds that it is late by so much."""
+        return bool(self.left_open.any()) and abs(clock.late) < FAR_OPEN * _with_prior(self.open_late)
 
     @property
     def not_told_apart(self) -> Reason | None:
@@ -215,11 +224,11 @@ def _registered(
             return seen
         # fewer references show less of a clock
         free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
-        return (
-            seen
-            if free is None or not _is_possible(free)
-            else replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
-        )
+        if free is None or not _is_possible(free):
+            return seen
+        if _held(fit, free, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))[1] < NO_DOUBT:
+            return replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
+        best = free
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
     return None if best is None or not _is_possible(best) else _explained(fit, best, rotation_body_from_dvl, lever_arm)
 
@@ -266,11 +275,10 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # that both are off holds either one, and is no other cause
-    is_told_apart = (
-        min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost > TOLD_APART
-    )
+    next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
     if best is None or cost > 2.0 * ONE_MORE:
-        likeliest, best, is_told_apart = _Off.BOTH, free, True
+        likeliest, best, next_worse = _Off.BOTH, free, math.inf
+    is_told_apart = next_worse > TOLD_APART
     x, p = best.x, best.p
     late = 0.0 if likeliest in (_Off.NONE, _Off.DVL) else float(x[LATE])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
@@ -290,6 +298,7 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
         left=best.left,
         spread=best.level,
         speed=best.speed,
+        next_worse=next_worse,
         **_open(fit, free, late, rotation),
     )
 

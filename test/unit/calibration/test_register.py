@@ -378,6 +378,22 @@ def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_a_calibrati
     assert found.contradiction(Parameters()) == found.not_told_apart
 
 
+@pytest.mark.parametrize(
+    ("late", "next_worse", "code"), [(0.2, 10.0, None), (0.2, 17.0, "CLOCK_LATE"), (0.5, 10.0, "CLOCK_LATE")]
+)
+def test_a_clock_that_is_told_apart_by_little_is_no_reason_against_a_calibration_whose_sigma_holds_it(
+    late, next_worse, code
+):
+    """Of all streams it was not told apart, so not taken off; of what was calibrated with it was, and rejected."""
+    in_time, arm = Clock(0.0, 0.1, False), np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    clocks = {"dvl": in_time, "imu": in_time, "reference": Clock(late, 0.02, True)}
+    found = replace(registered("box", 5.0), **clocks, open_late=0.15, open_by=arm, next_worse=next_worse)
+    said = found.contradiction(Parameters())
+    assert (said.code if said else None) == code
+    without = replace(found, open_by=np.zeros(7)).contradiction(Parameters())
+    assert without is not None and without.code == "CLOCK_LATE"
+
+
 def test_a_clock_that_a_steady_turn_hides_leaves_its_yaw_open_and_one_that_turns_show_does_not():
     """Of yaw and clock a steady turn shows the sum, by 0.1 rad/s, and the clock hardly; it was found 0.4 s late."""
     information = np.eye(N) * 1e6
