@@ -72,7 +72,8 @@ LEFT_TO_CALIBRATION_S = 2.5
 ALIKE_S = 0.1
 # A reference's clock of which nobody says anything is in time to this, s (σ): receivers and filters are late by tenths.
 IN_TIME_STD_S = 0.5
-# Farther off than so many times that no place of the data says what one in time leaves open.
+# A clock that stays in time, though the data have it farther off than so many σ, is open by that. Farther off than so
+# many times what is known of one in time no place of the data says what that leaves open.
 FAR_OPEN = 2.0
 # What it leaves open of a lever arm is none to speak of below this, m (σ).
 OPEN_FROM_M = 0.03
@@ -280,7 +281,9 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
         likeliest, best, next_worse = _Off.BOTH, free, math.inf
     is_told_apart = next_worse > TOLD_APART
     x, p = best.x, best.p
-    late = 0.0 if likeliest in (_Off.NONE, _Off.DVL) else float(x[LATE])
+    # what is not shown stays in time, and σ has to hold it
+    stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_told_apart and _is_off(best, LATE))
+    late = 0.0 if stays else float(x[LATE])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
         dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and is_beyond_doubt(best.dvl_late, best.dvl_std)),
@@ -308,6 +311,8 @@ def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> 
     if not fit.is_turned:
         return {"open_late": 0.0, "open_by": np.zeros(7), "turn_open": np.zeros(3)}
     std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
+    if off > FAR_OPEN * std and late == 0.0:
+        std = off
     if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
         # as good as in time, and so far away that it turns another arm there
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))

@@ -12,6 +12,7 @@ import pytest
 from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.register import registration
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.register.configuration import fitting_configuration
 from dvl_calib_ros.calibration.register.curves import Curves
@@ -320,6 +321,16 @@ def test_an_imu_too_little_late_to_be_shown_is_in_the_arm(late):
     assert found.offsets == {}
     std = np.hypot(found.lever_arm_std, np.sqrt(np.diag(found.left_open))[3:6])
     assert (np.abs(found.lever_arm - [ARM, 0.0, 0.0]) < 2.5 * std).all() and std[0] < 0.06
+
+
+def test_a_clock_that_is_not_told_apart_stays_in_time_and_is_open_by_what_the_data_have_it_late(monkeypatch):
+    """An IMU 0.15 s late made an arm of 0.60 m ± 0.06 of one of 0.80, accepted: which clock was off was not told apart,
+    and σ was that of a clock that had been taken off."""
+    assert registered("free", 5.0, imu=0.3).open_late < 0.1
+    monkeypatch.setattr(registration, "TOLD_APART", 1e9)
+    found = registered("free", 5.0, imu=0.3)
+    assert found.offsets == {} and found.open_late == pytest.approx(0.3, abs=0.1)
+    assert np.sqrt(found.left_open[3, 3]) == pytest.approx(abs(found.open_by[3]) * 0.25, rel=0.3)
 
 
 def test_where_the_clock_shows_nothing_of_the_arm_is_open():
