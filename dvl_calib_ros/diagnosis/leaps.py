@@ -23,9 +23,10 @@ LEAP, DVL_CLOCK = "time_offset_jump", "dvl_time_offset"
 # Effects of time, of which one is wrong where a clock leaps, and of these such as stand in for a leap
 OF_TIME = (DVL_CLOCK, "reference_time_offset", "attitude_time_offset", "reference_lag", "clock_drift", LEAP)
 STANDS_IN = (DVL_CLOCK, "clock_drift", LEAP)
-# Delays that are tried, s, about those of the fit; parts of the run between which one leap may lie
+# Delays that are tried, s, about those of the fit; parts of the run between which one leap may lie, and of how many of
+# them a delay is, or it is not to be told from how a run begins or ends
 DELAYS = np.arange(-4.0, 4.01, 0.25)
-PARTS = 60
+PARTS, FEWEST_PARTS = 60, 3
 # Squares of white noise that a leap takes off, from which on it is fitted, and a delay that is none, s
 WORTH_FITTING, NO_DELAY = 40.0, 0.13
 
@@ -101,8 +102,13 @@ def _found(squares: Array) -> Delays:
         return float(left.min()), int(left.argmin())
 
     none = best(0, n)
-    one = min((best(0, m)[0] + best(m, n)[0], m) for m in range(1, n))
-    two = min((best(0, m)[0] + best(m, k)[0] + best(k, n)[0], m, k) for m, k in itertools.combinations(range(1, n), 2))
+    places = range(FEWEST_PARTS, n - FEWEST_PARTS + 1)
+    one = min((best(0, m)[0] + best(m, n)[0], m) for m in places)
+    two = min(
+        (best(0, m)[0] + best(m, k)[0] + best(k, n)[0], m, k)
+        for m, k in itertools.combinations(places, 2)
+        if k - m >= FEWEST_PARTS
+    )
     edges = [0, n]
     if one[0] - two[0] > WORTH_FITTING and none[0] - two[0] > 2.0 * WORTH_FITTING:
         edges = [0, two[1], two[2], n]

@@ -22,6 +22,8 @@ from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
 from dvl_calib_ros.diagnosis.holm import holm
+from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays
+from dvl_calib_ros.diagnosis.leaps import _found as _delays
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
@@ -255,6 +257,19 @@ def test_leaps_of_seconds_are_found_beside_a_lag_and_a_clock_that_is_late_before
     assert set(found(diagnosis)) == {text.split(":")[0] for text in effects}
     assert_within(diagnosis, "dvl_time_offset", seconds=-1.71)
     assert_within(diagnosis, "time_offset_jump", seconds=-1.68, again_seconds=-1.99)
+
+
+def test_how_a_run_begins_or_ends_is_no_leap():
+    """A twin of a DVL that is early lacks the first half second: T13's, put right, had a leap at 1.9 s for its clock."""
+    late, leapt = int(np.argmin(np.abs(DELAYS + 0.5))), int(np.argmin(np.abs(DELAYS - 1.0)))
+    squares = np.full((len(DELAYS), PARTS), 100.0)
+    squares[late] = 1.0
+    for part in (0, PARTS - 1):
+        odd = squares.copy()
+        odd[late, part], odd[leapt, part] = 100.0, 1.0
+        assert _delays(odd) == Delays((-0.5,), ())
+    squares[late, 20:], squares[leapt, 20:] = 100.0, 1.0
+    assert _delays(squares) == Delays((-0.5, 1.0), (20,))
 
 
 def test_a_clock_that_is_late_before_it_leaps_is_no_ghost_of_the_leap_unless_it_is_next_to_nothing():
