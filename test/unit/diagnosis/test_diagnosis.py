@@ -260,7 +260,7 @@ def test_leaps_of_seconds_are_found_beside_a_lag_and_a_clock_that_is_late_before
 
 
 def test_how_a_run_begins_or_ends_is_no_leap():
-    """A twin of a DVL that is early lacks the first half second: T13's, put right, had a leap at 1.9 s for its clock."""
+    """A twin of a DVL that is early lacks its first half second: of T13 a leap at 1.9 s was named for the clock."""
     late, leapt = int(np.argmin(np.abs(DELAYS + 0.5))), int(np.argmin(np.abs(DELAYS - 1.0)))
     squares = np.full((len(DELAYS), PARTS), 100.0)
     squares[late] = 1.0
