@@ -39,9 +39,10 @@ TILT_S = 1.0, 15.0
 BEND_S = 1.0
 # Stretches, s, by whose scatter σ is found; fewer say nothing.
 STRETCH_S, ENOUGH = 15.0, 12
-# So many σ are no chance; of a bias, whose σ holds all else that is likely, fewer (of 300 combinations without one none
+# So many σ are no chance; of smoothing, whose σ knows how few turns show it, fewer (of 197 surveys without any none
+# had more than 3.3); of a bias, whose σ holds all else that is likely, fewer (of 300 combinations without one none
 # had more than 3.6), and from fewer still it is named.
-SURELY, SURELY_BIASED, NAMED_FROM = 6.0, 4.2, 3.7
+SURELY, SURELY_SMOOTHED, SURELY_BIASED, NAMED_FROM = 6.0, 5.0, 4.2, 3.7
 # Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s), and of the
 # heading (rad), which turns about the vertical of the earth: not as a yaw does where the vehicle leans; and errors of
 # the heading that change with it, once and twice around (rad), which look like a bias, but not like what is quick.
@@ -274,7 +275,8 @@ def left_over_advice(
     if is_filter and lags_so and is_nil and found.smoothed > FILTER_SHOWN * found.smoothed_std:
         return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
     is_ours = of_positions and found.smoothed > 0.0
-    if abs(found.smoothed) > SURELY * found.smoothed_std and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
+    is_smoothed = abs(found.smoothed) > SURELY_SMOOTHED * found.smoothed_std
+    if is_smoothed and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
         word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
         # what else it follows then comes of that
         return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(word)]
