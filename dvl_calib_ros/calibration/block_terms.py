@@ -103,9 +103,9 @@ def _heading_terms(
     one = np.ones(len(share))
     of_term = np.column_stack([north, east, 2.0 * north * east, east**2 - north**2, seconds * one, one])
     vertical = cross(earth_in_body[:, :, 0], earth_in_body[:, :, 1]) @ dvl_from_body.T
-    turned = (share[:, None] * vertical).T @ of_term
-    # of v × u the least squares misalignment: [Σ |v|² I - v vᵀ]⁻¹ Σ (|v|² u - v vᵀ u)
     each = share[:, None] * of_term
+    turned = vertical.T @ each
+    # of v × u the least squares misalignment: [Σ |v|² I - v vᵀ]⁻¹ Σ (|v|² u - v vᵀ u)
     square = (velocity_dvl * velocity_dvl).sum(axis=-1)
     along = (velocity_dvl * vertical).sum(axis=-1)
     across = velocity_dvl.swapaxes(-1, -2)
