@@ -11,7 +11,7 @@ from ..calibration.frames import Array
 from ..calibration.samples import Index
 from ..effects.base import Effect
 from .composed import Values
-from .fitting import Fit, Fitter
+from .fitting import OF_INTERVAL, Fit, Fitter
 from .registered import FirstGuess
 from .settings import SETTINGS
 
@@ -123,4 +123,4 @@ def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     arm, speed = at[ARM, name], speeds[name]
     value = float(vector[arm] - speed * vector[delay])
     std = float(np.sqrt(max(covariance[arm, arm] - speed**2 * covariance[delay, delay], 0.0)))
-    return Combination(name, clock, speed, (value, value - 1.96 * std, value + 1.96 * std))
+    return Combination(name, clock, speed, (value, value - OF_INTERVAL * std, value + OF_INTERVAL * std))

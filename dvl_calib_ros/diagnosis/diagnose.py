@@ -24,7 +24,7 @@ from .clock_or_arm import ARM, CLOCKS, Combination, combination
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
-from .fitting import Fit, prior_std
+from .fitting import OF_INTERVAL, Fit, prior_std
 from .intervals import Times, Triple, covariance_of
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
@@ -152,7 +152,7 @@ def _check_bounds(selection: EffectSelection) -> None:
 
 
 def _interval(value: float, std: float) -> Triple:
-    return value, value - 1.96 * std, value + 1.96 * std
+    return value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
 
 
 def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:

@@ -15,7 +15,7 @@ from ..calibration.robust import robust_std
 from .claims import claims_of, followed, stretches_of
 from .closure import claimed_std, high_frequency_variance
 from .composed import Problem
-from .fitting import Fit, Fitter
+from .fitting import OF_INTERVAL, Fit, Fitter
 from .holm import holm
 from .levels import SIGNIFICANT, fit_claims, fit_level
 from .made_up import made_up
@@ -144,7 +144,7 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
         error = 0.5 * error
         if ratio > INFLATION:
             p = float(2.0 * normal_sf(np.log(ratio) / error))
-            low, high = float(ratio * np.exp(-1.96 * error)), float(ratio * np.exp(1.96 * error))
+            low, high = float(ratio * np.exp(-OF_INTERVAL * error)), float(ratio * np.exp(OF_INTERVAL * error))
             found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
     names, log_claims = claims_of(problem, fit.seen, fit.noise.rotation)
     even = innovations * fit.noise.level
@@ -156,8 +156,8 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
         parameters = {
             units[name]: (
                 float(slope),
-                float(slope - 1.96 * abs(slope) / z_of),
-                float(slope + 1.96 * abs(slope) / z_of),
+                float(slope - OF_INTERVAL * abs(slope) / z_of),
+                float(slope + OF_INTERVAL * abs(slope) / z_of),
             )
             for name, slope, z_of, p in zip(level.names, level.slopes, z, level.p_of, strict=True)
             if p < LEVEL
@@ -177,6 +177,6 @@ def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFindin
         return None
     parameters, p_values = {}, []
     for name, value, std in zip(found.names, found.exponents.tolist(), found.stds.tolist(), strict=True):
-        parameters[f"{name}_exponent"] = value, value - 1.96 * std, value + 1.96 * std
+        parameters[f"{name}_exponent"] = value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
         p_values.append(2.0 * float(normal_sf(abs(value - (0.0 if value > HALF else 1.0)) / std)))
     return NoiseFinding("reported_covariance", parameters, float(min(1.0, len(p_values) * min(p_values))))

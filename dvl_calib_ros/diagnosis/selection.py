@@ -23,7 +23,7 @@ from .clock_or_arm import ARM, guessed_arm, is_open, with_arm, with_clocks
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
-from .leaps import LEAP, leaping
+from .leaps import CLOCKS, DVL_CLOCK, LEAP, leaping
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
@@ -334,9 +334,6 @@ def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[H
     return [_hypothesis(fitter, fit, table, chosen) for chosen in worth] + _told_by_other_clocks(fitter, fit, effects)
 
 
-CLOCKS = ("dvl_time_offset", "reference_time_offset", "attitude_time_offset")
-
-
 def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
     """Of three clocks only two differences matter: what any two say is told by those of DVL and reference."""
     names = {table.variants[index].effect.name for index in chosen}
@@ -618,7 +615,7 @@ def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
 
     It tells of the time before the leap alone, which may be short, and so of little of what all of them explain.
     """
-    if effect.name != CLOCKS[0] or LEAP not in fit.values:
+    if effect.name != DVL_CLOCK or LEAP not in fit.values:
         return False
     late, leap = fit.values[effect.name], fit.values[LEAP]
     return any(

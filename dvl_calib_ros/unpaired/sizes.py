@@ -18,7 +18,8 @@ from scipy.stats import norm, t
 from ..calibration.frames import Array
 from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
 from ..diagnosis.fitting import Fit
-from ..diagnosis.selection import CLOCKS, EffectSelection, blocks_of
+from ..diagnosis.leaps import CLOCKS
+from ..diagnosis.selection import EffectSelection, blocks_of
 from ..diagnosis.where import BANDS_HZ, regimes
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
