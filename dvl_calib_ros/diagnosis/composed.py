@@ -151,7 +151,7 @@ class Seen:
 
     def compared(self, body: Array) -> Array:
         """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
-        return self.projection @ body if body.ndim > 2 else (self.projection @ body[..., None])[..., 0]
+        return self.projection @ body if body.ndim > 2 else _turned(self.projection, body)
 
 
 @dataclass(frozen=True)
@@ -499,8 +499,10 @@ def _undone(
 
 
 def _turned(matrix: Array, values: Array) -> Array:
-    """(N, 3) values, multiplied by one matrix (3, 3) or by one each (N, 3, 3)."""
-    return values @ matrix.T if matrix.ndim == 2 else np.asarray(np.einsum("nij,nj->ni", matrix, values))
+    """(N, 3) values, multiplied by one matrix (3, 3), (1, 3, 3) or by one each (N, 3, 3)."""
+    if matrix.ndim == 2 or len(matrix) == 1:
+        return values @ (matrix if matrix.ndim == 2 else matrix[0]).T
+    return np.asarray(np.einsum("nij,nj->ni", matrix, values))
 
 
 def _by_turn(hypothesis: Hypothesis, seen: Seen) -> Array:

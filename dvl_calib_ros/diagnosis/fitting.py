@@ -111,6 +111,16 @@ class Fit:
 
 
 @dataclass(frozen=True)
+class _Looked:
+    """A hypothesis as it is looked at under a noise: seen, residual and columns as of a `Fit`; system of its step."""
+
+    seen: tuple[Seen, ...]
+    residual: Array
+    columns: Array
+    system: WhitenedLeastSquares
+
+
+@dataclass(frozen=True)
 class Fitter:
     """Fits hypotheses to one problem. outliers: (M, A) m/s, taken off the residual. held: (M,) bins not to be seen."""
 
@@ -146,6 +156,15 @@ class Fitter:
         parts += [problem.columns(hypothesis, seen, e, hypothesis.values[e.name]) for e in hypothesis.effects]
         return np.concatenate(parts, axis=2)
 
+    def _looked(
+        self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
+    ) -> _Looked:
+        """seen, residual: where they are known already."""
+        if seen is None or residual is None:
+            seen, residual = self.evaluated(hypothesis)
+        columns = self.columns(hypothesis, seen)
+        return _Looked(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
+
     def _white(self, noise: Noise, values: Array) -> Array:
         white = noise.whiten(values)
         if self.held is not None:
@@ -164,22 +183,23 @@ class Fitter:
         only_of_the_day: bool = False,
         fixed: frozenset[str] = frozenset(),
         careful: bool = False,
+        looked: _Looked | None = None,
     ) -> Fit:
         """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept.
 
         fixed: names of effects whose values are kept. careful: the last step, with what noise makes in the columns
         taken off, is not one that was just seen to make it worse, as at the kink of a slow attitude. Where a fit is
-        stuck far from the best, that step is what takes it out.
+        stuck far from the best, that step is what takes it out. looked: at the start, where that is done already.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
         kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
-        seen, residual = self.evaluated(hypothesis)
+        seen, residual = self.evaluated(hypothesis) if looked is None else (looked.seen, looked.residual)
         misfit = self._misfit(noise, residual, hypothesis)
         length, before, moved = 1.0, np.zeros(len(kept)), True
         for _ in range(max_steps):
-            columns = self.columns(hypothesis, seen)
-            system = self._system(noise, columns, residual, hypothesis)
+            looked = looked or self._looked(hypothesis, noise, seen, residual)
+            system = looked.system
             free = np.flatnonzero(~kept)
             step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
             step[free] = system.part(free).solution() if len(free) else 0.0
@@ -195,12 +215,12 @@ class Fitter:
                 tried = 0.4 * tried
             if not moved:
                 break
-            gained = misfit - trial_misfit
+            gained, looked = misfit - trial_misfit, None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
             if np.abs(step / std).max() < STANDS_STILL or gained < GAINS_NOTHING:
                 break
-        columns = self.columns(hypothesis, seen)
-        plain = self._system(noise, columns, residual, hypothesis)
+        looked = looked or self._looked(hypothesis, noise, seen, residual)
+        columns, plain = looked.columns, looked.system
         system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
         free = np.flatnonzero(~kept)
         if len(free):
@@ -309,23 +329,22 @@ class Fitter:
                 continue
             moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
             hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
-            if self._is_surely_worse(hypothesis, fit.noise, fit.deviance):
+            looked = self._looked(hypothesis, fit.noise)
+            if self._is_surely_worse(hypothesis, looked, fit.noise, fit.deviance):
                 continue
-            trial = self.fit(hypothesis, fit.noise, 3)
+            trial = self.fit(hypothesis, fit.noise, 3, looked=looked)
             if trial.deviance < fit.deviance:
                 fit = trial
         return fit
 
-    def _is_surely_worse(self, hypothesis: Hypothesis, noise: Noise, deviance: float) -> bool:
+    def _is_surely_worse(self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float) -> bool:
         """Whether a hypothesis, fitted, would have a larger deviance, as one straight step tells well enough.
 
         The deviance at which that step would end is the least there is, but for what is bent.
         """
-        seen, residual = self.evaluated(hypothesis)
-        system = self._system(noise, self.columns(hypothesis, seen), residual, hypothesis)
-        own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
-        least = system.misfit(system.solution())
-        gained = self._misfit(noise, residual, hypothesis) - least
+        own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
+        least = looked.system.misfit(looked.system.solution())
+        gained = self._misfit(noise, looked.residual, hypothesis) - least
         return least - float(own_noise @ own_noise) > deviance + SURELY + BENT * gained
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
@@ -340,10 +359,13 @@ class Fitter:
             while 0.0 <= (at := value + sign * step) <= seconds:
                 moved = _with_time(fit, effect, name, recording, at)
                 worse = fit.deviance + float(chi2_isf(0.05, 1))
-                if self._is_surely_worse(moved, fit.noise, worse) or self.fit(moved, fit.noise, 2).deviance > worse:
-                    as_good.append(at)  # the first that is worse bounds those that are as good
+                looked = self._looked(moved, fit.noise)
+                as_good.append(at)  # the first that is worse bounds those that are as good
+                if (
+                    self._is_surely_worse(moved, looked, fit.noise, worse)
+                    or self.fit(moved, fit.noise, 2, looked=looked).deviance > worse
+                ):
                     break
-                as_good.append(at)
                 step *= 1.6
         return value, min(as_good), max(as_good)
 

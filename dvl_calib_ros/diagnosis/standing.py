@@ -20,6 +20,8 @@ WEAK = 1e-3
 # Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
 # not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
 FAINT, BORNE_OUT = 200.0, 0.25
+# Deviance by which a bound on another may be off as numbers are rounded
+ROUNDING = 1e-3
 
 
 def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection, Unexplained]:
@@ -35,13 +37,13 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
         kept = [effect for effect in fit.effects if effect.name not in names]
         reduced = fitter.fit(fit.hypothesis.with_effects(kept, len(fit.seen), {}), fit.noise)
         drop = reduced.deviance - fit.deviance
-        if drop > SETTINGS.instead_of or not (other := unexplained(fitter, reduced)).found:
+        if drop > SETTINGS.instead_of:
             continue
-        paid = sum(price(effect, n_tested, len(fit.seen)) for effect in out)
-        gain = (other.clear_energy - other.price) - (drop - paid)
-        if gain < SETTINGS.indistinguishable + SETTINGS.instead_share * drop or not matters(
-            fitter.problem, reduced, other
-        ):
+        lost = drop - sum(price(effect, n_tested, len(fit.seen)) for effect in out)
+        wanted = SETTINGS.indistinguishable + SETTINGS.instead_share * drop
+        other = unexplained(fitter, reduced, asked=wanted + lost - ROUNDING)
+        gain = (other.clear_energy - other.price) - lost
+        if not other.found or gain < wanted or not matters(fitter.problem, reduced, other):
             continue
         if best is None or gain > best[0]:
             chosen = tuple(each for each in selection.selected if each.effect.name not in names)

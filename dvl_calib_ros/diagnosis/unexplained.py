@@ -71,27 +71,39 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
+def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
     """Look for what the residual of a fit still follows.
 
-    What is found is held against made-up recordings: in these nothing but the fit is there.
+    What is found is held against made-up recordings: in these nothing but the fit is there. asked: by how much it has
+    to be clearer than its price to be of use; where that cannot be, nothing is found, and at once.
     """
     problem, noise = fitter.problem, fit.noise
     looks, white, raw = _looked(fitter, fit, problem, fit.seen, fit.residual)
+    nothing = raw["time"][:, :, :0]
     followed = lines(problem, white.reshape(-1, problem.axes))
+    tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
+    known = _orthonormal(noise.whiten(fit.columns))
+    if asked > -np.inf:
+        most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
+        for line in followed:
+            waves = _along_axes(line.waves, problem.axes)
+            energy = explained(known, noise.whiten(waves), white, 1.0)[1]
+            most.append((energy + waves.shape[2], waves.shape[2]))
+        prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
+        if max(each - prices[columns] for each, columns in most) < asked:
+            return Unexplained(0.0, 0.0, "", nothing, nothing)
     recoloured: list[FollowTest] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
         for name, columns in raw.items():
             if name != "time":
                 drop, rank, _ = _recoloured(noise, fit.columns, columns, fit.residual)
                 recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
-    looked_at = float(np.log(len(looks) + len(followed) + len(recoloured)))
+    looked_at = float(np.log(tested))
     nominal = [
         *(look.log_p() for look in looks),
         *(line.log_p for line in followed),
         *(each.log_p() for each in recoloured),
     ]
-    nothing = raw["time"][:, :, :0]
     if min(nominal) + looked_at > np.log(LEVEL):
         return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
     grown = _grown(fitter, fit, looks)
@@ -116,11 +128,16 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    clear_energy = explained(_orthonormal(noise.whiten(fit.columns)), noise.whiten(best[2]), white, 1.0)[1]
+    clear_energy = explained(known, noise.whiten(best[2]), white, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
-    cost = float(chi2_isf(LEVEL / np.exp(looked_at), best[2].shape[2]))
+    cost = _price(tested, best[2].shape[2])
     found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
+
+
+def _price(tested: int, columns: int) -> float:
+    """What the best of so many tests of so many columns explains by chance, once in 1 / LEVEL recordings."""
+    return float(chi2_isf(LEVEL / tested, columns))
 
 
 def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:

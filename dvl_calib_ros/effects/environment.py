@@ -40,9 +40,10 @@ class WaterLock(Effect):
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """R_body_from_enu c while from_s <= t < to_s."""
-        current_enu = np.array([values["east_mps"], values["north_mps"], 0.0])
+        east, north = motion.attitude[:, 0], motion.attitude[:, 1]  # of each axis of the body
         locked = (motion.elapsed >= values["from_s"]) & (motion.elapsed < values["to_s"])
-        return locked[:, None] * (current_enu @ motion.attitude)
+        added: Array = values["east_mps"] * east + values["north_mps"] * north
+        return np.where(locked[:, None], added, 0.0)
 
 
 class HeadingError(Effect):

@@ -1,0 +1,48 @@
+"""What is not looked at twice, or not at all, changes no answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_diagnosis import fitted, scenario, with_added
+
+from dvl_calib_ros.diagnosis import unexplained as looking
+from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
+from dvl_calib_ros.diagnosis.fitting import Fitter
+from dvl_calib_ros.diagnosis.noise import white_noise
+from dvl_calib_ros.diagnosis.unexplained import unexplained
+from dvl_calib_ros.simulation.scenario import simulate
+
+
+@pytest.fixture(scope="module")
+def stepped():
+    """Fitter and fit, without any effect, of a run in which a bias steps by 3 cm/s."""
+    run = simulate(scenario("lawnmower", seconds=300.0, gnss_std=0.03))
+    recording = with_added(run, lambda time, _: 0.03 * np.outer(time > 200.0, [0.0, 1.0, 0.0]))
+    problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
+    fitter = Fitter(problem)
+    noise = white_noise(fitter.evaluated(no_effect())[1], problem.segments, None, problem.interval)
+    return fitter, fitter.fit(no_effect(), noise)
+
+
+def test_what_could_not_be_clear_enough_is_not_held_against_made_up_recordings(stepped, monkeypatch):
+    fitter, fit = stepped
+    whole = unexplained(fitter, fit)
+    excess = whole.clear_energy - whole.price
+    assert whole.found and excess > 20.0
+    asked = unexplained(fitter, fit, asked=excess)
+    assert asked.found and (asked.energy, asked.clear_energy, asked.about) == (
+        whole.energy,
+        whole.clear_energy,
+        whole.about,
+    )
+    monkeypatch.setattr(looking, "made_up", lambda *_: pytest.fail("asked for nothing"))
+    assert not unexplained(fitter, fit, asked=excess + 1000.0).found
+
+
+def test_a_fit_from_what_was_looked_at_already_is_the_same():
+    fitter, fit, start = fitted(scenario("lawnmower", seconds=120.0), {"lever_arm": {}, "dvl_time_offset": {}})
+    again = fitter.fit(start, fit.noise, looked=fitter._looked(start, fit.noise))
+    whole = fitter.fit(start, fit.noise)
+    assert again.deviance == whole.deviance
+    np.testing.assert_array_equal(again.hypothesis.vector(), whole.hypothesis.vector())
