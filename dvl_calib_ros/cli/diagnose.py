@@ -78,6 +78,7 @@ def run(arguments: argparse.Namespace) -> None:
             discovery.topics,
             on_progress,
             with_series=arguments.report is not None,
+            forget=True,
         )
 
     def answer() -> None:

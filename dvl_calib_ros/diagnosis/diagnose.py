@@ -60,9 +60,14 @@ def diagnose(
     on_progress: Callable[[float], None] = lambda _: None,
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
+    *,
+    forget: bool = False,
 ) -> Diagnosis:
-    """Diagnose bags of one vehicle. Raises InputError for what cannot be compared at all."""
-    loaded = load_recordings(source, parameters, topics or Topics())
+    """Diagnose bags of one vehicle. Raises InputError for what cannot be compared at all.
+
+    forget: as of `load_recordings`.
+    """
+    loaded = load_recordings(source, parameters, topics or Topics(), forget=forget)
     on_progress(0.5)
     diagnosis = diagnose_recordings(loaded.recordings, parameters, loaded.notes, effects, with_series)
     on_progress(1.0)

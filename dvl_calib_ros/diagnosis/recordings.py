@@ -149,17 +149,23 @@ def make_recording(
     time, velocity = dvl
     seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
-    repeats = int((np.diff(velocity, axis=0) == 0.0).all(axis=1).sum())
-    spikes = len(time) - len(_claiming(dvl, dvl_std).without_spikes().time) if len(time) > 1 else 0
+    repeats = int((velocity[1:] == velocity[:-1]).all(axis=1).sum())
 
-    def curve(stream: tuple[Array, Array] | None, std: Array | None = None, rate: float = rate) -> Curve | None:
+    def clean(stream: tuple[Array, Array] | None, std: Array | None = None) -> Curve | None:
         if stream is None or len(stream[0]) < 2:
             return None
-        return _claiming(stream, std).without_spikes().averaged(rate)
+        return _claiming(stream, std).without_spikes()
+
+    def curve(stream: tuple[Array, Array] | None, std: Array | None = None, rate: float = rate) -> Curve | None:
+        found = clean(stream, std)
+        return None if found is None else found.averaged(rate)
 
     if attitude is not None:
         attitude = attitude[0], _alike_in_sign(attitude[1])
-    dvl_curve = curve(dvl, dvl_std)
+    without_spikes = clean(dvl, dvl_std)
+    spikes = 0 if without_spikes is None else len(time) - len(without_spikes.time)
+    dvl_curve = None if without_spikes is None else without_spikes.averaged(rate)
+    del without_spikes
     of_dvl = SLOWEST_AVERAGE_HZ if dvl_curve is None else PER_DVL_SAMPLE / dvl_curve.interval
     reference_curve = curve(reference, reference_std, min(rate, max(of_dvl, SLOWEST_AVERAGE_HZ)))
     if dvl_curve is None or reference_curve is None:
@@ -221,8 +227,13 @@ class Loaded:
     notes: tuple[str, ...]
 
 
-def load_recordings(source: Opened | Sequence[Path], parameters: Parameters, topics: Topics) -> Loaded:
-    """The recordings of every bag. Raises InputError, also for a bag without a reference velocity."""
+def load_recordings(
+    source: Opened | Sequence[Path], parameters: Parameters, topics: Topics, *, forget: bool = False
+) -> Loaded:
+    """The recordings of every bag. Raises InputError, also for a bag without a reference velocity.
+
+    forget: let go of the messages of each, once its samples are taken (`Recording.forget`).
+    """
     paths = source.paths if isinstance(source, Opened) else source
     if len(set(paths)) < len(paths):
         raise InputError(f"{', '.join(map(str, paths))}: a bag is named twice")
@@ -232,13 +243,21 @@ def load_recordings(source: Opened | Sequence[Path], parameters: Parameters, top
     known: list[Recorded] = []
     for name, path, one in zip(recording_names(paths), paths, opened.each, strict=True):
         streams, own = _read(path, one, parameters, topics)
+        if len(paths) > 1:
+            dvl = one.recorded(topics.found_in(one.types).dvl, parameters)
+        if forget:
+            one.forget()
+        blocks = [*streams]
+        del streams  # `_recording` lets go of each as soon as it can
         registration = one.registration(topics, parameters)
-        recordings.append(replace(_recording(name, streams, parameters, own), registration=registration))
-        dvl = one.recorded(topics.found_in(one.types).dvl, parameters)
-        for other, its_path in zip(known, paths, strict=False):
-            if hold_the_same(dvl, other):
-                raise InputError(f"{its_path}, {path}: hold the same samples, so neither is held out; name one of them")
-        known.append(dvl)
+        recordings.append(replace(_recording(name, blocks, parameters, own), registration=registration))
+        if len(paths) > 1:
+            for other, its_path in zip(known, paths, strict=False):
+                if hold_the_same(dvl, other):
+                    raise InputError(
+                        f"{its_path}, {path}: hold the same samples, so neither is held out; name one of them"
+                    )
+            known.append(dvl)
         notes += own if len(paths) == 1 else [f"{path}: {note}" for note in own]
     return Loaded(tuple(recordings), tuple(notes))
 
@@ -289,29 +308,34 @@ def _unfit_positions(path: Path, msgtype: str, topic: str, velocities: Array) ->
     ]
 
 
-def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[str]) -> RecordedStreams:
+def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, notes: list[str]) -> RecordedStreams:
+    """blocks: of DVL, reference and IMU, which it takes out of the list."""
     clocks = Clocks.of(parameters)
-    dvl = _in_order(_valid(streams.dvl, parameters), parameters, notes)
+    given = blocks.pop(0)
+    dvl = _in_order(_valid(given, parameters), parameters, notes)
     if not len(dvl):
-        lost = Counter(streams.dvl.reasons[code - 1] for code in streams.dvl.refused.tolist() if code)
+        lost = Counter(given.reasons[code - 1] for code in given.refused.tolist() if code)
         listing = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "all invalid"
-        raise InputError(f"{name}: no valid DVL sample of {len(streams.dvl)}: {listing}")
+        raise InputError(f"{name}: no valid DVL sample of {len(given)}: {listing}")
     first_ns = int(dvl.stamps_ns[0])
-    reference = _in_order(_valid(streams.reference, parameters), parameters, notes)
+    given = blocks.pop(0)
+    reference = _in_order(_valid(given, parameters), parameters, notes)
     if not len(reference):
-        raise InputError(f"{name}: no valid reference velocity of {len(streams.reference)}; see gnss_frame, max_speed")
+        raise InputError(f"{name}: no valid reference velocity of {len(given)}; see gnss_frame, max_speed")
     code = int(reference.frames[0])
-    reference = reference.part(np.flatnonzero(reference.frames == code))
+    reference = _part(reference, reference.frames == code)
     dvl = _without_zeros(dvl, reference, notes)
     velocity, std, frame = reference.values, _std(reference.covariances), FRAMES[code]
     if frame is VelocityFrame.NED:
         velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[:, [1, 0, 2]], VelocityFrame.ENU
     if frame is VelocityFrame.ENU:
         velocity = velocity - np.array([*parameters.reference_velocity_offset, 0.0])
-    imu = _in_order(streams.imu.part(streams.imu.refused == 0), parameters, notes)
+    given = blocks.pop(0)
+    imu = _in_order(_part(given, given.refused == 0), parameters, notes)
+    del given
     length = np.linalg.norm(imu.orientation, axis=1)
-    oriented = imu.part(np.flatnonzero((length > 0.5) & (length < 2.0)))
-    rated = imu.part(np.flatnonzero(np.isfinite(imu.angular_velocity).all(axis=1)))
+    oriented = _part(imu, np.asarray((length > 0.5) & (length < 2.0)))
+    rated = _part(imu, np.asarray(np.isfinite(imu.angular_velocity).all(axis=1)))
     if frame is VelocityFrame.ENU and len(oriented) < 2:
         raise InputError(
             f"{name}: the reference is in an earth frame and there is no attitude to turn it into the body; "
@@ -338,17 +362,15 @@ def _recording(name: str, streams: Streams, parameters: Parameters, notes: list[
 def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple[Array, Array]:
     time = 1e-9 * (stamps_ns - first_ns)
     later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])  # a jump taken off may cross two
-    return time[later], values[later]
+    return (time, values) if later.all() else (time[later], values[later])
 
 
 def _claimed_stream(
     stamps_ns: NDArray[np.int64], values: Array, std: Array | None, first_ns: int
 ) -> tuple[tuple[Array, Array], Array | None]:
     """`_stream` with the claims (N, 3) of its samples."""
-    if std is None:
-        return _stream(stamps_ns, values, first_ns), None
-    time, both = _stream(stamps_ns, np.hstack([values, std]), first_ns)
-    return (time, both[:, :3]), both[:, 3:]
+    stream = _stream(stamps_ns, values, first_ns)
+    return stream, None if std is None else _stream(stamps_ns, std, first_ns)[1]
 
 
 def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
@@ -358,7 +380,12 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
     if block.stream is Stream.DVL:
         negative = np.array([bool((np.diag(c) < 0.0).any()) for c in block.covariances.distinct] + [False])
         valid &= ~negative[block.covariances.index]
-    return block.part(valid)
+    return _part(block, valid)
+
+
+def _part(block: SampleBlock, at: NDArray[np.bool_]) -> SampleBlock:
+    """Rows of a mask (N,); no copy of them where these are all."""
+    return block if at.all() else block.part(at)
 
 
 def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.bool_]:
@@ -394,6 +421,8 @@ def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> S
         notes.append(
             f"{block.stream.value}: stamps went back {len(parts) - 1} times; the longest stretch between is diagnosed"
         )
+    if len(longest) == len(stamps) and bool((np.diff(stamps) > 0).all()):
+        return block
     order = longest[np.argsort(stamps[longest], kind="stable")]
     fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
     return block.part(order[fresh])

@@ -28,6 +28,8 @@ from .columns import TopicColumns, stamped, turning
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
 # straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
 BURSTS, BURST_NS, BURST_EVERY_NS = 24, 6_000_000_000, 95_000_000
+# Of all messages of a topic no more than about so many, evenly: of one that is fast for hours, as many as it takes.
+MOST = 100_000
 # What is faster (m/s) is garbage, whose square may be no number any more; millimetres per second still pass.
 FASTEST = 1e5
 
@@ -95,15 +97,19 @@ def look_of(
     """A look at a topic, of which each recording has a part; None where no message of it can be read.
 
     start_ns: first log time of the recordings. spans_ns: from and to when was recorded, in order. whole: all of its
-    messages, and no bursts.
+    messages, up to MOST, and no bursts.
     """
     topic, msgtype = parts[0].topic, parts[0].msgtype
     seconds = 1e-9 * sum(end - start for start, end in spans_ns)
     every_s = seconds / count if count else 0.0
     is_seldom = every_s > SELDOM_S and is_position(msgtype)
     numbers = _Numbers(msgtype, every_s if is_seldom else 1.0)
-    whole = whole or is_seldom
-    taken = np.sort(np.concatenate([part.arrivals[0] for part in parts])) if whole else in_bursts(parts, spans_ns)
+    if whole or is_seldom:
+        taken = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
+        if not is_position(msgtype):  # of which velocities are made, from one to the next
+            taken = taken[:: -(-len(taken) // MOST) or 1]
+    else:
+        taken = in_bursts(parts, spans_ns)
     for part in parts:
         numbers.add_columns(part, _places(part.laid.arrival, taken))
     singly = sorted(

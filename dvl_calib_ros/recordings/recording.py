@@ -60,7 +60,7 @@ class Recording:
     counts: Mapping[str, int]
     file_spans_ns: tuple[Span, ...]
     notes: tuple[str, ...]
-    columns: Mapping[str, tuple[TopicColumns, ...]]
+    columns: dict[str, tuple[TopicColumns, ...]]
     transforms: tuple[Any, ...] = ()
     descriptions: tuple[str, ...] = ()
     parts: tuple[Recording, ...] = field(default=(), repr=False)
@@ -161,6 +161,12 @@ class Recording:
         """All messages of three topics as samples."""
         named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
         return _joined(list(self.stretches(named, decoder)))
+
+    def forget(self) -> None:
+        """Let go of all messages, for who knows that nobody asks again: those of hours take much memory."""
+        for one in (self, *self.parts):
+            one.columns.clear()
+            vars(one).pop("survey", None)
 
     def of_types(self, topics: Topics, parameters: Parameters) -> Parameters:
         """The parameters with the message types that the recording has on these topics."""

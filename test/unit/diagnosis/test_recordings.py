@@ -6,8 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
-from dvl_calib_ros.diagnosis.recordings import make_recording, recording_names
+from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis.recordings import load_recordings, make_recording, recording_names
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
 
 
 @pytest.mark.parametrize(
@@ -41,3 +45,17 @@ def test_turn_rates_are_without_the_noise_of_frequencies_that_hold_no_motion():
     as_measured = ((true + noise) * true).sum(axis=0) / ((true + noise) ** 2).sum(axis=0)
     np.testing.assert_allclose(share, 1.0, atol=0.03)
     assert (as_measured[:2] < 0.5).all()
+
+
+def test_messages_that_nobody_asks_for_again_are_let_go_of_and_the_samples_are_the_same():
+    """Those of five hours at 50 Hz stood beside a diagnosis with 250 MB."""
+    path = ROOT / "bags" / "harbour_box"
+    opened = open_recording([path])
+    (kept,) = load_recordings(opened, Parameters(), Topics()).recordings
+    assert opened.columns
+    (let_go,) = load_recordings(opened, Parameters(), Topics(), forget=True).recordings
+    assert not opened.columns
+    for name in ("dvl", "reference", "attitude", "rates"):
+        one, other = getattr(kept, name), getattr(let_go, name)
+        np.testing.assert_array_equal(one.time, other.time)
+        np.testing.assert_array_equal(one.values, other.values)
