@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
+from ..effects.along_time import slopes
 from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter, MountingEffect
 from ..effects.composition import Injection, late, traces, turns
 from .curve import Curve
@@ -132,26 +133,52 @@ def no_effect(phi: Array | None = None, scale: Array | None = None) -> Hypothesi
 @dataclass(frozen=True)
 class Seen:
     """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
-    (F, 3) m/s smoothed DVL velocity, its frame. rate_of_change: (F, 3) m/s² of it. error: (F, 3) e, body frame.
+    (F, 3) m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame.
     angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
     dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
-    body frame to the axes that are compared.
+    body frame to the axes that are compared. change: makes `rate_of_change`.
     """
 
     motion: EffectInput
     at_dvl: EffectInput
     measured: Array
-    rate_of_change: Array
     error: Array
     angles: Array
     body_from_measured: Array
     dvl_stamps: Array
     reference_stamps: Array
     projection: Array
+    change: Callable[[], Array] = field(repr=False)
+
+    @cached_property
+    def rate_of_change(self) -> Array:
+        """(F, 3) m/s² of the smoothed DVL velocity, which few ask for."""
+        return self.change()
 
     def compared(self, body: Array) -> Array:
         """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
         return self.projection @ body if body.ndim > 2 else _turned(self.projection, body)
+
+
+class SeenAgain(Sequence[Seen]):
+    """What is seen of a hypothesis for who asks for it: of hours it is large, and of most fits nobody asks."""
+
+    def __init__(self, problem: Problem, hypothesis: Hypothesis) -> None:
+        self._problem, self._hypothesis = problem, hypothesis
+
+    @cached_property
+    def _each(self) -> list[Seen]:
+        return self._problem.all_seen(self._hypothesis)
+
+    def __len__(self) -> int:
+        return len(self._problem.recordings)
+
+    @overload
+    def __getitem__(self, at: int) -> Seen: ...
+    @overload
+    def __getitem__(self, at: slice) -> Sequence[Seen]: ...
+    def __getitem__(self, at: int | slice) -> Seen | Sequence[Seen]:
+        return self._each[at]
 
 
 @dataclass(frozen=True)
@@ -323,7 +350,7 @@ class Problem:
         g = curve.kept.at("values", reference, lambda: curve(reference))
         if stream.frame is not VelocityFrame.BODY and rotation is not None:
             g = np.einsum("nji,nj->ni", rotation, g)
-        raw, smooth, change = _measured(stream.dvl, dvl, by_dvl)
+        raw, smooth = _measured(stream.dvl, dvl, by_dvl)
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
@@ -339,7 +366,9 @@ class Problem:
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
         error = _turned(matrix, raw) - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
         projection = self._kept_projection(stream, rotation, attitude)
-        return Seen(motion, at_dvl, smooth, change, error, hypothesis.phi + turn, matrix, dvl, reference, projection)
+        angles = hypothesis.phi + turn
+        change = partial(_change, stream.dvl, dvl)
+        return Seen(motion, at_dvl, smooth, error, angles, matrix, dvl, reference, projection, change)
 
     def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
         """`projection` at times (F,) s of the attitude, of which the last few are kept."""
@@ -362,10 +391,11 @@ class Problem:
 
     def binned(self, bodies: Sequence[Array], seen: Sequence[Seen]) -> Array:
         """(F, 3, ...) of each recording, body frame, -> (M, A, ...) means, in the frame that is compared."""
-        parts = []
-        for grid, body, each in zip(self.grids, bodies, seen, strict=True):
-            parts.append(grid.averaged(body if all(self.measured) else each.compared(body)))
-        return np.concatenate(parts)
+        return np.concatenate(list(map(self._in_bins, self.grids, bodies, seen)))
+
+    def _in_bins(self, grid: Grid, body: Array, seen: Seen) -> Array:
+        """(F, 3, ...) of one recording -> its bins, (m, A, ...)."""
+        return grid.averaged(body if all(self.measured) else seen.compared(body))
 
     @cached_property
     def bin_of(self) -> NDArray[np.intp]:
@@ -398,10 +428,16 @@ class Problem:
     def calibration_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
         """(M, A, 6) d e / d (φ, δk)."""
         parts = []
-        for each in seen:
-            by_scale = -(each.measured / (1.0 + hypothesis.scale))[:, None, :] * each.body_from_measured
-            parts.append(np.concatenate([_by_turn(hypothesis, each), by_scale], axis=2))
-        return self.binned(parts, seen)
+        for grid, each in zip(self.grids, seen, strict=True):
+            # of one mounting they are linear in the velocity, and so in its mean over each bin
+            is_linear = each.body_from_measured.ndim == 2 and all(self.measured)
+            measured = grid.averaged(each.measured) if is_linear else each.measured
+            columns = np.empty((len(measured), 3, 6))
+            columns[:, :, :3] = _by_turn(hypothesis, each, measured)
+            unscaled = measured / (1.0 + hypothesis.scale)
+            np.multiply(-unscaled[:, None, :], each.body_from_measured, out=columns[:, :, 3:])
+            parts.append(columns if is_linear else self._in_bins(grid, columns, each))
+        return np.concatenate(parts)
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
@@ -432,7 +468,7 @@ class Problem:
             return np.stack([by_late * slope[:, None] for slope in slopes], axis=2)
         if isinstance(effect, MountingEffect):
             slopes = [_difference(spec, values, lambda at: effect.turn(seen.at_dvl, at)) for spec in specs]
-            by_turn = _by_turn(hypothesis, seen)
+            by_turn = _by_turn(hypothesis, seen, seen.measured)
             stacked = np.stack([np.broadcast_to(slope, seen.error.shape) for slope in slopes], axis=2)
             return np.asarray(by_turn @ stacked)
         motion = seen.at_dvl if effect.acts_on is ActsOn.DVL else seen.motion
@@ -456,22 +492,26 @@ class Problem:
             turning = cross(motion.angular_velocity, motion.velocity_body)
         if clock is ActsOn.ATTITUDE_CLOCK:
             return turning
-        gradient = np.gradient(motion.velocity_body, motion.time, axis=0)
-        return -gradient - turning
+        return -slopes(motion.time, motion.velocity_body) - turning
 
 
-def _measured(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array, Array]:
-    """(F, 3) velocity, smoothed velocity and its change."""
+def _measured(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array]:
+    """(F, 3) velocity and smoothed velocity."""
 
-    def made() -> tuple[Array, Array, Array]:
+    def made() -> tuple[Array, Array]:
         smooth = curve.smooth
-        clipped = np.clip(at, curve.time[0], curve.time[-1])
         raw = curve if at_samples else curve.quiet
         smoothed = smooth(at)
-        return smoothed if raw is smooth else raw(at), smoothed, np.asarray(smooth.derivative(clipped))
+        return smoothed if raw is smooth else raw(at), smoothed
 
-    measured: tuple[Array, Array, Array] = curve.kept.at(f"measured, {at_samples}", at, made)
+    measured: tuple[Array, Array] = curve.kept.at(f"measured, {at_samples}", at, made)
     return measured
+
+
+def _change(curve: Curve, at: Array) -> Array:
+    """(F, 3) m/s² of the smoothed velocity."""
+    clipped = np.clip(at, curve.time[0], curve.time[-1])
+    return np.asarray(curve.kept.at("change", at, lambda: curve.smooth.derivative(clipped)))
 
 
 def _undone(
@@ -505,13 +545,13 @@ def _turned(matrix: Array, values: Array) -> Array:
     return np.asarray(np.einsum("nij,nj->ni", matrix, values))
 
 
-def _by_turn(hypothesis: Hypothesis, seen: Seen) -> Array:
-    """(F, 3, 3) d e / d (φ + turns), body frame.
+def _by_turn(hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
+    """(F, 3, 3) d e / d (φ + turns), body frame, of velocities (F, 3) m/s in the DVL's.
 
     D⁻¹ y with y the unscaled velocity is Exp(θ)ᵀ y, and Exp(θ + δ) = Exp(J δ) Exp(θ) with J the left Jacobian.
     """
     matrix = seen.body_from_measured * (1.0 + hypothesis.scale)
-    unscaled, jacobian = seen.measured / (1.0 + hypothesis.scale), _left_jacobian(seen.angles)
+    unscaled, jacobian = measured / (1.0 + hypothesis.scale), _left_jacobian(seen.angles)
     if matrix.ndim == 2:  # linear in the velocity: one product of matrices in place of many small ones
         of_axes = (matrix @ skew(np.eye(3)) @ jacobian).reshape(3, 9)
         return np.asarray((unscaled @ of_axes).reshape(-1, 3, 3))

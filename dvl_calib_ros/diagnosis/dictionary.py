@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..calibration.frames import Array
+from ..effects.along_time import recursion
 from .composed import Grid, Problem, Seen
-from .recursion import recursion
 
 TIME_KNOTS = 7
 SPEED_KNOTS = 7

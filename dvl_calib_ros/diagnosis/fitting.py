@@ -15,7 +15,7 @@ from ..calibration.distributions import chi2_isf
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
 from ..effects.base import Effect
-from .composed import Hypothesis, Problem, Seen, Values, amplitudes, is_time_of_run, whose_parameters
+from .composed import Hypothesis, Problem, Seen, SeenAgain, Values, amplitudes, is_time_of_run, whose_parameters
 from .least_squares import WhitenedLeastSquares
 from .noise import Noise
 from .settings import SETTINGS
@@ -58,7 +58,7 @@ class Fit:
     """
 
     hypothesis: Hypothesis
-    seen: tuple[Seen, ...]
+    seen: Sequence[Seen]
     residual: Array
     noise: Noise
     columns: Array
@@ -293,7 +293,8 @@ class Fitter:
             starts = [start, *self.problem.fitted.get(what, [])]
             if len(starts) > 1:  # under other noise it ended nearby
                 starts.sort(key=lambda each: self._misfit(noise, self.evaluated(each)[1], each))
-            self._fits[key] = self.fit(starts[0], noise)
+            found = self.fit(starts[0], noise)
+            self._fits[key] = replace(found, seen=SeenAgain(self.problem, found.hypothesis))
             self.problem.fitted[what] = [self._fits[key].hypothesis]
         return self._fits[key]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
-from .recursion import recursion
+from ..effects.along_time import recursion
 
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)
 HUBER = 2.5

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..calibration.frames import Array
 from ..calibration.register.coarse import LONGEST_S
 from ..calibration.samples import VelocityFrame
+from .along_time import recursion, slopes
 from .base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter
 
 # As far as clocks are registered
@@ -170,7 +171,7 @@ def delayed(time: Array, values: Array, delay: float | Array) -> Array:
     """
     if not np.any(delay) or len(time) < 2:
         return values
-    curve = CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
+    curve = CubicHermiteSpline(time, values, slopes(time, values))
     return np.asarray(curve(np.clip(time - delay, time[0], time[-1])))
 
 
@@ -181,22 +182,15 @@ def lag_error(time: Array, values: Array, time_constant: float) -> Array:
     solution is p(t) = T² (s_1 - s_0) / h - T slope(t), so e_n = exp(-h / T) (e_(n-1) - p_(n-1)) + p_n. The filter
     begins with the first value.
     """
-    error = np.zeros_like(values)
     if time_constant <= 0.0 or len(time) < 2:
-        return error
-    steps = np.diff(time)[:, None]
-    decay = np.vstack([[0.0], np.exp(-steps / time_constant)])
-    slope = np.gradient(values, time, axis=0)
-    bend = time_constant**2 * np.diff(slope, axis=0) / steps
-    error[1:] = bend - time_constant * slope[1:] - decay[1:] * (bend - time_constant * slope[:-1])
-    # the recursion over any steps, by doubling: each pass adds what came twice as far before
-    reach = 1
-    while reach < len(time) and decay[reach:].max() > np.finfo(float).eps:
-        error[reach:] += decay[reach:] * error[:-reach]
-        decay[reach:] = decay[reach:] * decay[:-reach]
-        decay[:reach] = 0.0
-        reach *= 2
-    return error
+        return np.zeros_like(values)
+    steps, slope = np.diff(time), slopes(time, values)
+    decay = np.concatenate([[0.0], np.exp(-steps / time_constant)])
+    bend = np.diff(slope, axis=0) * (time_constant**2 / steps)[:, None]
+    slope *= time_constant
+    added = np.zeros_like(values)
+    added[1:] = bend - slope[1:] - decay[1:, None] * (bend - slope[:-1])
+    return recursion(decay, added)
 
 
 def _turns(motion: EffectInput) -> bool:

@@ -8,7 +8,7 @@ from scipy.signal import lfilter, savgol_filter
 
 from dvl_calib_ros.diagnosis.curve import SMOOTH_SAMPLES, Curve
 from dvl_calib_ros.diagnosis.noise import Arma, Noise
-from dvl_calib_ros.diagnosis.recursion import recursion
+from dvl_calib_ros.effects.along_time import recursion, slopes
 
 
 def test_a_recursion_of_any_decay_is_that_of_a_loop(rng):
@@ -19,6 +19,12 @@ def test_a_recursion_of_any_decay_is_that_of_a_loop(rng):
     assert recursion(decay, added) == pytest.approx(expected)
     assert recursion(decay, added[:, 0]) == pytest.approx(expected[:, 0])
     assert recursion(decay[:0], added[:0]).shape == (0, 4)
+
+
+@pytest.mark.parametrize("n", [2, 3, 50])
+def test_slopes_are_those_of_numpy(rng, n):
+    time, values = np.cumsum(rng.uniform(0.1, 2.0, n)), rng.normal(size=(n, 3))
+    assert slopes(time, values) == pytest.approx(np.gradient(values, time, axis=0), abs=1e-12)
 
 
 @pytest.mark.parametrize(("ar", "ma"), [(0.9, -0.5), (0.7, 0.0), (0.0, 0.4)])

@@ -7,7 +7,7 @@ import pytest
 from test_diagnosis import fitted, scenario, with_added
 
 from dvl_calib_ros.diagnosis import unexplained as looking
-from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
+from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
 from dvl_calib_ros.diagnosis.fitting import Fitter
 from dvl_calib_ros.diagnosis.noise import white_noise
 from dvl_calib_ros.diagnosis.unexplained import unexplained
@@ -46,3 +46,19 @@ def test_a_fit_from_what_was_looked_at_already_is_the_same():
     whole = fitter.fit(start, fit.noise)
     assert again.deviance == whole.deviance
     np.testing.assert_array_equal(again.hypothesis.vector(), whole.hypothesis.vector())
+
+
+def test_columns_of_the_calibration_are_the_means_of_those_of_the_samples():
+    fitter, fit, _ = fitted(scenario("lawnmower", seconds=120.0), {"lever_arm": {}})
+    (seen,), (grid,) = fit.seen, fitter.problem.grids
+    by_turn = grid.averaged(_by_turn(fit.hypothesis, seen, seen.measured))
+    by_scale = -(seen.measured / (1.0 + fit.hypothesis.scale))[:, None, :] * seen.body_from_measured
+    columns = fitter.problem.calibration_columns(fit.hypothesis, fit.seen)
+    np.testing.assert_allclose(columns, np.concatenate([by_turn, grid.averaged(by_scale)], axis=2), atol=1e-13)
+
+
+def test_a_fit_that_is_kept_sees_again_what_it_saw():
+    fitter, fit, start = fitted(scenario("lawnmower", seconds=120.0), {"lever_arm": {}, "dvl_time_offset": {}})
+    kept = fitter.fit_kept(start, fit.noise)
+    assert len(kept.seen) == 1 and kept.seen[0] is kept.seen[0]
+    np.testing.assert_array_equal(fitter.problem.residual(kept.seen), kept.residual)

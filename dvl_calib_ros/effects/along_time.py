@@ -1,4 +1,4 @@
-"""First-order recursions along time, of any decay from sample to sample."""
+"""Along time: slopes, and first-order recursions of any decay from sample to sample."""
 
 from __future__ import annotations
 
@@ -6,6 +6,17 @@ import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
 from ..calibration.frames import Array
+
+
+def slopes(time: Array, values: Array) -> Array:
+    """(N, k) per s of values (N, k) at times (N,) s, N > 1: `numpy.gradient` in fewer passes over them."""
+    steps = np.diff(time)
+    between = np.diff(values, axis=0)
+    between /= steps[:, None]
+    found: Array = np.empty_like(between, shape=values.shape)
+    found[:-1], found[-1] = between, between[-1]
+    found[1:-1] += (steps[1:] / (steps[1:] + steps[:-1]))[:, None] * (between[:-1] - between[1:])
+    return found
 
 
 def recursion(decay: Array, added: Array) -> Array:
