@@ -167,13 +167,9 @@ def _flipped(
         given = fitted(nominal, (REFERENCE,))
     if given is None:
         return None
-    # of the same samples but for those at the ends; outliers, and a level that is told by the middle one, judge nothing
-    most = (OUTLYING * max(min(given.level, turned.level), 1e-6)) ** 2
-    as_given, as_turned = (float(np.minimum(each.squares, most).mean()) for each in (given, turned))
-    gain = 3.0 * turned.rows * math.log(max(as_given, 1e-12) / max(as_turned, 1e-12))
     # read at other times, the DVL's noise is another one: what is left differs by that alone
     by_chance = math.sqrt(6.0 * turned.rows) if abs(given.dvl_late - turned.dvl_late) > ALIKE_S else 0.0
-    return finding("DVL_AXES_FRD") if gain > CLEARLY + by_chance else None
+    return finding("DVL_AXES_FRD") if _gain(given, turned) > CLEARLY + by_chance else None
 
 
 def _mirrored(
@@ -192,9 +188,20 @@ def _mirrored(
     given = MotionFit(motion, lever_arm, curves, MOST_ROWS)(0.0, registered.dvl.late, nominal, held)
     if turned is None or given is None:
         return None
-    gain = 3.0 * turned.rows * 2.0 * math.log(max(given.level, 1e-6) / max(turned.level, 1e-6))
+    gain = _gain(given, turned)
     gain /= max(given.inflation, turned.inflation) ** 2  # noise that lasts is that of fewer samples (survey 34211)
     return finding("DVL_LEFT_HANDED") if gain > CLEARLY + math.sqrt(6.0 * turned.rows) else None
+
+
+def _gain(given: Fitted, turned: Fitted) -> float:
+    """By how much less is left of axes that are turned, in chi-square, were all samples independent.
+
+    Of the same samples but for those at the ends. Outliers judge nothing, and neither does the level, which the middle
+    one tells: of samples of which none fits any better it is another one by chance (survey 47135).
+    """
+    most = (OUTLYING * max(min(given.level, turned.level), 1e-6)) ** 2
+    as_given, as_turned = (float(np.minimum(each.squares, most).mean()) for each in (given, turned))
+    return 3.0 * turned.rows * math.log(max(as_given, 1e-12) / max(as_turned, 1e-12))
 
 
 def _named(
