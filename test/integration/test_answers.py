@@ -239,8 +239,8 @@ def test_what_is_right_is_not_rejected_for_what_noise_and_compass_make(tmp_path,
 
 @pytest.mark.slow
 def test_axes_are_judged_by_all_samples_and_not_by_the_middle_one(tmp_path):
-    """Survey 47135: on a circle the middle sample fitted a left-handed DVL by 1.2 % better and their mean square by 0.2:
-    right, and rejected as left-handed."""
+    """Survey 47135: on a circle a left-handed DVL fitted the middle sample by 1.2 % better, and their mean square by
+    0.2 %: right, and rejected as left-handed."""
     truth = write_survey(draw(47135, DVL_BIAS_STD), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert run.verdict != "reject", run.reasons
