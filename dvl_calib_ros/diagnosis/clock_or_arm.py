@@ -10,7 +10,7 @@ import numpy as np
 from ..calibration.frames import Array
 from ..calibration.samples import Index
 from ..effects.base import Effect
-from .composed import Values
+from .composed import Hypothesis, Values
 from .fitting import OF_INTERVAL, Fit, Fitter
 from .registered import FirstGuess
 from .settings import SETTINGS
@@ -21,6 +21,8 @@ ARM_PARAMETERS = "x_m", "y_m", "z_m"
 GUESSED_STD_M = 0.2
 # A part of the arm is a clock's as well if, with clocks free, it is known so many times worse, and not to so many σ.
 WORSE, SHOWN = 2.0, 2.0
+# Metres of the arm that are a clock's as well, from which on neither is known better than registration knows them
+OPEN_M = 0.1
 CLOCKS = ("dvl_time_offset", "reference_time_offset")
 
 
@@ -84,11 +86,18 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
 
 
 def with_clocks(
-    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], block: Index
-) -> Fit:
+    fitter: Fitter,
+    fit: Fit,
+    guesses: Sequence[FirstGuess],
+    effects: Mapping[str, Effect],
+    block: Index,
+    opened: Mapping[str, tuple[float, float]],
+) -> Fit | None:
     """The fit with both clocks beside the lever arm that it has, if a part of that is as likely theirs; else the fit.
+    None where the two are so much one that no fit holds them.
 
-    block: (M,), of each bin, by which σ is found.
+    block: (M,), of each bin, by which σ is found. opened: as `opened_arm` has it; where that is much, a part that is
+    another with clocks free, beyond chance, is as likely theirs as well.
 
     A boat at 0.87 m/s whose DVL sits 0.3 m astern and one whose compass is 0.35 s late look alike, but where it slows
     down; and what turns make of the instruments there, a model that has no clocks calls the arm's.
@@ -98,15 +107,70 @@ def with_clocks(
     if ARM not in present or not clocks or not is_open(guesses):
         return fit
     joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], len(fit.seen), {}), fit.noise)
+    if opened and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
+        return None
     (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
     was_shown, is_shown = np.abs(own) > SHOWN * own_std, np.abs(free) > SHOWN * free_std
-    return joint if bool((was_shown & ~is_shown & (free_std > WORSE * own_std)).any()) else fit
+    by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # of the other, where no clock is late
+    is_another = ~is_shown | (bool(opened) & (np.abs(free - own) > SHOWN * by_chance))
+    return joint if bool((was_shown & is_another & (free_std > WORSE * own_std)).any()) else fit
 
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
     """The parameters (p,) of the lever arm and their σ (p,), as blocks scatter."""
     at = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == ARM]
     return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
+
+
+def opened_arm(guesses: Sequence[FirstGuess]) -> dict[str, tuple[float, float]]:
+    """By parameter of the lever arm, by how much (m) a second of the reference's clock makes it another, and how late
+    (σ, s) that may be; of the recording that leaves it least open. Nothing where one leaves next to nothing open."""
+    found = [each.registration for each in guesses if each.registration is not None]
+    least = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
+    if least is None or np.trace(least.left_open[3:6, 3:6]) < OPEN_M**2:
+        return {}
+    late = float(np.sqrt(np.trace(least.left_open) / (least.open_by @ least.open_by)))
+    return {name: (by, late) for name, by in zip(ARM_PARAMETERS, least.open_by[3:6].tolist(), strict=True)}
+
+
+def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> list[Array]:
+    """(6 + p,) by how much the lever arm of a fit is another by what explains the data as well; the farthest.
+
+    rivals: with another clock.
+    """
+    moved: list[Array] = []
+    for rival in (each for each in rivals if ARM in each.values):
+        step = np.zeros(len(fit.hypothesis.vector()))
+        for i, each in enumerate(fit.hypothesis.parameters()):
+            if each.effect.name == ARM:
+                step[6 + i] = rival.values[ARM][0].get(each.spec.name, 0.0) - fit.hypothesis.value(each)
+        moved.append(step)
+    return sorted(moved, key=lambda step: -float(step @ step))[:1]
+
+
+def with_open(fit: Fit, covariance: Array, opened: Mapping[str, tuple[float, float]]) -> Array:
+    """A covariance (6 + p, 6 + p) in which lever arm and the reference's clock are known no better than registration
+    knows them, which does not take turns between samples for what a fit makes of them."""
+    if not opened:
+        return covariance
+    (_, late), *_ = opened.values()
+    step, known = np.zeros(len(covariance)), 0.0
+    for i, each in enumerate(fit.hypothesis.parameters(), start=6):
+        if each.effect.name == ARM:
+            step[i] = opened[each.spec.name][0]
+        elif each.effect.name == CLOCKS[1]:
+            step[i], known = 1.0, max(known, float(covariance[i, i]))
+    return np.asarray(covariance + max(late**2 - known, 0.0) * np.outer(step, step))
+
+
+def opened_combination(fit: Fit, covariance: Array, opened: Mapping[str, tuple[float, float]]) -> Combination | None:
+    """What is known of the lever arm and the reference's clock by a fit of one recording that has no such clock."""
+    at = {each.spec.name: 6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == ARM}
+    if not opened or not at or len(fit.seen) > 1:
+        return None
+    name = max(at, key=lambda each: abs(opened[each][0]))
+    value, std = float(fit.hypothesis.vector()[at[name]]), float(np.sqrt(covariance[at[name], at[name]]))
+    return Combination(name, CLOCKS[1], opened[name][0], (value, value - OF_INTERVAL * std, value + OF_INTERVAL * std))
 
 
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:

@@ -223,7 +223,8 @@ class Grid:
 @dataclass(frozen=True)
 class Problem:
     """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
-    bursts: of how many samples an instrument was far off, which are left out.
+    bursts: of how many samples an instrument was far off, which are left out. shown_turns: (3, 3) projection of φ on
+    the turns of the mounting that a reference without a vertical shows; by the others it is not turned.
     """
 
     recordings: tuple[RecordedStreams, ...]
@@ -232,6 +233,7 @@ class Problem:
     grids: tuple[Grid, ...]
     of_axes: tuple[bool, bool, bool] = (True, True, True)
     bursts: int = 0
+    shown_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
     # Hypotheses as they were fitted last, by what they are made of: where to start from again
     fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -433,7 +435,8 @@ class Problem:
             is_linear = each.body_from_measured.ndim == 2 and all(self.measured)
             measured = grid.averaged(each.measured) if is_linear else each.measured
             columns = np.empty((len(measured), 3, 6))
-            columns[:, :, :3] = _by_turn(hypothesis, each, measured)
+            by_turn = _by_turn(hypothesis, each, measured)
+            columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
             unscaled = measured / (1.0 + hypothesis.scale)
             np.multiply(-unscaled[:, None, :], each.body_from_measured, out=columns[:, :, 3:])
             parts.append(columns if is_linear else self._in_bins(grid, columns, each))
@@ -580,7 +583,25 @@ def make_problem(
 ) -> Problem:
     """The problem on bins where all streams are known, with offsets (about which hypotheses lie) and without."""
     grids = tuple(_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
-    return Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
+    problem = Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
+    return problem if problem.measured[2] else replace(problem, shown_turns=_shown_turns(problem))
+
+
+# A turn of the mounting that, as large as its prior, does less than this (m/s rms), is not fitted: it would take in
+# what is left of the waves, by tens of degrees
+TURN_SHOWN_MPS = 0.002
+
+
+def _shown_turns(problem: Problem) -> Array:
+    """(3, 3) projection of φ on the turns that are shown, whatever the scale."""
+    columns = problem.calibration_columns(no_effect(), problem.all_seen(no_effect())).reshape(-1, 6)
+    if not len(columns):
+        return np.eye(3)
+    by_turn, by_scale = columns[:, :3], columns[:, 3:]
+    by_turn = by_turn - by_scale @ np.linalg.lstsq(by_scale, by_turn, rcond=None)[0]
+    squares, turns = np.linalg.eigh(by_turn.T @ by_turn * (problem.axes / len(columns)))
+    shown = turns[:, SETTINGS.prior_angle * np.sqrt(np.maximum(squares, 0.0)) > TURN_SHOWN_MPS]
+    return np.asarray(shown @ shown.T)
 
 
 @dataclass(frozen=True)

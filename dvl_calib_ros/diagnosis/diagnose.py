@@ -20,11 +20,11 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_or_arm import ARM, CLOCKS, Combination, combination
+from .clock_or_arm import ARM, CLOCKS, Combination, combination, opened_combination, with_open
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
-from .fitting import OF_INTERVAL, Fit, prior_std
+from .fitting import OF_INTERVAL, prior_std
 from .intervals import Times, Triple, covariance_of
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
@@ -115,7 +115,12 @@ def diagnose_recordings(
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
         moved = moved_by(selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
-    found = tuple(_found(selection, each, covariance, times, len(testable), gap) for each in selection.selected)
+    unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
+    for step in selection.moved:
+        covariance = covariance + np.outer(step, step)
+    found = tuple(
+        _found(selection, each, covariance, unmoved, times, len(testable), gap) for each in selection.selected
+    )
     columns = rest.columns
     if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and rest.found):
         columns = selection.fit.columns[:, :, 6:]
@@ -261,6 +266,7 @@ def _found(
     selection: EffectSelection,
     selected: Selected,
     covariance: Array,
+    unmoved: Array,
     times: Times,
     n_tested: int,
     gap: Gap,
@@ -289,16 +295,18 @@ def _found(
         closure_alone(selection, gap, effect.name),
         min(1.0, float(np.exp(selected.log_p)) * n_tested),
         {names[recording]: parameters for recording, parameters in ordered.items()} if is_of_each else {},
-        _known_together(fit, covariance, selected),
+        _known_together(selection, unmoved, selected),
     )
 
 
-def _known_together(fit: Fit, covariance: Array, selected: Selected) -> Combination | None:
+def _known_together(selection: EffectSelection, covariance: Array, selected: Selected) -> Combination | None:
     """What is known of a lever arm and a clock that are one to the data; of several clocks by that which tells most."""
-    name, others = selected.effect.name, selected.equivalent
+    fit, name, others = selection.fit, selected.effect.name, selected.equivalent
+    if name == ARM and others and not {*CLOCKS} & fit.values.keys():
+        return opened_combination(fit, covariance, selection.opened)
     clocks = [name] if ARM in others else [each for each in others if each in CLOCKS] if name == ARM else []
-    known = [found for clock in clocks if (found := combination(fit, covariance, clock)) is not None]
-    return min(known, key=lambda each: each.value[2] - each.value[1], default=None)
+    each = [found for clock in clocks if (found := combination(fit, covariance, clock)) is not None]
+    return min(each, key=lambda one: one.value[2] - one.value[1], default=None)
 
 
 def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:

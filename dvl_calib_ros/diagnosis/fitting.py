@@ -287,7 +287,8 @@ class Fitter:
             for spec in effect.parameters
             if is_time_of_run(spec)
         )
-        what = tuple(sorted(effect.name for effect in start.effects)), windows
+        of = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
+        what = tuple(of), windows
         key = (id(noise), *what)
         if key not in self._fits:
             starts = [start, *self.problem.fitted.get(what, [])]

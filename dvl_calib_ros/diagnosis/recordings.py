@@ -108,10 +108,10 @@ class RecordedStreams:
             return np.asarray(own.kept.at("values", at, lambda: own(at)))
         if attitude is None:
             raise ValueError(f"{self.name}: no angular velocity")
-        oriented = attitude
+        oriented = attitude.quiet  # a hundredth of a degree ten times a second is a tenth of a degree per second
 
         def turning() -> Array:
-            q = oriented.kept.at("quaternion", at, lambda: oriented(at))
+            q = oriented(at)
             dq = oriented.derivative(np.clip(at, oriented.time[0], oriented.time[-1]))
             square = (q * q).sum(axis=1)[:, None]
             # vector part of 2 q* dq/dt, with q = (x, y, z, w)

@@ -157,6 +157,7 @@ def _combination(effect: FoundEffect) -> dict[str, Any]:
         return {}
     known = {
         "parameter": found.parameter,
+        "clock": found.clock,
         "speed_mps": found.speed,
         "arm_less_speed_times_delay_m": _value(found.value),
     }

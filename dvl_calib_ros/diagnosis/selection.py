@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..effects.base import Effect
-from .clock_or_arm import ARM, guessed_arm, is_open, with_arm, with_clocks
+from .clock_or_arm import ARM, guessed_arm, is_open, moved_arm, opened_arm, with_arm, with_clocks
+from .compass import HEADING, heading_first, with_two_cycles
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
@@ -47,6 +48,8 @@ CLEAR = 6.0
 TAKEN_BACK = 0.25
 # and where it explains as much as an unknown cause would not without being seen, but for this share
 TAKEN_BACK_EXACTLY = 0.05
+# A clock is late for sure from so many σ of what registration leaves open
+LATER = 2.0
 # Fits with outliers drawn in about the one before, from the first guess on
 ROBUST_ROUNDS = 3
 
@@ -68,17 +71,21 @@ class Variant:
 
 @dataclass(frozen=True)
 class Selected:
-    """An effect that the data calls for. log_p: with all others in; equivalent: names that could stand in for it."""
+    """An effect that the data calls for. log_p: with all others in; equivalent: names that could stand in for it;
+    rivals: with these in its place."""
 
     effect: Effect
     log_p: float
     equivalent: tuple[str, ...]
+    rivals: tuple[Hypothesis, ...] = field(default=(), repr=False, compare=False)
 
 
 @dataclass(frozen=True)
 class EffectSelection:
     """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
-    fitter; guesses per recording; the effects there were, with what of each is shown.
+    fitter; guesses per recording; the effects there were, with what of each is shown. opened: by part of the lever
+    arm, what a second of the reference's clock makes of it and how late that may be (σ, s), at one speed.
+    moved: (6 + p,) each, m, by which the lever arm is another where another clock explains the data as well.
     """
 
     selected: tuple[Selected, ...]
@@ -87,10 +94,12 @@ class EffectSelection:
     fitter: Fitter
     guesses: tuple[FirstGuess, ...]
     testable: Mapping[str, Effect]
+    opened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    moved: tuple[Array, ...] = ()
 
     def withdrawn(self) -> EffectSelection:
         """Without any effect."""
-        return replace(self, selected=(), fit=self.base)
+        return replace(self, selected=(), fit=self.base, opened={}, moved=())
 
 
 def started(
@@ -121,7 +130,8 @@ def select(
     effects: Mapping[str, Effect],
 ) -> EffectSelection:
     """Select among testable effects."""
-    every = effects  # what is not shown of them is not noise all the same
+    heading = effects.get(HEADING)
+    effects = every = {name: effect.usual for name, effect in effects.items()}  # what is not shown is no noise either
     problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
     kept = without_contradicted(problem, fit.hypothesis)
@@ -136,7 +146,7 @@ def select(
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
-        candidates = _proposed(fitter, fit, effects)
+        candidates = [*_proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         leapt = [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += [each for each in leapt if not _is_taken_back(fitter, each, LEAP, fit.deviance - each.deviance)]
@@ -155,20 +165,27 @@ def select(
     fit = _once_borne_out(fitter, fit, every, effects)
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
+    fit = _without_nothing(fitter, fit, len(effects))
+    fit, alike = heading_first(fitter, fit, heading)
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
+    opened = opened_arm(guesses) if ARM in fit.values else {}
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for)
-    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem))
-    clocks = tuple(effect.name for effect in freed.effects if effect not in fit.effects)
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened)
+    selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
+    rivals = [one for each in selected if opened and each.effect.name in CLOCKS for one in each.rivals]
+    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
+    clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
+    if freed is None:
+        clocks = tuple(name for name in CLOCKS[:2] if name not in fit.values)
     if clocks:
         selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
-    fit = freed
+    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, [])
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, CLOCKS[:2]) if each.effect.name in CLOCKS[:2] else each for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
-    return EffectSelection(ordered, base, fit, fitter, guesses, effects)
+    return EffectSelection(ordered, base, fit, fitter, guesses, effects, opened, tuple(moved))
 
 
 # ------------------------------------------------------------------ noise
@@ -603,6 +620,21 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
+def _without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """A fit without those effects that explain, under the noise as it is known now, no more than chance does.
+
+    At one speed a quadratic scale and the scale go anywhere together, and what noise of the DVL that makes is all they
+    explain.
+    """
+    while fit.effects:
+        rests = [(rest := _without(fitter, fit, effect), _log_p(fit, rest, effect)) for effect in fit.effects]
+        worst, log_p = max(rests, key=lambda each: each[1])
+        if log_p < -float(np.log(n_effects)):
+            return fit
+        fit = worst
+    return fit
+
+
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
     """Whether an effect adds next to nothing to what all of them explain; of what bends an arm, nor to the noise."""
     if drop > SETTINGS.ghost_share * explained:
@@ -691,7 +723,7 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     table = _table(fitter, rest, effects)
     n = len(fit.seen)
     own = list(range(len(rest.effects)))
-    found: list[tuple[float, str]] = []
+    found: list[tuple[float, str, Hypothesis]] = []
     best_of: dict[str, int] = {}
     drops = {i: table.drop(own) - table.drop([*own, i]) for i in range(len(own), len(table.variants))}
     for index in sorted(drops, key=lambda i: -drops[i]):
@@ -704,20 +736,31 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
         behind = rival.deviance - fit.deviance
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
         if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * fewer):
-            found.append((behind, name))
-    return Selected(effect, log_p, tuple(name for _, name in sorted(found)))
+            found.append((behind, name, rival.hypothesis))
+    found.sort(key=lambda each: each[:2])
+    return Selected(effect, log_p, tuple(name for _, name, _ in found), tuple(each for *_, each in found))
 
 
 def _clock_or_arm(
-    fitter: Fitter, fit: Fit, selected: list[Selected], n_effects: int, called_for: Sequence[Effect]
+    fitter: Fitter,
+    fit: Fit,
+    selected: list[Selected],
+    n_effects: int,
+    called_for: Sequence[Effect],
+    opened: Mapping[str, tuple[float, float]] | None = None,
 ) -> list[Selected]:
     """Lever arm and clock as one where each would do without the other.
 
     called_for: what the data calls for; a further clock that only stands beside the arm is named where it is shown.
+    opened: as `opened_arm` has it; a clock of the reference that is no later than that is not shown.
     """
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
     def is_shown(each: Selected) -> bool:
+        if opened and each.effect.name == CLOCKS[1]:
+            (_, late), *_ = opened.values()
+            if max(abs(own["seconds"]) for own in fit.values[CLOCKS[1]]) < LATER * late:
+                return False
         return each.log_p <= threshold and _robust_p(fit, each.effect, block) < SETTINGS.robust_level
 
     own = {each.effect.name: each for each in selected}

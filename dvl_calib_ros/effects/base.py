@@ -20,6 +20,8 @@ from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
 from ..errors import InputError
 
+HOUR_S = 3600.0
+
 
 @dataclass(frozen=True)
 class EffectInput:
@@ -171,6 +173,7 @@ class Effect(AnyEffect, ABC):
     vehicle. relative_to_first: whether it is a change against the first of several recordings. bends_arm: whether
     little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres. again:
     parameters of a second time that it happens, which is looked for where a first was found -> those of the first.
+    rarer: parameters that are looked for where several recordings ask for them.
     """
 
     remedy: ClassVar[str] = ""
@@ -179,6 +182,12 @@ class Effect(AnyEffect, ABC):
     relative_to_first: ClassVar[bool] = False
     bends_arm: ClassVar[bool] = False
     again: ClassVar[Mapping[str, str]] = {}
+    rarer: ClassVar[frozenset[str]] = frozenset()
+
+    @property
+    def usual(self) -> Effect:
+        """The same, without what is rarer."""
+        return self.without(self.rarer)
 
     @property
     def once(self) -> Effect:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
+from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
 
 _CURRENT = "{} component of the added velocity (the negative of the current)"
 
@@ -47,13 +47,17 @@ class WaterLock(Effect):
 
 
 class HeadingError(Effect):
-    """The heading is wrong by an amount that swings once around with the heading, as of an uncompensated compass.
+    """The heading is wrong by an amount that swings with the heading, as of an uncompensated compass, or that grows.
 
-    It turns the reference, which is what the wrong heading is used for. A constant error is misalignment about z.
+    It turns the reference, which is what the wrong heading is used for. A constant error is misalignment about z. Iron
+    that keeps its magnetism makes one cycle, iron that takes on the earth's two.
     """
 
     name = "heading_error"
-    summary = "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ"
+    summary = (
+        "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ; in several recordings "
+        "also by sin2_rad · sin 2ψ + cos2_rad · cos 2ψ, or by rad_per_hour · (t - start)"
+    )
     remedy = "calibrate the compass, away from what is magnetic; no mounting makes this"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
@@ -63,7 +67,31 @@ class HeadingError(Effect):
         EffectParameter(
             "cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False, said="cos"
         ),
+        EffectParameter(
+            "sin2_rad",
+            "rad",
+            0.02,
+            -0.5,
+            0.5,
+            "part in phase with sin 2ψ",
+            linear=False,
+            said="sin 2ψ",
+        ),
+        EffectParameter(
+            "cos2_rad",
+            "rad",
+            0.02,
+            -0.5,
+            0.5,
+            "part in phase with cos 2ψ",
+            linear=False,
+            said="cos 2ψ",
+        ),
+        EffectParameter(
+            "rad_per_hour", "rad/h", 0.05, -2.0, 2.0, "part that grows with time", linear=False, said="drift"
+        ),
     )
+    rarer = frozenset({"sin2_rad", "cos2_rad", "rad_per_hour"})
     of_the_day = True
     acts_on = ActsOn.REFERENCE
     needs = frozenset({EffectNeeds.ATTITUDE})
@@ -74,6 +102,11 @@ class HeadingError(Effect):
         rotation = motion.attitude
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         error = values["sin_rad"] * np.sin(yaw) + values["cos_rad"] * np.cos(yaw)
+        sine2, cosine2, drift = (values.get(name, 0.0) for name in ("sin2_rad", "cos2_rad", "rad_per_hour"))
+        if sine2 or cosine2:
+            error = error + sine2 * np.sin(2.0 * yaw) + cosine2 * np.cos(2.0 * yaw)
+        if drift:
+            error = error + drift / HOUR_S * motion.elapsed
         east, north, _ = np.einsum("nij,nj->in", rotation, motion.velocity_body)
         sine, cosine_less_one = np.sin(error), -2.0 * np.sin(0.5 * error) ** 2
         added = [cosine_less_one * east + sine * north, cosine_less_one * north - sine * east, np.zeros_like(east)]

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.frames import Array
-from .base import ActsOn, Effect, EffectInput, EffectParameter, MountingEffect, along_axes, vector
-
-HOUR_S = 3600.0
+from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectParameter, MountingEffect, along_axes, vector
 
 
 class VelocityBias(Effect):
