@@ -35,6 +35,8 @@ BY_CHANCE = 1.5
 PRIOR_IN_TYPICAL = 50.0
 # A fit is not made where it would come out worse by so much deviance, and by this share of what its first step gains
 SURELY, BENT = 2.0, 0.2
+# The first, times this, where what a fit nearby promises, and does not keep, is taken off
+NEARBY = 2.0
 # A burst: bins beyond so many standard deviations of what is usually left, those about them that are beyond fewer, and
 # the share of a recording up to which all of them are taken for errors of an instrument
 BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
@@ -325,6 +327,7 @@ class Fitter:
         return found if found.deviance < fit.deviance else fit
 
     def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
+        at_rest: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
             per = fit.values[effect.name]
             if not all(np.isfinite(each[name]) for each in per):
@@ -332,22 +335,36 @@ class Fitter:
             moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
             hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
             looked = self._looked(hypothesis, fit.noise)
-            if self._is_surely_worse(hypothesis, looked, fit.noise, fit.deviance):
+            if at_rest is None or at_rest[0] is not fit:
+                at_rest = fit, self._promised(fit)
+            if self._is_surely_worse(hypothesis, looked, fit.noise, fit.deviance, at_rest[1]):
                 continue
             trial = self.fit(hypothesis, fit.noise, 3, looked=looked)
             if trial.deviance < fit.deviance:
                 fit = trial
         return fit
 
-    def _is_surely_worse(self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float) -> bool:
+    def _promised(self, fit: Fit) -> float:
+        """What a straight step from a fit would gain, although it stands still: so much is promised of no step."""
+        system = self._system(fit.noise, fit.columns, fit.residual, fit.hypothesis)
+        return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
+
+    def _is_surely_worse(
+        self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float, promised: float = 0.0
+    ) -> bool:
         """Whether a hypothesis, fitted, would have a larger deviance, as one straight step tells well enough.
 
-        The deviance at which that step would end is the least there is, but for what is bent.
+        The deviance at which that step would end is the least there is, but for what is bent. promised: of what it
+        gains, what a step from a fit nearby, of this deviance, would gain as well, which is nothing (`_promised`).
         """
         own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
         least = looked.system.misfit(looked.system.solution())
         gained = self._misfit(noise, looked.residual, hypothesis) - least
-        return least - float(own_noise @ own_noise) > deviance + SURELY + BENT * gained
+        least -= float(own_noise @ own_noise)
+        if least > deviance + SURELY + BENT * gained:
+            return True
+        alike = min(promised, gained)
+        return least + alike > deviance + NEARBY * SURELY + BENT * (gained - alike)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """A time at which an effect begins or ends, with those that the data takes for as good (95 per cent)."""

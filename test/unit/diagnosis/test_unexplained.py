@@ -8,10 +8,11 @@ from test_diagnosis import fitted, scenario, with_added
 
 from dvl_calib_ros.diagnosis import unexplained as looking
 from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
-from dvl_calib_ros.diagnosis.fitting import Fitter
+from dvl_calib_ros.diagnosis.fitting import NEARBY, SURELY, Fitter
 from dvl_calib_ros.diagnosis.noise import white_noise
 from dvl_calib_ros.diagnosis.unexplained import unexplained
 from dvl_calib_ros.simulation.scenario import simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +63,19 @@ def test_a_fit_that_is_kept_sees_again_what_it_saw():
     kept = fitter.fit_kept(start, fit.noise)
     assert len(kept.seen) == 1 and kept.seen[0] is kept.seen[0]
     np.testing.assert_array_equal(fitter.problem.residual(kept.seen), kept.residual)
+
+
+def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_nearby():
+    """A noisy DVL at 1 Hz promised 65 of deviance at any time of a water lock, and 74 fits were made for that."""
+    errors = DvlErrors(beam_std=0.1)
+    given = scenario("lawnmower", seconds=300.0, errors=errors, dvl_rate=1.0, gnss_rate=5.0, gnss_std=0.02)
+    effects = {"lever_arm": {}, "dvl_time_offset": {}, "reference_time_offset": {}}
+    fitter, fit, _ = fitted(given, effects)
+    promised, looked = fitter._promised(fit), fitter._looked(fit.hypothesis, fit.noise)
+
+    def is_surely_worse(by: float, promised: float) -> bool:
+        return fitter._is_surely_worse(fit.hypothesis, looked, fit.noise, fit.deviance - by, promised)
+
+    assert promised > 3.0 and not is_surely_worse(0.0, promised)
+    beyond = NEARBY * SURELY + 0.1
+    assert is_surely_worse(beyond, promised) and not is_surely_worse(beyond, 0.0)
