@@ -15,7 +15,7 @@ from .fitting import OF_INTERVAL, Fit, Fitter
 from .registered import FirstGuess
 from .settings import SETTINGS
 
-ARM = "lever_arm"
+ARM, LAG = "lever_arm", "reference_lag"
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
 # A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
 GUESSED_STD_M = 0.2

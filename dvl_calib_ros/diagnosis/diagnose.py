@@ -20,7 +20,7 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_or_arm import ARM, CLOCKS, Combination, combination, opened_combination, with_open
+from .clock_or_arm import ARM, CLOCKS, LAG, Combination, combination, opened_combination, with_open
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
@@ -302,6 +302,8 @@ def _found(
 def _known_together(selection: EffectSelection, covariance: Array, selected: Selected) -> Combination | None:
     """What is known of a lever arm and a clock that are one to the data; of several clocks by that which tells most."""
     fit, name, others = selection.fit, selected.effect.name, selected.equivalent
+    if LAG in fit.values:  # which takes in a part of the delay
+        return None
     if name == ARM and others and not {*CLOCKS} & fit.values.keys():
         return opened_combination(fit, covariance, selection.opened)
     clocks = [name] if ARM in others else [each for each in others if each in CLOCKS] if name == ARM else []

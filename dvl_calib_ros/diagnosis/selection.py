@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
+from ..calibration.register.registration import IN_TIME_STD_S
 from ..effects.base import Effect
-from .clock_or_arm import ARM, guessed_arm, is_open, moved_arm, opened_arm, with_arm, with_clocks
+from .clock_or_arm import ARM, LAG, guessed_arm, is_open, moved_arm, opened_arm, with_arm, with_clocks
 from .compass import HEADING, heading_first, with_two_cycles
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
@@ -180,6 +181,12 @@ def select(
         clocks = tuple(name for name in CLOCKS[:2] if name not in fit.values)
     if clocks:
         selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
+    if any(each.effect.name == ARM and CLOCKS[1] in each.equivalent for each in selected):
+        opened = {name: (by, IN_TIME_STD_S) for name, (by, _) in opened.items()}  # only the two together are known
+    if opened:  # what tells a lag from a delay is less than what lies between samples
+        selected = [
+            _or_else(each, [*each.equivalent, CLOCKS[1]]) if each.effect.name == LAG else each for each in selected
+        ]
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, [])
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):

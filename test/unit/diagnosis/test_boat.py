@@ -25,7 +25,7 @@ def right(yaw, time):
     return 0.0 * yaw
 
 
-def boat(seed, first_heading, compass=right, moved=0.0, cross=True, name="run"):
+def boat(seed, first_heading, compass=right, moved=0.0, cross=True, name="run", reference_late=0.0):
     """A run of 400 s at one speed. compass: rad that it is off, by heading and time (s). moved: rad, of the yaw."""
     rng = np.random.default_rng(seed)
     time = np.arange(-10.0, 410.0, 1.0 / HZ)
@@ -47,6 +47,7 @@ def boat(seed, first_heading, compass=right, moved=0.0, cross=True, name="run"):
         return time[at], values[at] + rng.normal(0.0, std, (len(at), values.shape[1]))
 
     horizontal = sampled(enu * [1.0, 1.0, 0.0], 4, [0.02, 0.02, 0.0])
+    horizontal = horizontal[0] + reference_late, horizontal[1]
     at, angles = sampled(np.column_stack([yaw + compass(yaw, time), pitch, roll]), 2, np.radians(0.05))
     attitude = at, Rotation.from_euler("ZYX", angles).as_quat()
     attitude[1][:] *= np.cumprod(
@@ -80,6 +81,21 @@ def test_roll_and_pitch_of_the_mounting_are_not_claimed_where_only_noise_of_the_
         assert abs(value) < np.radians(1.0) and low < 0.0 < high
     _, low, high = diagnosis.calibration[2]
     assert low < YAW < high
+
+
+@pytest.mark.parametrize(("seed", "late"), [(0, 0.4), (1, -0.5), (2, 0.3)])
+def test_at_one_speed_a_late_reference_is_named_and_the_interval_of_the_arm_holds_what_it_may_be(seed, late):
+    """The arm was said to be 0.4 m further astern, to 3 cm, and nothing of a clock."""
+    effects = found(diagnose_recordings([boat(seed, 0.3, reference_late=late)], Parameters()))
+    names = {name for each in effects.values() for name in (each.name, *each.equivalent_to)}
+    assert {"lever_arm", "reference_time_offset"} <= names
+    if "lever_arm" in effects:
+        _, low, high = effects["lever_arm"].parameters["x_m"]
+        assert low < ARM[0] < high
+    for known in (each.combination for each in effects.values()):
+        if known is not None and known.clock == "reference_time_offset":
+            _, low, high = known.value
+            assert known.parameter == "x_m" and low - 0.03 < ARM[0] - known.speed * late < high + 0.03
 
 
 def test_a_compass_with_two_cycles_is_named_for_runs_that_disagree_in_yaw_and_no_mounting_moved():
