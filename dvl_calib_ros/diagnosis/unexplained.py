@@ -80,14 +80,14 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     problem, noise = fitter.problem, fit.noise
     looks, white, raw = _looked(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
-    followed = lines(problem, white.reshape(-1, problem.axes))
+    followed = lines(problem, white[: fit.residual.size].reshape(-1, problem.axes))
     tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
-    known = _orthonormal(noise.whiten(fit.columns))
+    known, _ = _beside_prior(fit, noise.whiten(fit.columns), noise.whiten(fit.residual))
     if asked > -np.inf:
         most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
         for line in followed:
             waves = _along_axes(line.waves, problem.axes)
-            energy = explained(known, noise.whiten(waves), white, 1.0)[1]
+            energy = explained(known, _with_rows_of_prior(noise.whiten(waves), white), white, 1.0)[1]
             most.append((energy + waves.shape[2], waves.shape[2]))
         prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
         if max(each - prices[columns] for each, columns in most) < asked:
@@ -96,7 +96,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     if noise.is_coloured:  # what changes with time alone may as well be noise
         for name, columns in raw.items():
             if name != "time":
-                drop, rank, _ = _recoloured(noise, fit.columns, columns, fit.residual)
+                drop, rank, _ = _recoloured(fit, fit.columns, columns, fit.residual)
                 recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
     looked_at = float(np.log(tested))
     nominal = [
@@ -115,7 +115,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     others: list[tuple[float, str | float, Array]] = []
     for number, each in enumerate(recoloured):
         if each.log_p() + looked_at < np.log(LEVEL):
-            recoloured[number] = each = replace(each, energy=each.energy / _chance(fit, raw[each.name]))
+            recoloured[number] = each = replace(each, energy=each.energy / _chance(fitter, fit, each.name))
         others.append((each.log_p(), each.name, raw[each.name]))
     best = min(tests, key=_first)
     if best[0] + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
@@ -128,7 +128,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    clear_energy = explained(known, noise.whiten(best[2]), white, 1.0)[1]
+    clear_energy = explained(known, _with_rows_of_prior(noise.whiten(best[2]), white), white, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
     cost = _price(tested, best[2].shape[2])
     found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
@@ -171,23 +171,38 @@ def _looked(
     fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
 ) -> tuple[list[FollowTest], Array, dict[str, Array]]:
     """All looks at a residual (M, A) of a problem seen through a fit; what it is whitened, of unit variance, beside
-    the fit's columns; and the columns of every group.
+    the fit's columns, with the rows of its prior; and the columns of every group.
     """
     noise = fit.noise
     known = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    q = _orthonormal(noise.whiten(known))
-    white = noise.whiten(residual)
+    q, white = _beside_prior(fit, noise.whiten(known), noise.whiten(residual))
     white = white - q @ (q.T @ white)
-    white = white / np.sqrt(float(white @ white) / (len(white) - q.shape[1]))
+    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1]))
     looks: list[FollowTest] = []
     raw: dict[str, Array] = {}
     sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
-        told = _Told.by(q, noise.whiten(raw[name]), white)
+        told = _Told.by(q, _with_rows_of_prior(noise.whiten(raw[name]), white), white)
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
             looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
     return looks, white, raw
+
+
+def _beside_prior(fit: Fit, known: Array, white: Array) -> tuple[Array, Array]:
+    """Orthonormal basis of whitened columns (M A, 6 + p), and a whitened series (M A,), each with the rows of the fit's
+    prior below: 6 + p more.
+
+    Without it the scale of a sway that is hardly there, which is noise, would explain that noise.
+    """
+    std = prior_std(fit.hypothesis)
+    basis = _orthonormal(np.concatenate([known, np.diag(1.0 / std)]))
+    return basis, np.concatenate([white, fit.hypothesis.vector() / std])
+
+
+def _with_rows_of_prior(columns: Array, white: Array) -> Array:
+    """Whitened columns (M A, c) of which a prior says nothing, with as many rows as a series has with its prior."""
+    return np.concatenate([columns, np.zeros((len(white) - len(columns), columns.shape[1]))])
 
 
 def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
@@ -250,7 +265,7 @@ def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
     noise = fit.noise
     if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
-        noise = _recoloured(noise, fit.columns, rest.clearest, fit.residual)[2]
+        noise = _recoloured(fit, fit.columns, rest.clearest, fit.residual)[2]
     return told_elsewhere(problem, noise, fit.columns, rest.clearest, fit.residual)
 
 
@@ -258,7 +273,7 @@ def moved_by(fit: Fit, rest: Unexplained) -> Array:
     """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
     noise, raw = fit.noise, rest.clearest
     if noise.is_coloured:
-        noise = _recoloured(noise, fit.columns, raw, fit.residual)[2]
+        noise = _recoloured(fit, fit.columns, raw, fit.residual)[2]
     size, at = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12), fit.columns.shape[2]
     white = noise.whiten(np.concatenate([fit.columns, raw / size], axis=2))
     std = np.concatenate([prior_std(fit.hypothesis), np.full(raw.shape[2], _likely(raw, fit.residual))])
@@ -298,34 +313,43 @@ def _solved(white: Array, series: Array, std: Array) -> Array:
     return WhitenedLeastSquares.of(white, series, std, np.zeros_like(std)).solution()
 
 
-def _chance(fit: Fit, raw: Array) -> float:
-    """By what factor columns (M, A, c) lower the deviance more than chi-square of noise of the fit's colour, as the
-    noise that is estimated anew bends to them; at least 1.
+def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
+    """By what factor a group of functions lowers the deviance more than chi-square in made-up recordings, as the noise
+    that is estimated anew bends to them; at least 1.
     """
-    rng = np.random.default_rng(0)
-    lowered, dof = PRIOR_DOF, PRIOR_DOF
-    for _ in range(MADE_UP // 2):
-        drop, rank, _ = _recoloured(
-            fit.noise, fit.columns, raw, fit.noise.unwhiten(rng.standard_normal(raw[..., 0].size))
-        )
+    lowered, dof, sound = PRIOR_DOF, PRIOR_DOF, ~_upset(fitter, fit.noise)[:, None]
+    for other, seen, residual in made_up(fitter.problem, fit, MADE_UP // 2):
+        known = replace(fitter, problem=other).columns(fit.hypothesis, seen)
+        raw = _along_axes(dictionary(other, seen)[name] * sound, other.axes)
+        drop, rank, _ = _recoloured(fit, known, raw, residual)
         lowered, dof = lowered + drop, dof + rank
     return max(1.0, lowered / dof)
 
 
-def _recoloured(noise: Noise, known: Array, raw: Array, residual: Array) -> tuple[float, int, Noise]:
-    """By what columns (M, A, c) lower the deviance, their rank beside those known, and the noise, estimated anew from
-    what they leave: else it has their colour.
+def _recoloured(fit: Fit, known: Array, raw: Array, residual: Array) -> tuple[float, int, Noise]:
+    """By what columns (M, A, c) beside those of the fit (M, A, 6 + p) lower the deviance of a residual, how many of
+    them are independent, and the noise, estimated anew from what they leave: else it has their colour.
     """
+    beside, rank, noise = _coloured_anew(fit, known, raw, residual)
+    alone, own_rank, _ = _coloured_anew(fit, known, raw[:, :, :0], residual)
+    return max(alone - beside, 0.0), max(rank - own_rank, 1), noise
+
+
+def _coloured_anew(fit: Fit, known: Array, raw: Array, residual: Array) -> tuple[float, int, Noise]:
+    """Deviance of what all columns leave under the noise that is estimated anew from it, their rank, that noise."""
     joined = np.concatenate([known, raw], axis=2)
-    joined = joined / np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
-    left, colour = residual, noise.white
+    size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
+    joined = joined / size
+    std = prior_std(fit.hypothesis) * size[: known.shape[2]]
+    held = np.eye(joined.shape[2])[: len(std)] / std[:, None]
+    vector = fit.hypothesis.vector() * size[: len(std)] / std
+    left, colour = residual, fit.noise.white
     for _ in range(2):
         white = colour.whiten(joined)
-        left = residual - joined @ np.linalg.lstsq(white, colour.whiten(residual), rcond=INDEPENDENT)[0]
-        colour = noise.like(left)
-    rank = _orthonormal(white).shape[1] - known.shape[2]
-    drop = noise.deviance(residual) - colour.deviance(left)
-    return max(drop, 0.0), max(rank, 1), colour
+        rows, series = np.concatenate([white, held]), np.concatenate([colour.whiten(residual), vector])
+        left = residual - joined @ np.linalg.lstsq(rows, series, rcond=INDEPENDENT)[0]
+        colour = fit.noise.like(left)
+    return colour.deviance(left), _orthonormal(white).shape[1], colour
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

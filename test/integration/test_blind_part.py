@@ -80,6 +80,14 @@ def test_nothing_is_guessed_where_the_data_cannot_tell(scored):
     assert all(case.no_guess for case in scored[Category.UNIDENTIFIABLE])
 
 
+def test_the_scale_of_a_sway_that_is_noise_explains_no_noise(tmp_path):
+    """Of a DVL of 2 Hz that has lost some samples: with the heading it did, and the rest followed a period of 85 s."""
+    trial = Trial(tmp_path / "trial", seed=25401, jobs=1)
+    answers = trial.run([Case(Category.HARD_NULL, "box", hardness="gaps", number=21)])
+    [case] = join(unseal(trial.sealed), answers)
+    assert case.verdict == "no_gap"
+
+
 # ------------------------------------------------------------------ real motion
 
 
