@@ -133,19 +133,26 @@ def opened_arm(guesses: Sequence[FirstGuess]) -> dict[str, tuple[float, float]]:
     return {name: (by, late) for name, by in zip(ARM_PARAMETERS, least.open_by[3:6].tolist(), strict=True)}
 
 
-def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> list[Array]:
-    """(6 + p,) by how much the lever arm of a fit is another by what explains the data as well; the farthest.
+def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
+    """By parameter of the lever arm, by how much (m) it is another by what explains the data as well; the farthest.
 
     rivals: with another clock.
     """
-    moved: list[Array] = []
-    for rival in (each for each in rivals if ARM in each.values):
-        step = np.zeros(len(fit.hypothesis.vector()))
-        for i, each in enumerate(fit.hypothesis.parameters()):
-            if each.effect.name == ARM:
-                step[6 + i] = rival.values[ARM][0].get(each.spec.name, 0.0) - fit.hypothesis.value(each)
-        moved.append(step)
-    return sorted(moved, key=lambda step: -float(step @ step))[:1]
+    if ARM not in fit.values:
+        return {}
+    own, others = fit.values[ARM][0], [each.values[ARM][0] for each in rivals if ARM in each.values]
+    moved = [{name: other.get(name, 0.0) - value for name, value in own.items()} for other in others]
+    return max(moved, key=lambda each: sum(by**2 for by in each.values()), default={})
+
+
+def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
+    """A covariance (6 + p, 6 + p) in which the lever arm may be another, as `moved_arm` has it."""
+    parameters = enumerate(fit.hypothesis.parameters(), start=6)
+    at = {each.spec.name: i for i, each in parameters if each.effect.name == ARM}
+    step = np.zeros(len(covariance))
+    for name in at.keys() & moved.keys():
+        step[at[name]] = moved[name]
+    return np.asarray(covariance + np.outer(step, step))
 
 
 def with_open(fit: Fit, covariance: Array, opened: Mapping[str, tuple[float, float]]) -> Array:

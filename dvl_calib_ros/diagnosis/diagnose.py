@@ -20,7 +20,7 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_or_arm import ARM, CLOCKS, LAG, Combination, combination, opened_combination, with_open
+from .clock_or_arm import ARM, CLOCKS, LAG, Combination, combination, opened_combination, with_moved, with_open
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
@@ -116,8 +116,7 @@ def diagnose_recordings(
         moved = moved_by(selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
     unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
-    for step in selection.moved:
-        covariance = covariance + np.outer(step, step)
+    covariance = with_moved(selection.fit, covariance, selection.moved)
     found = tuple(
         _found(selection, each, covariance, unmoved, times, len(testable), gap) for each in selection.selected
     )

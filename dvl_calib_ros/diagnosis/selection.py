@@ -86,7 +86,7 @@ class EffectSelection:
     """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
     fitter; guesses per recording; the effects there were, with what of each is shown. opened: by part of the lever
     arm, what a second of the reference's clock makes of it and how late that may be (σ, s), at one speed.
-    moved: (6 + p,) each, m, by which the lever arm is another where another clock explains the data as well.
+    moved: by part of the lever arm, by how much (m) it is another where another clock explains the data as well.
     """
 
     selected: tuple[Selected, ...]
@@ -96,11 +96,11 @@ class EffectSelection:
     guesses: tuple[FirstGuess, ...]
     testable: Mapping[str, Effect]
     opened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    moved: tuple[Array, ...] = ()
+    moved: Mapping[str, float] = field(default_factory=dict)
 
     def withdrawn(self) -> EffectSelection:
         """Without any effect."""
-        return replace(self, selected=(), fit=self.base, opened={}, moved=())
+        return replace(self, selected=(), fit=self.base, opened={}, moved={})
 
 
 def started(
@@ -187,12 +187,12 @@ def select(
         selected = [
             _or_else(each, [*each.equivalent, CLOCKS[1]]) if each.effect.name == LAG else each for each in selected
         ]
-    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, [])
+    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, {})
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, CLOCKS[:2]) if each.effect.name in CLOCKS[:2] else each for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
-    return EffectSelection(ordered, base, fit, fitter, guesses, effects, opened, tuple(moved))
+    return EffectSelection(ordered, base, fit, fitter, guesses, effects, opened, moved)
 
 
 # ------------------------------------------------------------------ noise
