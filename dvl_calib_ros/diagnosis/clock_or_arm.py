@@ -21,6 +21,8 @@ ARM_PARAMETERS = "x_m", "y_m", "z_m"
 GUESSED_STD_M = 0.2
 # A part of the arm is a clock's as well if, with clocks free, it is known so many times worse, and not to so many σ.
 WORSE, SHOWN = 2.0, 2.0
+# At one speed, arm and clock are one whatever the fit with both says, if that knows the arm so many times worse
+AS_ONE = 3.5
 # Metres of the arm that are a clock's as well, from which on neither is known better than registration knows them
 OPEN_M = 0.1
 CLOCKS = ("dvl_time_offset", "reference_time_offset")
@@ -94,7 +96,7 @@ def with_clocks(
     opened: Mapping[str, tuple[float, float]],
 ) -> Fit | None:
     """The fit with both clocks beside the lever arm that it has, if a part of that is as likely theirs; else the fit.
-    None where the two are so much one that no fit holds them.
+    None where the two are one, and the fit stays as it is.
 
     block: (M,), of each bin, by which σ is found. opened: as `opened_arm` has it; where that is much, a part that is
     another with clocks free, beyond chance, is as likely theirs as well.
@@ -113,7 +115,9 @@ def with_clocks(
     was_shown, is_shown = np.abs(own) > SHOWN * own_std, np.abs(free) > SHOWN * free_std
     by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # of the other, where no clock is late
     is_another = ~is_shown | (bool(opened) & (np.abs(free - own) > SHOWN * by_chance))
-    return joint if bool((was_shown & is_another & (free_std > WORSE * own_std)).any()) else fit
+    if bool((was_shown & is_another & (free_std > WORSE * own_std)).any()):
+        return joint
+    return None if opened and bool((was_shown & (free_std > AS_ONE * own_std)).any()) else fit
 
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:

@@ -98,6 +98,17 @@ def test_at_one_speed_a_late_reference_is_named_and_the_interval_of_the_arm_hold
             assert known.parameter == "x_m" and low - 0.03 < ARM[0] - known.speed * late < high + 0.03
 
 
+def test_at_one_speed_an_arm_is_one_with_the_clocks_and_what_is_known_of_both_is_said():
+    arm = found(diagnose_recordings([boat(1, 0.3)], Parameters()))["lever_arm"]
+    assert arm.equivalent_to == ("dvl_time_offset", "reference_time_offset")
+    known = arm.combination
+    assert known is not None and (known.parameter, known.clock) == ("x_m", "reference_time_offset")
+    _, low, high = known.value
+    assert low - 0.02 < ARM[0] < high + 0.02 and high - low < 0.1
+    _, low, high = arm.parameters["x_m"]
+    assert high - low > 1.0
+
+
 def test_a_compass_with_two_cycles_is_named_for_runs_that_disagree_in_yaw_and_no_mounting_moved():
     """It was a mounting that moved, beside one cycle of the compass, and what is left was unknown."""
     diagnosis = days(compass=(lambda yaw, _: TWO * np.sin(2.0 * yaw + 1.0),) * 3, cross=(False,) * 3)
