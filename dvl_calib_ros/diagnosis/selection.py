@@ -220,7 +220,7 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
     noise = fit.noise
     raw = fit.residual + fitter.outliers
     for _ in range(2):
-        explained = _explained(noise, columns, raw - fitter.outliers, prior_std(fit.hypothesis))
+        explained = _explained(noise, columns, raw - fitter.outliers)
         left = raw - explained
         noise, robust = min(
             (estimated(problem, fit.seen, left, rotation) for rotation in _frames(problem)),
@@ -237,16 +237,11 @@ def _frames(problem: Problem) -> list[Array | None]:
     return [None] if problem.earth_from_compared is None else [problem.earth_from_compared, None]
 
 
-def _explained(noise: Noise, columns: Array, residual: Array, likely: Array) -> Array:
-    """(M, A) what all columns explain of a residual, with a ridge that keeps those apart that are alike.
-
-    likely: (n,) standard deviations of the first n of them: the scale of a sway that is hardly there, which is noise,
-    would explain that noise.
-    """
+def _explained(noise: Noise, columns: Array, residual: Array) -> Array:
+    """(M, A) what all columns explain of a residual, with a ridge that keeps those apart that are alike."""
     size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
     white = noise.whiten(columns / size)
     ridge = np.full(columns.shape[2], 10.0 * np.sqrt(float((noise.whiten(residual) ** 2).sum())) / np.sqrt(len(white)))
-    ridge[: len(likely)] = np.minimum(ridge[: len(likely)], likely * size[: len(likely)])
     solution = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge)).solution()
     return np.asarray((columns / size) @ solution)
 
