@@ -65,6 +65,7 @@ def compare(
 
 def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
     """`compare`, of sides that are read and explained already."""
+    effects = {name: effect.usual for name, effect in effects.items()}
     selections = vehicle.selection, simulator.selection
     if selections[0] is None or selections[1] is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)

@@ -192,7 +192,7 @@ def put_right(
     corrected: dict[str, Any] = deepcopy(dict(document))
     by_name = {each["name"]: each for each in corrected["effects"]}
     for compared in (each for each in comparison.effects if each.status.is_claim):
-        effect = effects[compared.name]
+        effect = effects[compared.name].usual
         if effect.relative_to_first or any(" of " in key for key in compared.vehicle):
             continue  # another size every day, of which a simulator has one
         entry = by_name.get(effect.name)

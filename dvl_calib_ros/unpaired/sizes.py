@@ -142,7 +142,7 @@ def fitted(selection: EffectSelection, names: Sequence[str], effects: Mapping[st
     fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
     n = len(problem.recordings)
-    chosen = [effects[name].usual for name in names if is_testable(effects[name], selection)]
+    chosen = [effects[name] for name in names if is_testable(effects[name], selection)]
     start: dict[str, tuple[Values, ...]] = {}
     for effect in chosen:
         if effect not in fit.effects:
