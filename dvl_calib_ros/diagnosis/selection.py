@@ -120,7 +120,8 @@ def started(
         "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
     }
     present = [effects[name] for name in START if name in effects]
-    start = no_effect(np.median([guess.phi for guess in guesses], axis=0)).with_effects(present, len(guesses), found)
+    phi = problem.shown_turns @ np.median([guess.phi for guess in guesses], axis=0)
+    start = no_effect(phi).with_effects(present, len(guesses), found)
     return problem, start, guesses, effects
 
 
