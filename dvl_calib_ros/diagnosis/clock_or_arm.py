@@ -11,11 +11,15 @@ from ..calibration.frames import Array
 from ..calibration.samples import Index
 from ..effects.base import Effect
 from .composed import Hypothesis, Values
-from .fitting import OF_INTERVAL, Fit, Fitter
+from .fitting import Fit, Fitter, around
 from .registered import FirstGuess
 from .settings import SETTINGS
 
 ARM, LAG = "lever_arm", "reference_lag"
+DVL_CLOCK, REFERENCE_CLOCK, ATTITUDE_CLOCK = "dvl_time_offset", "reference_time_offset", "attitude_time_offset"
+CLOCKS = DVL_CLOCK, REFERENCE_CLOCK, ATTITUDE_CLOCK
+# What any two of the three say is told by these
+TWO_CLOCKS = DVL_CLOCK, REFERENCE_CLOCK
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
 # A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
 GUESSED_STD_M = 0.2
@@ -25,7 +29,6 @@ WORSE, SHOWN = 2.0, 2.0
 AS_ONE = 3.5
 # Metres of the arm that are a clock's as well, from which on neither is known better than registration knows them
 OPEN_M = 0.1
-CLOCKS = ("dvl_time_offset", "reference_time_offset")
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,16 @@ class Combination:
     clock: str
     speed: float
     value: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class OpenArm:
+    """How far lever arm and the reference's clock are one. by: parameter of the arm -> by how much (m) a second of the
+    clock makes it another. late: how late the clock may be, σ, s.
+    """
+
+    by: Mapping[str, float]
+    late: float
 
 
 def is_open(guesses: Sequence[FirstGuess]) -> bool:
@@ -67,18 +80,18 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
     As it is where no clock is in it, or the other explains less.
     """
     present = [effect.name for effect in fit.effects]
-    own = [name for name in CLOCKS if name in present]
+    own = [name for name in TWO_CLOCKS if name in present]
     if not own or ARM not in effects or not is_open(guesses):
         return fit
     shown = {name for each in guesses if each.registration is not None for name in each.registration.offsets}
-    clocks = [name for name in CLOCKS if name in shown] or own
-    if not shown <= {*CLOCKS} or {*clocks, ARM} == {*own, *(name for name in present if name == ARM)}:
+    clocks = [name for name in TWO_CLOCKS if name in shown] or own
+    if not shown <= {*TWO_CLOCKS} or {*clocks, ARM} == {*own, *(name for name in present if name == ARM)}:
         return fit
-    rest = [effect for effect in fit.effects if effect.name not in (*CLOCKS, ARM)]
+    rest = [effect for effect in fit.effects if effect.name not in (*TWO_CLOCKS, ARM)]
     start: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
-        CLOCKS[0]: tuple({"seconds": each.offsets.dvl} for each in guesses),
-        CLOCKS[1]: tuple({"seconds": each.offsets.reference} for each in guesses),
+        DVL_CLOCK: tuple({"seconds": each.offsets.dvl} for each in guesses),
+        REFERENCE_CLOCK: tuple({"seconds": each.offsets.reference} for each in guesses),
     }
     wanted = [*rest, effects[ARM], *(effects[name] for name in clocks if name in effects)]
     if len(wanted) > SETTINGS.max_effects:
@@ -93,7 +106,7 @@ def with_clocks(
     guesses: Sequence[FirstGuess],
     effects: Mapping[str, Effect],
     block: Index,
-    opened: Mapping[str, tuple[float, float]],
+    opened: OpenArm | None,
 ) -> Fit | None:
     """The fit with both clocks beside the lever arm that it has, if a part of that is as likely theirs; else the fit.
     None where the two are one, and the fit stays as it is.
@@ -105,36 +118,35 @@ def with_clocks(
     down; and what turns make of the instruments there, a model that has no clocks calls the arm's.
     """
     present = [effect.name for effect in fit.effects]
-    clocks = [effects[name] for name in CLOCKS if name in effects and name not in present]
+    clocks = [effects[name] for name in TWO_CLOCKS if name in effects and name not in present]
     if ARM not in present or not clocks or not is_open(guesses):
         return fit
     joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], len(fit.seen), {}), fit.noise)
-    if opened and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
+    if opened is not None and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
         return None
     (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
     was_shown, is_shown = np.abs(own) > SHOWN * own_std, np.abs(free) > SHOWN * free_std
     by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # of the other, where no clock is late
-    is_another = ~is_shown | (bool(opened) & (np.abs(free - own) > SHOWN * by_chance))
+    is_another = ~is_shown | ((opened is not None) & (np.abs(free - own) > SHOWN * by_chance))
     if bool((was_shown & is_another & (free_std > WORSE * own_std)).any()):
         return joint
-    return None if opened and bool((was_shown & (free_std > AS_ONE * own_std)).any()) else fit
+    return None if opened is not None and bool((was_shown & (free_std > AS_ONE * own_std)).any()) else fit
 
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
     """The parameters (p,) of the lever arm and their σ (p,), as blocks scatter."""
-    at = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == ARM]
+    at = [*_places(fit, ARM).values()]
     return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
 
 
-def opened_arm(guesses: Sequence[FirstGuess]) -> dict[str, tuple[float, float]]:
-    """By parameter of the lever arm, by how much (m) a second of the reference's clock makes it another, and how late
-    (σ, s) that may be; of the recording that leaves it least open. Nothing where one leaves next to nothing open."""
+def opened_arm(guesses: Sequence[FirstGuess]) -> OpenArm | None:
+    """As the recording has it that leaves it least open; None where one leaves next to nothing open."""
     found = [each.registration for each in guesses if each.registration is not None]
     least = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
     if least is None or np.trace(least.left_open[3:6, 3:6]) < OPEN_M**2:
-        return {}
+        return None
     late = float(np.sqrt(np.trace(least.left_open) / (least.open_by @ least.open_by)))
-    return {name: (by, late) for name, by in zip(ARM_PARAMETERS, least.open_by[3:6].tolist(), strict=True)}
+    return OpenArm(dict(zip(ARM_PARAMETERS, least.open_by[3:6].tolist(), strict=True)), late)
 
 
 def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
@@ -151,51 +163,51 @@ def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
 
 def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
     """A covariance (6 + p, 6 + p) in which the lever arm may be another, as `moved_arm` has it."""
-    parameters = enumerate(fit.hypothesis.parameters(), start=6)
-    at = {each.spec.name: i for i, each in parameters if each.effect.name == ARM}
     step = np.zeros(len(covariance))
-    for name in at.keys() & moved.keys():
-        step[at[name]] = moved[name]
+    for name, i in _places(fit, ARM).items():
+        step[i] = moved.get(name, 0.0)
     return np.asarray(covariance + np.outer(step, step))
 
 
-def with_open(fit: Fit, covariance: Array, opened: Mapping[str, tuple[float, float]]) -> Array:
+def with_open(fit: Fit, covariance: Array, opened: OpenArm | None) -> Array:
     """A covariance (6 + p, 6 + p) in which lever arm and the reference's clock are known no better than registration
     knows them, which does not take turns between samples for what a fit makes of them."""
-    if not opened:
+    if opened is None:
         return covariance
-    (_, late), *_ = opened.values()
-    step, known = np.zeros(len(covariance)), 0.0
-    for i, each in enumerate(fit.hypothesis.parameters(), start=6):
-        if each.effect.name == ARM:
-            step[i] = opened[each.spec.name][0]
-        elif each.effect.name == CLOCKS[1]:
-            step[i], known = 1.0, max(known, float(covariance[i, i]))
-    return np.asarray(covariance + max(late**2 - known, 0.0) * np.outer(step, step))
+    clock = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == REFERENCE_CLOCK]
+    step = np.zeros(len(covariance))
+    step[clock] = 1.0
+    for name, i in _places(fit, ARM).items():
+        step[i] = opened.by[name]
+    known = max(np.diag(covariance)[clock].tolist(), default=0.0)
+    return np.asarray(covariance + max(opened.late**2 - known, 0.0) * np.outer(step, step))
 
 
-def opened_combination(fit: Fit, covariance: Array, opened: Mapping[str, tuple[float, float]]) -> Combination | None:
+def opened_combination(fit: Fit, covariance: Array, opened: OpenArm | None) -> Combination | None:
     """What is known of the lever arm and the reference's clock by a fit of one recording that has no such clock."""
-    at = {each.spec.name: 6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == ARM}
-    if not opened or not at or len(fit.seen) > 1:
+    at = _places(fit, ARM)
+    if opened is None or not at or len(fit.seen) > 1:
         return None
-    name = max(at, key=lambda each: abs(opened[each][0]))
+    name = max(at, key=lambda each: abs(opened.by[each]))
     value, std = float(fit.hypothesis.vector()[at[name]]), float(np.sqrt(covariance[at[name], at[name]]))
-    return Combination(name, CLOCKS[1], opened[name][0], (value, value - OF_INTERVAL * std, value + OF_INTERVAL * std))
+    return Combination(name, REFERENCE_CLOCK, opened.by[name], around(value, std))
 
 
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     """What is known of arm and clock of one recording, by a fit that has both and its covariance (6 + p, 6 + p)."""
-    at = {(each.effect.name, each.spec.name): 6 + i for i, each in enumerate(fit.hypothesis.parameters())}
-    delay = at.get((clock, "seconds"))
-    if delay is None or len(fit.seen) > 1:
+    arm, delay = _places(fit, ARM), _places(fit, clock).get("seconds")
+    if delay is None or not arm or len(fit.seen) > 1:
         return None
     vector = fit.hypothesis.vector()
-    speeds = {name: float(covariance[i, delay] / covariance[delay, delay]) for (e, name), i in at.items() if e == ARM}
-    if not speeds:
-        return None
+    speeds = {name: float(covariance[i, delay] / covariance[delay, delay]) for name, i in arm.items()}
     name = max(speeds, key=lambda each: abs(speeds[each]))
-    arm, speed = at[ARM, name], speeds[name]
-    value = float(vector[arm] - speed * vector[delay])
-    std = float(np.sqrt(max(covariance[arm, arm] - speed**2 * covariance[delay, delay], 0.0)))
-    return Combination(name, clock, speed, (value, value - OF_INTERVAL * std, value + OF_INTERVAL * std))
+    at, speed = arm[name], speeds[name]
+    value = float(vector[at] - speed * vector[delay])
+    std = float(np.sqrt(max(covariance[at, at] - speed**2 * covariance[delay, delay], 0.0)))
+    return Combination(name, clock, speed, around(value, std))
+
+
+def _places(fit: Fit, effect: str) -> dict[str, int]:
+    """Where the parameters of an effect stand in a fit's vector, by name; of a recording each, the last one's."""
+    parameters = enumerate(fit.hypothesis.parameters(), start=6)
+    return {each.spec.name: i for i, each in parameters if each.effect.name == effect}

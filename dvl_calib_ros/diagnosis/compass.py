@@ -9,7 +9,6 @@ mounting hardly ever, so it is named first: but where the same heading on anothe
 from __future__ import annotations
 
 from collections.abc import Collection
-from copy import copy
 
 from ..effects.base import Effect
 from .composed import Hypothesis, Values
@@ -66,9 +65,7 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
 def _two_cycles(heading: Effect) -> tuple[Effect, Effect]:
     """The same in all recordings, and another in each."""
     of_day = heading.without({OF_DRIFT})
-    of_vehicle = copy(of_day)
-    vars(of_vehicle)["of_the_day"] = False
-    return of_vehicle, of_day
+    return of_day.of_the_vehicle, of_day
 
 
 def _names(effect: Effect) -> frozenset[str]:

@@ -20,11 +20,11 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_or_arm import ARM, CLOCKS, LAG, Combination, combination, opened_combination, with_moved, with_open
+from .clock_or_arm import ARM, LAG, TWO_CLOCKS, Combination, combination, opened_combination, with_moved, with_open
 from .closure import Gap, closure_alone, held_out, measure_gap
 from .composed import amplitudes, is_time_of_run
 from .dvl import dvl_seen
-from .fitting import OF_INTERVAL, prior_std
+from .fitting import around, prior_std
 from .intervals import Times, Triple, covariance_of
 from .least_squares import WhitenedLeastSquares
 from .noise_findings import noise_findings
@@ -138,7 +138,7 @@ def diagnose_recordings(
         next_steps=_next_steps(verdict, selection.selected, testable, untestable, detectable),
         notes=tuple(notes),
         series=collect_series(selection, residuals, rest, covariance) if with_series else None,
-        calibration=tuple(_interval(float(value), std) for value, std in calibration),
+        calibration=tuple(around(float(value), std) for value, std in calibration),
         compared_axes=_compared_axes(selection),
         recordings=tuple((recording.name, recording.first_ns) for recording in recordings),
         twins=twins(selection),
@@ -158,10 +158,6 @@ def _check_bounds(selection: EffectSelection) -> None:
                 f"{name}: {each.effect.name} comes out at {value:+.3g} {spec.unit}, the end of what can be diagnosed "
                 "and taken off: set that clock right, or correct the stamps in the bag"
             )
-
-
-def _interval(value: float, std: float) -> Triple:
-    return value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
 
 
 def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
@@ -276,7 +272,7 @@ def _found(
     for parameter, std in zip(fit.hypothesis.parameters(), stds, strict=True):
         if parameter.effect is effect:
             of_recording = by_recording.setdefault(parameter.recording or 0, {})
-            of_recording[parameter.spec.name] = _interval(fit.hypothesis.value(parameter), std)
+            of_recording[parameter.spec.name] = around(fit.hypothesis.value(parameter), std)
     for recording, parameters in by_recording.items():
         for spec in filter(is_time_of_run, effect.parameters):
             parameters[spec.name] = times[effect.name, recording, spec.name]
@@ -303,9 +299,9 @@ def _known_together(selection: EffectSelection, covariance: Array, selected: Sel
     fit, name, others = selection.fit, selected.effect.name, selected.equivalent
     if LAG in fit.values:  # which takes in a part of the delay
         return None
-    if name == ARM and others and not {*CLOCKS} & fit.values.keys():
+    if name == ARM and others and not {*TWO_CLOCKS} & fit.values.keys():
         return opened_combination(fit, covariance, selection.opened)
-    clocks = [name] if ARM in others else [each for each in others if each in CLOCKS] if name == ARM else []
+    clocks = [name] if ARM in others else [each for each in others if each in TWO_CLOCKS] if name == ARM else []
     each = [found for clock in clocks if (found := combination(fit, covariance, clock)) is not None]
     return min(each, key=lambda one: one.value[2] - one.value[1], default=None)
 
@@ -319,7 +315,7 @@ def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:
             mean[name] = first
             continue
         weight = 1.0 / np.maximum((values[:, 2] - values[:, 1]) / 3.92, 1e-12) ** 2
-        mean[name] = _interval(float(weight @ values[:, 0] / weight.sum()), float(weight.sum() ** -0.5))
+        mean[name] = around(float(weight @ values[:, 0] / weight.sum()), float(weight.sum() ** -0.5))
     return mean
 
 

@@ -45,6 +45,11 @@ OF_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
 
 
+def around(value: float, std: float) -> tuple[float, float, float]:
+    """A value with its interval of 95 per cent."""
+    return value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
+
+
 def prior_std(hypothesis: Hypothesis) -> Array:
     """(6 + p,) standard deviations of the prior of calibration and effects."""
     own = [PRIOR_IN_TYPICAL * each.spec.typical for each in hypothesis.parameters()]

@@ -14,15 +14,14 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..effects.base import ActsOn, Effect
-from .clock_or_arm import ARM
+from .clock_or_arm import ARM, CLOCKS, DVL_CLOCK, LAG
 from .composed import Hypothesis, Values
 from .fitting import Fit, Fitter
 from .settings import SETTINGS
 
-LEAP, CLOCKS = "time_offset_jump", ("dvl_time_offset", "reference_time_offset", "attitude_time_offset")
-DVL_CLOCK = CLOCKS[0]
+LEAP = "time_offset_jump"
 # Effects of time, of which one is wrong where a clock leaps, and of these such as stand in for a leap
-OF_TIME = (*CLOCKS, "reference_lag", "clock_drift", LEAP)
+OF_TIME = (*CLOCKS, LAG, "clock_drift", LEAP)
 STANDS_IN = (DVL_CLOCK, "clock_drift", LEAP)
 # Delays that are tried, s, about those of the fit; parts of the run between which one leap may lie, and of how many of
 # them a delay is, or it is not to be told from how a run begins or ends

@@ -15,7 +15,7 @@ from ..calibration.robust import robust_std
 from .claims import claims_of, followed, stretches_of
 from .closure import claimed_std, high_frequency_variance
 from .composed import Problem
-from .fitting import OF_INTERVAL, Fit, Fitter
+from .fitting import OF_INTERVAL, Fit, Fitter, around
 from .holm import holm
 from .levels import SIGNIFICANT, fit_claims, fit_level
 from .made_up import made_up
@@ -154,11 +154,7 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}
         z = normal_isf(np.maximum(level.p_of, 1e-300) / 2.0)
         parameters = {
-            units[name]: (
-                float(slope),
-                float(slope - OF_INTERVAL * abs(slope) / z_of),
-                float(slope + OF_INTERVAL * abs(slope) / z_of),
-            )
+            units[name]: around(float(slope), float(abs(slope) / z_of))
             for name, slope, z_of, p in zip(level.names, level.slopes, z, level.p_of, strict=True)
             if p < LEVEL
         }
@@ -177,6 +173,6 @@ def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFindin
         return None
     parameters, p_values = {}, []
     for name, value, std in zip(found.names, found.exponents.tolist(), found.stds.tolist(), strict=True):
-        parameters[f"{name}_exponent"] = value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
+        parameters[f"{name}_exponent"] = around(value, std)
         p_values.append(2.0 * float(normal_sf(abs(value - (0.0 if value > HALF else 1.0)) / std)))
     return NoiseFinding("reported_covariance", parameters, float(min(1.0, len(p_values) * min(p_values))))

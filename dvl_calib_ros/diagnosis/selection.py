@@ -20,12 +20,27 @@ from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..calibration.register.registration import IN_TIME_STD_S
 from ..effects.base import Effect
-from .clock_or_arm import ARM, LAG, guessed_arm, is_open, moved_arm, opened_arm, with_arm, with_clocks
+from .clock_or_arm import (
+    ARM,
+    ATTITUDE_CLOCK,
+    CLOCKS,
+    DVL_CLOCK,
+    LAG,
+    REFERENCE_CLOCK,
+    TWO_CLOCKS,
+    OpenArm,
+    guessed_arm,
+    is_open,
+    moved_arm,
+    opened_arm,
+    with_arm,
+    with_clocks,
+)
 from .compass import HEADING, heading_first, with_two_cycles
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
-from .leaps import CLOCKS, DVL_CLOCK, LEAP, leaping
+from .leaps import LEAP, leaping
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
@@ -84,8 +99,7 @@ class Selected:
 @dataclass(frozen=True)
 class EffectSelection:
     """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
-    fitter; guesses per recording; the effects there were, with what of each is shown. opened: by part of the lever
-    arm, what a second of the reference's clock makes of it and how late that may be (σ, s), at one speed.
+    fitter; guesses per recording; the effects there were, with what of each is shown. opened: at one speed.
     moved: by part of the lever arm, by how much (m) it is another where another clock explains the data as well.
     """
 
@@ -95,12 +109,12 @@ class EffectSelection:
     fitter: Fitter
     guesses: tuple[FirstGuess, ...]
     testable: Mapping[str, Effect]
-    opened: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    opened: OpenArm | None = None
     moved: Mapping[str, float] = field(default_factory=dict)
 
     def withdrawn(self) -> EffectSelection:
         """Without any effect."""
-        return replace(self, selected=(), fit=self.base, opened={}, moved={})
+        return replace(self, selected=(), fit=self.base, opened=None, moved={})
 
 
 def started(
@@ -171,27 +185,28 @@ def select(
     fit, alike = heading_first(fitter, fit, heading)
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
-    opened = opened_arm(guesses) if ARM in fit.values else {}
+    opened = opened_arm(guesses) if ARM in fit.values else None
     if is_open(guesses):
         selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened)
     selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
-    rivals = [one for each in selected if opened and each.effect.name in CLOCKS for one in each.rivals]
+    rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
     clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
     if freed is None:
-        clocks = tuple(name for name in CLOCKS[:2] if name not in fit.values)
+        clocks = tuple(name for name in TWO_CLOCKS if name not in fit.values)
     if clocks:
         selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
-    if any(each.effect.name == ARM and CLOCKS[1] in each.equivalent for each in selected):
-        opened = {name: (by, IN_TIME_STD_S) for name, (by, _) in opened.items()}  # only the two together are known
-    if opened:  # what tells a lag from a delay is less than what lies between samples
+    if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
+        opened = replace(opened, late=IN_TIME_STD_S)  # only the two together are known
+    if opened is not None:  # what tells a lag from a delay is less than what lies between samples
         selected = [
-            _or_else(each, [*each.equivalent, CLOCKS[1]]) if each.effect.name == LAG else each for each in selected
+            _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
+            for each in selected
         ]
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, {})
     base = fitter.fit_kept(fit.hypothesis.with_effects([], len(recordings), {}), fit.noise)
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
-        selected = [_or_else(each, CLOCKS[:2]) if each.effect.name in CLOCKS[:2] else each for each in selected]
+        selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
     ordered = tuple(sorted(selected, key=lambda each: each.log_p))
     return EffectSelection(ordered, base, fit, fitter, guesses, effects, opened, moved)
 
@@ -362,7 +377,7 @@ def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[H
 def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
     """Of three clocks only two differences matter: what any two say is told by those of DVL and reference."""
     names = {table.variants[index].effect.name for index in chosen}
-    return CLOCKS[2] not in names or len(names & set(CLOCKS)) == 1
+    return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
 
 
 def _told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
@@ -382,8 +397,8 @@ def _told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect
         dvl = dvl + [each["seconds"] for each in values[LEAP]]
     rest = [effect for effect in fit.effects if effect.name not in said]
     told = [
-        {CLOCKS[2]: -0.5 * (dvl + reference)}, {CLOCKS[0]: dvl - reference}, {CLOCKS[1]: reference - dvl},
-        {CLOCKS[0]: dvl, CLOCKS[1]: reference},
+        {ATTITUDE_CLOCK: -0.5 * (dvl + reference)}, {DVL_CLOCK: dvl - reference}, {REFERENCE_CLOCK: reference - dvl},
+        {DVL_CLOCK: dvl, REFERENCE_CLOCK: reference},
     ]  # fmt: skip
     found = []
     for one in told:
@@ -403,7 +418,7 @@ def _leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
     """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
-    if not set(CLOCKS[:2]) <= set(fit.values) and not _leaps_at_the_beginning(fitter, fit):
+    if not set(TWO_CLOCKS) <= set(fit.values) and not _leaps_at_the_beginning(fitter, fit):
         return fit
     others = [
         fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in _told_by_other_clocks(fitter, fit, effects)
@@ -755,7 +770,7 @@ def _clock_or_arm(
     selected: list[Selected],
     n_effects: int,
     called_for: Sequence[Effect],
-    opened: Mapping[str, tuple[float, float]] | None = None,
+    opened: OpenArm | None,
 ) -> list[Selected]:
     """Lever arm and clock as one where each would do without the other.
 
@@ -764,15 +779,16 @@ def _clock_or_arm(
     """
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
+    late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
+    is_late = opened is None or max(late, default=0.0) >= LATER * opened.late
+
     def is_shown(each: Selected) -> bool:
-        if opened and each.effect.name == CLOCKS[1]:
-            (_, late), *_ = opened.values()
-            if max(abs(own["seconds"]) for own in fit.values[CLOCKS[1]]) < LATER * late:
-                return False
+        if each.effect.name == REFERENCE_CLOCK and not is_late:
+            return False
         return each.log_p <= threshold and _robust_p(fit, each.effect, block) < SETTINGS.robust_level
 
     own = {each.effect.name: each for each in selected}
-    arm, clocks = own.get(ARM), [own[name] for name in CLOCKS[:2] if name in own]
+    arm, clocks = own.get(ARM), [own[name] for name in TWO_CLOCKS if name in own]
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)

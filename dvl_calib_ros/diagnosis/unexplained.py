@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,11 +79,10 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     to be clearer than its price to be of use; where that cannot be, nothing is found, and at once.
     """
     problem, noise = fitter.problem, fit.noise
-    looks, white, raw = _looked(fitter, fit, problem, fit.seen, fit.residual)
+    looks, white, raw, known = _looked(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
     followed = lines(problem, white[: fit.residual.size].reshape(-1, problem.axes))
     tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
-    known, _ = _beside_prior(fit, noise.whiten(fit.columns), noise.whiten(fit.residual))
     if asked > -np.inf:
         most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
         for line in followed:
@@ -94,9 +94,10 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             return Unexplained(0.0, 0.0, "", nothing, nothing)
     recoloured: list[FollowTest] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
+        alone = _coloured_anew(fit, fit.columns, nothing, fit.residual)
         for name, columns in raw.items():
             if name != "time":
-                drop, rank, _ = _recoloured(fit, fit.columns, columns, fit.residual)
+                drop, rank = alone.lowered_by(_coloured_anew(fit, fit.columns, columns, fit.residual))
                 recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
     looked_at = float(np.log(tested))
     nominal = [
@@ -169,9 +170,9 @@ class FollowTest:
 
 def _looked(
     fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
-) -> tuple[list[FollowTest], Array, dict[str, Array]]:
+) -> tuple[list[FollowTest], Array, dict[str, Array], Array]:
     """All looks at a residual (M, A) of a problem seen through a fit; what it is whitened, of unit variance, beside
-    the fit's columns, with the rows of its prior; and the columns of every group.
+    the fit's columns, with the rows of its prior; the columns of every group; and the basis of the fit's.
     """
     noise = fit.noise
     known = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
@@ -186,7 +187,7 @@ def _looked(
         told = _Told.by(q, _with_rows_of_prior(noise.whiten(raw[name]), white), white)
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
             looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
-    return looks, white, raw
+    return looks, white, raw, q
 
 
 def _beside_prior(fit: Fit, known: Array, white: Array) -> tuple[Array, Array]:
@@ -217,7 +218,7 @@ def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]
     """By what factor each look's energy is larger than chi-square in made-up recordings, at least 1."""
     energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
     for other, seen, residual in made_up(fitter.problem, fit, MADE_UP):
-        found, _, _ = _looked(fitter, fit, other, seen, residual)
+        found, *_ = _looked(fitter, fit, other, seen, residual)
         energy += [look.energy for look in found]
         dof += [look.dof for look in found]
     return np.maximum(energy / dof, 1.0).tolist()
@@ -265,7 +266,7 @@ def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
     noise = fit.noise
     if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
-        noise = _recoloured(fit, fit.columns, rest.clearest, fit.residual)[2]
+        noise = _coloured_anew(fit, fit.columns, rest.clearest, fit.residual).noise
     return told_elsewhere(problem, noise, fit.columns, rest.clearest, fit.residual)
 
 
@@ -273,7 +274,7 @@ def moved_by(fit: Fit, rest: Unexplained) -> Array:
     """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
     noise, raw = fit.noise, rest.clearest
     if noise.is_coloured:
-        noise = _recoloured(fit, fit.columns, raw, fit.residual)[2]
+        noise = _coloured_anew(fit, fit.columns, raw, fit.residual).noise
     size, at = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12), fit.columns.shape[2]
     white = noise.whiten(np.concatenate([fit.columns, raw / size], axis=2))
     std = np.concatenate([prior_std(fit.hypothesis), np.full(raw.shape[2], _likely(raw, fit.residual))])
@@ -321,22 +322,28 @@ def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
     for other, seen, residual in made_up(fitter.problem, fit, MADE_UP // 2):
         known = replace(fitter, problem=other).columns(fit.hypothesis, seen)
         raw = _along_axes(dictionary(other, seen)[name] * sound, other.axes)
-        drop, rank, _ = _recoloured(fit, known, raw, residual)
+        alone = _coloured_anew(fit, known, raw[:, :, :0], residual)
+        drop, rank = alone.lowered_by(_coloured_anew(fit, known, raw, residual))
         lowered, dof = lowered + drop, dof + rank
     return max(1.0, lowered / dof)
 
 
-def _recoloured(fit: Fit, known: Array, raw: Array, residual: Array) -> tuple[float, int, Noise]:
-    """By what columns (M, A, c) beside those of the fit (M, A, 6 + p) lower the deviance of a residual, how many of
-    them are independent, and the noise, estimated anew from what they leave: else it has their colour.
+class _Coloured(NamedTuple):
+    """deviance: of what columns leave of a residual under noise that is estimated anew from it, else it has their
+    colour. rank: of the columns.
     """
-    beside, rank, noise = _coloured_anew(fit, known, raw, residual)
-    alone, own_rank, _ = _coloured_anew(fit, known, raw[:, :, :0], residual)
-    return max(alone - beside, 0.0), max(rank - own_rank, 1), noise
+
+    deviance: float
+    rank: int
+    noise: Noise
+
+    def lowered_by(self, beside: _Coloured) -> tuple[float, int]:
+        """By how much further columns lower the deviance, and how many of them are independent."""
+        return max(self.deviance - beside.deviance, 0.0), max(beside.rank - self.rank, 1)
 
 
-def _coloured_anew(fit: Fit, known: Array, raw: Array, residual: Array) -> tuple[float, int, Noise]:
-    """Deviance of what all columns leave under the noise that is estimated anew from it, their rank, that noise."""
+def _coloured_anew(fit: Fit, known: Array, raw: Array, residual: Array) -> _Coloured:
+    """A residual (M, A) under columns (M, A, c) beside those of the fit (M, A, 6 + p), which have its prior."""
     joined = np.concatenate([known, raw], axis=2)
     size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
     joined = joined / size
@@ -349,7 +356,7 @@ def _coloured_anew(fit: Fit, known: Array, raw: Array, residual: Array) -> tuple
         rows, series = np.concatenate([white, held]), np.concatenate([colour.whiten(residual), vector])
         left = residual - joined @ np.linalg.lstsq(rows, series, rcond=INDEPENDENT)[0]
         colour = fit.noise.like(left)
-    return colour.deviance(left), _orthonormal(white).shape[1], colour
+    return _Coloured(colour.deviance(left), _orthonormal(white).shape[1], colour)
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

@@ -194,6 +194,13 @@ class Effect(AnyEffect, ABC):
         """The same, happening once at most."""
         return self.without(self.again)
 
+    @property
+    def of_the_vehicle(self) -> Effect:
+        """The same, of one size in all recordings."""
+        found = copy(self)
+        vars(found)["of_the_day"] = False
+        return found
+
     def without(self, names: Collection[str]) -> Effect:
         """The same, without some parameters, which stay at their defaults of 0."""
         if not names:

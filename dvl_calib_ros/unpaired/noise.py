@@ -18,11 +18,11 @@ from scipy.stats import norm
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
 from ..diagnosis.curve import FAST_ENOUGH_S
+from ..diagnosis.fitting import around
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.where import regimes
 from ..effects.base import EffectInput
 from .logs import Log
-from .results import Triple
 from .streams import OUTLIER
 from .two_sides import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
 
@@ -179,8 +179,8 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
             Candidate(
                 f"growth_with_{name}",
                 unit,
-                _around(a, std_a),
-                _around(b, std_b),
+                around(a, std_a),
+                around(b, std_b),
                 p,
                 (there[0], there[1]),
                 matters=any(there),
@@ -219,10 +219,6 @@ def _covariates(scattered: Scatter) -> dict[str, Array]:
     if motion.angular_velocity is not None:
         found["turn_rate"] = np.abs(motion.turn_rate[:, 2])
     return found | {"astern": np.maximum(-motion.velocity_body[:, 0], 0.0)}
-
-
-def _around(value: float, std: float) -> Triple:
-    return value, value - 1.96 * std, value + 1.96 * std
 
 
 def slopes_of(scattered: Sequence[Scatter]) -> Slopes:

@@ -16,9 +16,9 @@ from scipy.stats import f as f_distribution
 from scipy.stats import norm, t
 
 from ..calibration.frames import Array
+from ..diagnosis.clock_or_arm import ATTITUDE_CLOCK, CLOCKS
 from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
 from ..diagnosis.fitting import Fit
-from ..diagnosis.leaps import CLOCKS
 from ..diagnosis.selection import EffectSelection, blocks_of
 from ..diagnosis.where import BANDS_HZ, regimes
 from ..effects.base import Effect
@@ -133,7 +133,7 @@ def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]
     """Names to compare. Of three clocks only two differences matter, so the third is left out."""
     both = {*vehicle.values(), *simulator.values()}
     if set(CLOCKS) <= both:
-        both.discard(CLOCKS[2])
+        both.discard(ATTITUDE_CLOCK)
     return [name for name in EFFECTS if name in both] + sorted(both - set(EFFECTS))
 
 
