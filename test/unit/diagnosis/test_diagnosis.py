@@ -149,7 +149,7 @@ def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown(
         {"lever_arm": {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0}, "dvl_time_offset": {"seconds": 0.0}, **late},
     )
     selected = [_selected(fitter, fit, effect, EFFECTS) for effect in fit.effects]
-    kept = _clock_or_arm(fitter, fit, selected, len(EFFECTS), [EFFECTS["reference_time_offset"]])
+    kept = _clock_or_arm(fitter, fit, selected, len(EFFECTS), [EFFECTS["reference_time_offset"]], None)
     assert [each.effect.name for each in kept] == ["reference_time_offset"]
 
 
