@@ -102,21 +102,21 @@ def whole_degrees(rotation: Array) -> tuple[float, float, float]:
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
     """Unit quaternion (x, y, z, w), w >= 0, of one rotation (3, 3). Shepperd's method: the largest term first."""
-    r = np.asarray(rotation, dtype=float)
-    trace = float(np.trace(r))
-    terms = np.array([r[0, 0], r[1, 1], r[2, 2], trace])
-    largest = int(np.argmax(terms))
-    q = np.empty(4)
+    r = np.asarray(rotation, dtype=float).tolist()  # of one, numbers by themselves are several times faster
+    diagonal = [r[0][0], r[1][1], r[2][2]]
+    trace = sum(diagonal)
+    terms = [*diagonal, trace]
+    largest = terms.index(max(terms))
     if largest == 3:
-        q[:] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1.0 + trace
+        q = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1], 1.0 + trace]
     else:
         i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q[i] = 1.0 + 2.0 * r[i, i] - trace
-        q[j] = r[j, i] + r[i, j]
-        q[k] = r[k, i] + r[i, k]
-        q[3] = r[k, j] - r[j, k]
-    q /= np.linalg.norm(q)
-    x, y, z, w = (q if q[3] >= 0.0 else -q).tolist()
+        q = [0.0, 0.0, 0.0, r[k][j] - r[j][k]]
+        q[i] = 1.0 + 2.0 * diagonal[i] - trace
+        q[j] = r[j][i] + r[i][j]
+        q[k] = r[k][i] + r[i][k]
+    norm = math.sqrt(np.dot(q, q))
+    x, y, z, w = (each / norm if q[3] >= 0.0 else -(each / norm) for each in q)
     return x, y, z, w
 
 
