@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class State:
     rates: Floats
     euler: Floats
 
-    @property
+    @cached_property
     def velocity_body(self) -> Floats:
         """(N, 3) m/s."""
         return np.asarray(self.attitude.apply(self.velocity_enu, inverse=True))

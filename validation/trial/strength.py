@@ -23,7 +23,7 @@ from .vehicle import (
     Vehicle,
     attitude_state,
     dvl_stamps,
-    dvl_velocity,
+    dvl_velocity_of,
     in_recording,
     of_one_recording,
     recorded_attitude,
@@ -100,6 +100,8 @@ class Yardstick:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._times = [scene.dvl_times(motion) for motion in scene.motions]
+        # by far the most of what is measured is another fault of the same motion
+        self._states = [motion.at(times) for motion, times in zip(scene.motions, self._times, strict=True)]
         self._inside = [
             (times >= scene.gnss_phase_s) & (times <= scene.gnss_stamps(motion)[-1])
             for motion, times in zip(scene.motions, self._times, strict=True)
@@ -217,12 +219,12 @@ class Yardstick:
     def _difference(self, faults: Faults) -> Floats:
         """(N, 3) m/s DVL less reference in the DVL's frame; (N, 2) east and north of a reference without a vertical."""
         parts = []
-        for number, motion in enumerate(self.scene.motions):
+        for number in range(len(self.scene.motions)):
             here = in_recording(faults, number)
             reference = (
                 self._sound_reference[number] if ON_REFERENCE.isdisjoint(here) else self._reference(number, here)
             )
-            measured = dvl_velocity(motion, self.scene.vehicle, here, self._times[number])
+            measured = dvl_velocity_of(self._states[number], self.scene.vehicle, here)
             parts.append((measured - reference)[self._inside[number]])
         return self._measured(np.vstack(parts)[..., None])[..., 0]
 

@@ -217,12 +217,16 @@ def dvl_stamps(times: Floats, faults: Faults) -> Floats:
 
 def dvl_velocity(motion: Motion, vehicle: Vehicle, faults: Faults, times: Floats) -> Floats:
     """What the DVL measures at times (N,) s, free of noise: (N, 3) m/s in its own frame."""
-    state = motion.at(times)
+    return dvl_velocity_of(motion.at(times), vehicle, faults)
+
+
+def dvl_velocity_of(state: State, vehicle: Vehicle, faults: Faults) -> Floats:
+    """What the DVL measures of a motion at N times, free of noise: (N, 3) m/s in its own frame."""
     nominal = vehicle.dvl_from_body
     moved = _velocity_at_dvl(state, faults)
     turned = _mounting(state, vehicle, faults).apply(nominal.apply(moved))
     radial = turned @ _beams_as_they_are(vehicle, faults).T
-    factor = np.full(len(times), 1.0 + vehicle.sound_speed_error)
+    factor = np.full(len(state.time), 1.0 + vehicle.sound_speed_error)
     factor += faults.get("sound_speed_moved", {}).get("ratio", 0.0)
     factor += faults.get("quadratic_scale", {}).get("coefficient_s_per_m", 0.0) * state.speed
     factor += faults.get("scale_drift", {}).get("rate_per_hour", 0.0) / HOUR_S * state.time
