@@ -23,7 +23,7 @@ from dvl_calib_ros.calibration.samples import (
     sample_block,
 )
 from dvl_calib_ros.simulation.sensors import measure_dvl_matched
-from dvl_calib_ros.simulation.trajectories import make_motion
+from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 START_NS = 1_700_000_000_123_456_789
 SECOND = 1_000_000_000
@@ -62,7 +62,7 @@ def make_samples(run: MatchedRun) -> list[DvlSample | ReferenceSample | ImuSampl
 @cache
 def _made(run: MatchedRun) -> tuple[DvlSample | ReferenceSample | ImuSample, ...]:
     rng = np.random.default_rng(run.seed)
-    motion = make_motion(run.trajectory, run.seconds, 100.0)
+    motion, orientations = _motion(run.trajectory, run.seconds)
     mounting = rotation_from_rpy(run.mounting_rpy).T
     at_dvl = motion.velocity_body + np.cross(motion.angular_velocity, run.lever_arm)
     scale = np.full(3, run.scale)
@@ -76,13 +76,19 @@ def _made(run: MatchedRun) -> tuple[DvlSample | ReferenceSample | ImuSample, ...
     samples: list = []
     for i, stamp in enumerate(stamps):
         if run.imu_every and i % run.imu_every == 0:
-            rotation, rate = motion.rotation_enu_from_body[i], motion.angular_velocity[i]
-            samples.append(ImuSample(stamp, quaternion_from_rotation(rotation), tuple(rate.tolist())))
+            samples.append(ImuSample(stamp, orientations[i], tuple(motion.angular_velocity[i].tolist())))
         if run.gnss_every and (i - run.gnss_phase) % run.gnss_every == 0:
             samples.append(ReferenceSample(stamp, tuple(reference[i].tolist()), None, run.frame))
         if i % run.dvl_every == 0:
             samples.append(DvlSample(stamp + run.dvl_late_ns, tuple(measured[i].tolist())))
     return tuple(samples)
+
+
+@cache
+def _motion(trajectory: str, seconds: float) -> tuple[Motion, list[tuple[float, ...]]]:
+    """At 100 Hz, and its orientations: hundreds of runs have the same."""
+    motion = make_motion(trajectory, seconds, 100.0)
+    return motion, [quaternion_from_rotation(rotation) for rotation in motion.rotation_enu_from_body]
 
 
 def feed(calibrator: Calibrator, samples) -> Calibrator:
