@@ -75,6 +75,9 @@ def _parts(n: int) -> list[slice]:
 
 
 def _between(values: Array, before: Index, share: Array) -> Array:
-    left = values[before]
-    found: Array = left + share * (values[before + 1] - left)
+    left = values.take(before, axis=0)
+    found: Array = values.take(before + 1, axis=0)
+    found -= left
+    found *= share
+    found += left
     return found

@@ -11,7 +11,8 @@ is turned into the body by an attitude of another time, its velocity turns as th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -60,28 +61,48 @@ _MEDIAN_CHI2 = (0.455, 1.386, 2.366)
 _Compared = tuple[Index, tuple[Array, ...]]
 
 
+class Claimed(NamedTuple):
+    """Covariance p (9, 9) of the states, σ of it as blocks of time show. raised: (9,) by how much σ of each was, above
+    that of white noise. inflation: by how much σ of the clocks is more than white noise makes it, by blocks of time and
+    by how long what is left lasts."""
+
+    p: Array
+    inflation: float
+    raised: Array
+
+
 class Fitted(NamedTuple):
-    """x (9,) and its covariance p (9, 9), σ of it as blocks of time show; rotation_body_from_dvl (3, 3).
+    """x (9,); rotation_body_from_dvl (3, 3).
 
-    squares (J,) (m/s)²: of what is left of each reference. inflation: by how much σ of the clocks is more than white
-    noise makes it, by blocks of time and by how long what is left lasts.
-
-    level: m/s per axis, robust, of what is left of `rows` references. speed: RMS of what was compared, m/s.
-    at: (J,) which references these are, of those that are looked at. raised: (9,) by how much σ of each was, above that
-    of white noise.
+    squares (J,) (m/s)²: of what is left of each reference. level: m/s per axis, robust, of what is left of `rows`
+    references. speed: RMS of what was compared, m/s. at: (J,) which references these are, of those that are looked at.
+    claims: how well x is known, which is asked of few: it takes as long as three rounds.
     """
 
     x: Array
-    p: Array
     rotation_body_from_dvl: Array
     level: float
     rows: int
     speed: float
     squares: Array
     axes: int
-    inflation: float
     at: Index
-    raised: Array
+    claims: Callable[[], Claimed]
+
+    @property
+    def p(self) -> Array:
+        """As `Claimed.p`."""
+        return self.claims().p
+
+    @property
+    def inflation(self) -> float:
+        """As `Claimed.inflation`."""
+        return self.claims().inflation
+
+    @property
+    def raised(self) -> Array:
+        """As `Claimed.raised`."""
+        return self.claims().raised
 
     def cost(self, level: float, among: Index) -> float:
         """What is left of these references, in chi-square by a level of noise (m/s), robust."""
@@ -189,10 +210,9 @@ class MotionFit:
         if rows is None or solved is None:
             return None
         _, information, level, weight = self._solved(x, rows, nominal, rotation, in_time)
-        p, factor = self._covariance(rows, information, level, weight)
         squares, axes = (rows.residual**2).sum(axis=1), rows.residual.shape[1]
-        inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
-        return Fitted(x, p, rotation, level, len(rows.at), rows.speed, squares, axes, inflation, rows.at, factor)
+        claims = cache(partial(_claimed, rows, information, level, weight))
+        return Fitted(x, rotation, level, len(rows.at), rows.speed, squares, axes, rows.at, claims)
 
     def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
         """Which references (J,) are compared at a state, and what is left of each (J,), as in `Fitted.cost`."""
@@ -287,15 +307,17 @@ class MotionFit:
             vector -= HELD_STD_S**-2.0 * row * float(row @ x)
         return np.linalg.solve(information, vector), information, float(np.sqrt(level2)), weight
 
-    def _covariance(self, rows: _Rows, information: Array, level: float, weight: Array) -> tuple[Array, Array]:
-        p = np.linalg.inv(information)
-        blocks = TimeBlocks()
-        for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):
-            h = rows.jacobian[part].reshape(-1, N)
-            w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
-            blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
-        factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT, None)
-        return p * np.outer(factor, factor), factor
+
+def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Claimed:
+    p = np.linalg.inv(information)
+    blocks = TimeBlocks()
+    for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):
+        h = rows.jacobian[part].reshape(-1, N)
+        w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
+        blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
+    factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT, None)
+    inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
+    return Claimed(p * np.outer(factor, factor), inflation, factor)
 
 
 def _robust(squares: Array, axes: int, level: float) -> Array:

@@ -16,7 +16,7 @@ from dvl_calib_ros.calibration.register import registration
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.register.configuration import fitting_configuration
 from dvl_calib_ros.calibration.register.curves import Curves
-from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, Fitted, MotionFit, N
+from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, Claimed, Fitted, MotionFit, N
 from dvl_calib_ros.calibration.register.motion import MotionStreams, make_motion
 from dvl_calib_ros.calibration.register.registration import (
     IN_TIME_STD_S,
@@ -298,7 +298,8 @@ def test_by_how_much_an_arm_is_another_for_each_second_is_no_matter_of_what_the_
     assert fitted is not None
     white = fitted.p / np.outer(fitted.raised, fitted.raised)
     raised = rng.uniform(1.0, 40.0, len(white))
-    more = fitted._replace(p=white * np.outer(raised, raised), raised=raised)
+    claimed = fitted.claims()._replace(p=white * np.outer(raised, raised), raised=raised)
+    more = fitted._replace(claims=lambda: claimed)
     np.testing.assert_allclose(more.by(LATE), white[:, LATE] / white[LATE, LATE], rtol=1e-9)
 
 
@@ -411,9 +412,10 @@ def test_a_clock_that_a_steady_turn_hides_leaves_its_yaw_open_and_one_that_turns
     information[2, 2], information[2, LATE], information[LATE, 2], information[LATE, LATE] = 1e6, 1e5, 1e5, 1e4 + 10.0
     x = np.zeros(N)
     x[LATE] = 0.4
-    found = {"level": 0.01, "rows": 100, "speed": 1.0, "squares": np.zeros(100), "axes": 3, "inflation": 1.0}
-    fit = Fitted(x, np.linalg.inv(information), np.eye(3), **found, at=np.arange(100), raised=np.ones(N))
+    claimed = Claimed(np.linalg.inv(information), 1.0, np.ones(N))
+    fit = Fitted(x, np.eye(3), 0.01, 100, 1.0, np.zeros(100), 3, np.arange(100), lambda: claimed)
     std = 1.0 / math.hypot(1.0 / 0.4, 1.0 / IN_TIME_STD_S)
     np.testing.assert_allclose(turn_open(fit, 0.0), [0.0, 0.0, -0.1 * std], atol=1e-9)
     information[LATE, LATE] = 1e6
-    assert not turn_open(fit._replace(p=np.linalg.inv(information), x=np.zeros(N)), 0.0).any()
+    known = claimed._replace(p=np.linalg.inv(information))
+    assert not turn_open(fit._replace(claims=lambda: known, x=np.zeros(N)), 0.0).any()

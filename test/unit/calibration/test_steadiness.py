@@ -10,7 +10,7 @@ from test_register import ARM, run
 
 from dvl_calib_ros.calibration.delay.rows import ImuColumns
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.register.fine import Fitted
+from dvl_calib_ros.calibration.register.fine import Claimed, Fitted
 from dvl_calib_ros.calibration.register.motion import make_motion
 from dvl_calib_ros.calibration.register.registration import Registration, register
 from dvl_calib_ros.calibration.register.steadiness import unsteady
@@ -45,10 +45,11 @@ def test_noise_that_lasts_as_long_as_blocks_of_a_stretch_is_no_drift():
 
     def found(inflation: float):
         std = np.array([0.01] * 4 + [0.3, 0.07, 0.1, 0.05, 0.35])
+        claimed = Claimed(np.diag(std**2), inflation, np.full(9, 1.5))
         each = [
             Fitted(
-                np.array([0.0] * 7 + [apart, late]), np.diag(std**2), np.eye(3), 0.05, 400, 0.8, np.zeros(400), 3,
-                inflation, np.arange(400), np.full(9, 1.5),
+                np.array([0.0] * 7 + [apart, late]), np.eye(3), 0.05, 400, 0.8, np.zeros(400), 3, np.arange(400),
+                lambda: claimed,
             )
             for _, late, apart in seen
         ]  # fmt: skip
@@ -105,10 +106,11 @@ def test_only_the_clock_of_the_dvl_is_put_right_and_what_is_left_is_said():
 def test_a_clock_that_leaps_ahead_leaves_a_hole_in_its_stamps():
     """Combination 652, in noise that lasts: the DVL's clock leapt ahead by 42 s, in stamps that are all there."""
     at, std = np.arange(45.0, 600.0, 90.0), np.array([0.01] * 4 + [0.3] * 3 + [0.2, 0.2])
+    claimed = Claimed(np.diag(std**2), 1.5, np.full(9, 1.5))
     each = [
         Fitted(
-            np.array([0.0] * 7 + [40.0 * (n > 2), 0.0]), np.diag(std**2), np.eye(3), 0.05, 400, 0.8, np.zeros(400), 3,
-            1.5, np.arange(400), np.full(9, 1.5),
+            np.array([0.0] * 7 + [40.0 * (n > 2), 0.0]), np.eye(3), 0.05, 400, 0.8, np.zeros(400), 3, np.arange(400),
+            lambda: claimed,
         )
         for n in range(len(at))
     ]  # fmt: skip
