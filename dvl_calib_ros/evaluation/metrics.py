@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
+from ..calibration.distributions import normal_isf
 from ..calibration.frames import Array
 from .results import Coverage
 
 # Two-sided intervals of a normal distribution
-WITHIN_68, WITHIN_95 = (float(norm.ppf(0.5 + 0.5 * share)) for share in (0.68, 0.95))
+WITHIN_68, WITHIN_95 = (float(normal_isf(0.5 - 0.5 * share)) for share in (0.68, 0.95))
 
 
 @dataclass(frozen=True)

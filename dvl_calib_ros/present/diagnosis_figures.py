@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from scipy.stats import norm
 
+from ..calibration.distributions import normal_isf, normal_sf
 from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
 from .replay_figures import AFTER, BAD
@@ -139,11 +139,11 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
     """
     figure, axes = new_figure(height=3.2)
     k = max(len(each) for each in values.values())
-    end = float(norm.ppf(1.0 - 0.5 / k))
-    shares = norm.cdf(np.linspace(-end, end, QUANTILES))
+    end = float(normal_isf(0.5 / k))
+    shares = normal_sf(np.linspace(end, -end, QUANTILES))
     std = MM * np.maximum(noise, 1e-9)
     grid = np.linspace(-6.0, 6.0, 4001) * std.max()
-    of_noise = np.interp(shares, norm.cdf(grid[:, None] / std).mean(axis=1), grid)
+    of_noise = np.interp(shares, normal_sf(-grid[:, None] / std).mean(axis=1), grid)
     axes.plot(of_noise[[0, -1]], of_noise[[0, -1]], color=FAINT, linewidth=2.0, label="noise", zorder=1)
     for (name, each), (colour, _) in zip(values.items(), _lines(list(values)), strict=True):
         axes.plot(of_noise, MM * np.quantile(each, shares), ".", color=colour, markersize=3.5, label=name)
