@@ -172,7 +172,8 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
     theta = np.zeros(N_THETA)
     for _ in range(12):
         centred = rows - _of_stretches(rows, weight, stretch)[stretch]
-        square = np.einsum("na,nai,naj->ij", weight, centred, centred)
+        each = centred.reshape(-1, N_THETA + 1)
+        square = (each * weight.reshape(-1, 1)).T @ each
         theta = np.linalg.solve(square[1:, 1:] + np.diag((level / std) ** 2), square[1:, 0])
         left = np.abs(centred[..., 0] - centred[..., 1:] @ theta)
         level = max(float(median(left.ravel())) * 1.4826, 1e-6)
@@ -250,8 +251,10 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     rows = np.concatenate([blocks.y[:, :, None], blocks.columns], axis=2)
     rows = rows - rows.mean(axis=1, keepdims=True)  # of a stretch that begins anywhere it is no matter
-    whitened = np.linalg.solve(root[:, None], rows[None])  # (G, A, B, 14)
-    square = np.einsum("gabi,gabj->gij", whitened, whitened)
+    # axes beside one another, (B, A 14): each of the many large roots is taken apart once for all
+    whitened = np.linalg.solve(root, np.concatenate(list(rows), axis=1))
+    parts = np.split(whitened, axes, axis=2)
+    square = np.asarray(sum(part.swapaxes(1, 2) @ part for part in parts))
     yy, by, told = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
     freedom = float(axes * (n - len(np.unique(blocks.stretch))))
     # hypotheses of the deviation beside those of the noise: (G, F, ...)
