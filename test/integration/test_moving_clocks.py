@@ -13,14 +13,14 @@ from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
-ARM, AT_S = -0.6, 250.0
+ARM, AT_S = -0.6, 170.0
 
 
 def bag_of(folder, topic, drift=0.0, leap=0.0):
-    """Ten minutes of figures of eight; stamps of a topic get later."""
+    """Figures of eight; stamps of a topic get later. A drift takes ten minutes to show, a leap less."""
     arm = injection(f"lever_arm:x_m={ARM}")
     errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)
-    made = simulate(Scenario("figure8", 600.0, 3, errors, gnss_std=0.05, effects=(arm,)))
+    made = simulate(Scenario("figure8", 600.0 if drift else 400.0, 3, errors, gnss_std=0.05, effects=(arm,)))
     first_ns = made.dvl[0].stamp_ns
 
     def change(name, message):
