@@ -252,7 +252,7 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     rows = np.concatenate([blocks.y[:, :, None], blocks.columns], axis=2)
     rows = rows - rows.mean(axis=1, keepdims=True)  # of a stretch that begins anywhere it is no matter
     # axes beside one another, (B, A 14): each of the many large roots is taken apart once for all
-    whitened = np.linalg.solve(root, np.concatenate(list(rows), axis=1))
+    whitened = np.linalg.solve(root, np.concatenate(list(rows), axis=1)[None])  # NumPy 1 takes (B, k) for vectors
     parts = np.split(whitened, axes, axis=2)
     square = np.asarray(sum(part.swapaxes(1, 2) @ part for part in parts))
     yy, by, told = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
