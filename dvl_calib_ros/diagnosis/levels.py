@@ -15,6 +15,8 @@ from .composed import Problem, Seen
 from .noise import Noise, white_noise
 
 SIGNIFICANT = 1e-4
+# Rows that are out alone, of which no level is called for
+FEW = 6
 
 
 @dataclass(frozen=True)
@@ -41,17 +43,34 @@ def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Lev
     found = covariates(problem, seen)
     if not found:
         return None
-    x = np.column_stack([np.ones(len(innovations)), *(values - values.mean() for values in found.values())])
     log_square = np.log(np.maximum((innovations**2).mean(axis=1), 1e-12))
+    slopes, covariance, wald = _sloped(list(found.values()), log_square)
+    p, p_of = float(chi2_sf(wald, len(slopes))), chi2_sf(slopes**2 / np.diag(covariance), 1)
+    if p < SIGNIFICANT:
+        common = [each for values in found.values() if np.ptp(each := _common(values)) > 0.0]
+        p_common = float(chi2_sf(_sloped(common, log_square)[2], len(common))) if common else 1.0
+        p = p if p_common < SIGNIFICANT else p_common
+    x = np.column_stack([values - values.mean() for values in found.values()])
+    level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
+    return Level(tuple(found), 0.5 * slopes, p, p_of, level)
+
+
+def _sloped(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, float]:
+    """Slopes (c,) of log squares (M,) along c covariates (M,), their covariance, and Wald's statistic of all."""
+    x = np.column_stack([np.ones(len(log_square)), *(values - values.mean() for values in found)])
     inverse = np.linalg.pinv(x.T @ x)
     parameters = inverse @ x.T @ log_square
     left = (log_square - x @ parameters)[:, None] * x
     covariance = (inverse @ (left.T @ left) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
     slopes = parameters[1:]
-    wald = float(slopes @ np.linalg.solve(covariance, slopes))
-    p_of = chi2_sf(slopes**2 / np.diag(covariance), 1)
-    level = np.exp(np.clip(0.5 * x[:, 1:] @ slopes, -2.0, 2.0))
-    return Level(tuple(found), 0.5 * slopes, float(chi2_sf(wald, len(slopes))), p_of, level)
+    return slopes, covariance, float(slopes @ np.linalg.solve(covariance, slopes))
+
+
+def _common(values: Array) -> Array:
+    """Values (M,) no further out than `FEW` rows are: these few may be quiet by chance, and pull at a slope."""
+    ordered = np.sort(values)
+    few = min(FEW, (len(values) - 1) // 2)
+    return np.clip(values, ordered[few], ordered[-1 - few])
 
 
 def estimated(problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None) -> tuple[Noise, Array]:

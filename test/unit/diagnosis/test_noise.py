@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.register.far import lag
 from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.diagnosis import levels
 from dvl_calib_ros.diagnosis.claims import claims_of, exponents, followed
 from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.contradicted import without_contradicted
@@ -268,3 +269,18 @@ def test_of_two_spikes_with_a_good_sample_between_the_spikes_are_left_out():
     velocity[[100, 102, 300]] += [[-1.0, 0.9, -0.9], [-0.2, 0.1, -1.0], [1.0, 0.0, 0.0]]
     kept = Curve(time, velocity).without_spikes().time
     assert sorted(set(time) - set(kept)) == pytest.approx(time[[100, 102, 300]])
+
+
+def test_a_few_quiet_rows_at_a_rare_speed_call_for_no_level(monkeypatch):
+    """Four of 95 means, quiet by chance, made what they are all that counts, and noise of them a finding."""
+    speed = np.full(95, 2.0) + 0.1 * np.sin(np.arange(95.0))
+    speed[40:44] = [1.4, 1.2, 1.0, 0.9]
+    innovations = np.random.default_rng(1).standard_normal((95, 2))
+    innovations[40:44] *= 0.1
+    monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": speed})
+    assert levels.fit_level(None, (), innovations).p > levels.SIGNIFICANT
+    monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": np.where(speed < 1.5, speed, 2.0)})
+    assert levels.fit_level(None, (), innovations).p > levels.SIGNIFICANT
+    monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": np.linspace(1.0, 2.0, 95)})
+    grown = innovations * np.exp(3.0 * np.linspace(0.0, 1.0, 95))[:, None]
+    assert levels.fit_level(None, (), grown).p < levels.SIGNIFICANT
