@@ -20,6 +20,8 @@ DVL_CLOCK, REFERENCE_CLOCK, ATTITUDE_CLOCK = "dvl_time_offset", "reference_time_
 CLOCKS = DVL_CLOCK, REFERENCE_CLOCK, ATTITUDE_CLOCK
 # What any two of the three say is told by these
 TWO_CLOCKS = DVL_CLOCK, REFERENCE_CLOCK
+# What makes a reference late, and from how late on (s) either is tried in place of the other
+LAG_OR_DELAY, LAG_FROM_S = (LAG, REFERENCE_CLOCK), 0.2
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
 # A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
 GUESSED_STD_M = 0.2
@@ -54,24 +56,48 @@ class OpenArm:
     late: float
 
 
+def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, tuple[Values, ...]]]:
+    """Start values, by name, with which what makes the reference of a fit late is a lag alone, or a delay alone.
+
+    To first order a low-pass is a delay; of seconds, a straight line leads from neither to the other.
+    """
+    own = [fit.values.get(LAG, ()), fit.values.get(REFERENCE_CLOCK, ())]
+    each = [[next(iter(values.values())) for values in per] or [0.0] * len(fit.seen) for per in own]
+    late = [lag + delay for lag, delay in zip(*each, strict=True)]
+    if min(late) < LAG_FROM_S or not any(own):
+        return []
+    told = {LAG: "time_constant_s", REFERENCE_CLOCK: "seconds"}
+    return [
+        {name: tuple({key: seconds} for seconds in late)}
+        for name, key in told.items()
+        if name in effects and {name} != set(LAG_OR_DELAY) & set(fit.values)
+    ]
+
+
 def is_open(guesses: Sequence[FirstGuess]) -> bool:
     """Whether registration leaves open how much of a clock is a lever arm."""
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
 
 
-def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
-    """The lever arm to start from, as most recordings have it: what is not shown of it only where it is known.
+def known_arm(guesses: Sequence[FirstGuess]) -> dict[str, float]:
+    """The parts of the lever arm that registration knows, whatever the columns show; as most recordings have it.
 
-    A height of 5 m for one of 1 turns the rest of the arm. effects: with what of each is shown.
+    A height of 5 m for one of 1 turns the rest of the arm.
     """
-    shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
     stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
-    known = np.min(stds, axis=0) < GUESSED_STD_M if stds else np.zeros(3, dtype=bool)
-    arm = np.median([guess.lever_arm for guess in guesses], axis=0)
-    return {
-        name: value if name in shown or is_known else 0.0
-        for name, value, is_known in zip(ARM_PARAMETERS, arm.tolist(), known.tolist(), strict=True)
-    }
+    if not stds:
+        return {}
+    arm = np.median([guess.lever_arm for guess in guesses], axis=0).tolist()
+    known = (np.min(stds, axis=0) < GUESSED_STD_M).tolist()
+    return {name: value for name, value, is_known in zip(ARM_PARAMETERS, arm, known, strict=True) if is_known}
+
+
+def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
+    """The lever arm to start from: what is not shown of it only where it is known. effects: with what is shown."""
+    shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
+    arm = np.median([guess.lever_arm for guess in guesses], axis=0).tolist()
+    guessed = {name: value if name in shown else 0.0 for name, value in zip(ARM_PARAMETERS, arm, strict=True)}
+    return guessed | known_arm(guesses)
 
 
 def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> Fit:

@@ -77,6 +77,10 @@ class Hypothesis:
         """The effects as one recording has them."""
         return [Injection(effect, self.values[effect.name][recording]) for effect in self.effects]
 
+    def lags(self, recording: int) -> list[tuple[Effect, Values]]:
+        """The effects of one recording with a memory, and their values."""
+        return [(effect, self.values[effect.name][recording]) for effect in self.effects if effect.has_memory]
+
     def parameters(self) -> list[Parameter]:
         """What is fitted beside the calibration, in order."""
         return [each for effect in self.effects for each in self.parameters_of(effect)]
@@ -430,23 +434,28 @@ class Problem:
     def calibration_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
         """(M, A, 6) d e / d (φ, δk)."""
         parts = []
-        for grid, each in zip(self.grids, seen, strict=True):
+        for recording, (grid, each) in enumerate(zip(self.grids, seen, strict=True)):
             # of one mounting they are linear in the velocity, and so in its mean over each bin
-            is_linear = each.body_from_measured.ndim == 2 and all(self.measured)
+            lags = hypothesis.lags(recording)
+            is_linear = each.body_from_measured.ndim == 2 and all(self.measured) and not lags
             measured = grid.averaged(each.measured) if is_linear else each.measured
             columns = np.empty((len(measured), 3, 6))
             by_turn = _by_turn(hypothesis, each, measured)
             columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
             unscaled = measured / (1.0 + hypothesis.scale)
             np.multiply(-unscaled[:, None, :], each.body_from_measured, out=columns[:, :, 3:])
-            parts.append(columns if is_linear else self._in_bins(grid, columns, each))
+            parts.append(columns if is_linear else self._in_bins(grid, _lagging(lags, each, columns), each))
         return np.concatenate(parts)
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
-        per_recording = [
-            self._derivatives(hypothesis, each, effect, values[recording]) for recording, each in enumerate(seen)
-        ]
+        per_recording = []
+        for recording, each in enumerate(seen):
+            body = self._derivatives(hypothesis, each, effect, values[recording])
+            if effect.acts_on is not ActsOn.REFERENCE:
+                lags = hypothesis.lags(recording)
+                body = _lagging(lags, each, body)
+            per_recording.append(body)
         joined = self.binned(per_recording, seen)
         if not effect.of_the_day or len(seen) == 1:
             return joined
@@ -478,6 +487,10 @@ class Problem:
         if all(spec.linear for spec in specs):
             none = {**values, **{spec.name: 0.0 for spec in specs}}
             slopes = [effect.trace(motion, {**none, spec.name: 1.0}) for spec in specs]
+            own = {spec.name for spec in effect.parameters}
+            if any(value for name, value in none.items() if name not in own):  # a height that is known and not fitted
+                still = effect.trace(motion, none)
+                slopes = [slope - still for slope in slopes]
         else:
             slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
         stacked = -np.stack(slopes, axis=2)
@@ -539,6 +552,14 @@ def _undone(
         moved_before = np.minimum(moved, moved_before)
         motion = replace(motion, velocity_body=after - added)
     return motion, added
+
+
+def _lagging(lags: Sequence[tuple[Effect, Values]], seen: Seen, columns: Array) -> Array:
+    """Derivatives (F, 3, p) of the reference point's velocity, m/s, of references that follow with a lag."""
+    for lag, values in lags:
+        moved = [replace(seen.motion, velocity_body=column) for column in np.moveaxis(columns, 2, 0)]
+        columns = columns - np.stack([lag.trace(one, values) for one in moved], axis=2)
+    return columns
 
 
 def _turned(matrix: Array, values: Array) -> Array:

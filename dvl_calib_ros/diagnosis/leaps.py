@@ -14,7 +14,7 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..effects.base import ActsOn, Effect
-from .clock_or_arm import ARM, CLOCKS, DVL_CLOCK, LAG
+from .clock_or_arm import ARM, CLOCKS, DVL_CLOCK, LAG, LAG_OR_DELAY, lags_and_delays
 from .composed import Hypothesis, Values
 from .fitting import Fit, Fitter
 from .settings import SETTINGS
@@ -70,9 +70,12 @@ def _hypotheses(
         usual.append(once[ARM])
     made: dict[frozenset[str], Hypothesis] = {}
     clocks = [{}, {DVL_CLOCK: before}] if abs(before) > NO_DELAY and DVL_CLOCK in once else [{}]
-    for others, clock in itertools.product((list(rest), usual), clocks):
-        effects = [*others, *(once[name] for name in clock), leap]
-        start: dict[str, tuple[Values, ...]] = {leap.name: (values,)}
+    lags = [{}, *lags_and_delays(fit, once)]
+    for others, lag, clock in itertools.product((list(rest), usual), lags, clocks):
+        if lag:
+            others = [effect for effect in others if effect.name not in LAG_OR_DELAY]
+        effects = [*others, *(once[name] for name in (*lag, *clock)), leap]
+        start: dict[str, tuple[Values, ...]] = {**lag, leap.name: (values,)}
         start |= {name: ({"seconds": seconds},) for name, seconds in clock.items()}
         if len(effects) <= SETTINGS.max_effects:
             names = frozenset(effect.name for effect in effects)

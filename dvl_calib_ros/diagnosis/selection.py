@@ -26,11 +26,14 @@ from .clock_or_arm import (
     CLOCKS,
     DVL_CLOCK,
     LAG,
+    LAG_OR_DELAY,
     REFERENCE_CLOCK,
     TWO_CLOCKS,
     OpenArm,
     guessed_arm,
     is_open,
+    known_arm,
+    lags_and_delays,
     moved_arm,
     opened_arm,
     with_arm,
@@ -48,6 +51,7 @@ from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
 from .settings import SETTINGS
 from .shown import shown_parts
+from .unexplained import unexplained
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
 START = (ARM, "dvl_time_offset", "reference_time_offset")
@@ -62,8 +66,9 @@ AS_WELL = 2.0
 CLEAR = 6.0
 # What is taken back but for this share of it, or within a step of the grid, may be anything that is there for a while
 TAKEN_BACK = 0.25
-# and where it explains as much as an unknown cause would not without being seen, but for this share
-TAKEN_BACK_EXACTLY = 0.05
+# and where it explains as much as an unknown cause would not without being seen, or so much and more than an unknown
+# cause in its place, but for this share
+TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
 # A clock is late for sure from so many σ of what registration leaves open
 LATER = 2.0
 # Fits with outliers drawn in about the one before, from the first guess on
@@ -127,7 +132,7 @@ def started(
     with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-    effects = shown_parts({name: effect.once for name, effect in effects.items()}, problem)
+    effects = shown_parts({name: effect.once for name, effect in effects.items()}, problem, {ARM: known_arm(guesses)})
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
@@ -182,6 +187,10 @@ def select(
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fit = _without_nothing(fitter, fit, len(effects))
+    whole = _with_all_of_the_arm(fitter, fit, every, effects)
+    if whole is not fit:
+        effects = {**effects, ARM: every[ARM]}
+        fitter, fit = _about(fitter, whole, every)
     fit, alike = heading_first(fitter, fit, heading)
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
@@ -371,7 +380,11 @@ def _proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[H
     worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
     if tuple(own) not in worth:
         worth.append(tuple(own))
-    return [_hypothesis(fitter, fit, table, chosen) for chosen in worth] + _told_by_other_clocks(fitter, fit, effects)
+    return [
+        *(_hypothesis(fitter, fit, table, chosen) for chosen in worth),
+        *_told_by_other_clocks(fitter, fit, effects),
+        *_told_by_a_lag(fit, effects),
+    ]
 
 
 def _is_told_by_two_clocks(table: _Table, chosen: Sequence[int]) -> bool:
@@ -406,6 +419,15 @@ def _told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect
             start = {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
             found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
     return found
+
+
+def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The fit with a lag of the reference for its delay, or the other way round."""
+    rest = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
+    return [
+        fit.hypothesis.with_effects([*rest, *(effects[name] for name in start)], len(fit.seen), start)
+        for start in lags_and_delays(fit, effects)
+    ]
 
 
 def _leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
@@ -524,19 +546,19 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
 
 
-def _is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float) -> bool:
+def _is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | None = None) -> bool:
     """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
 
-    drop: deviance that it explains. What explains much may be nearly undone, but not exactly.
+    drop: deviance that it explains. What explains much may be nearly undone, but not exactly; if it is not beyond
+    what an unknown cause can explain, where that explains less in its place, without it (rest).
     """
     effect = next(each for each in fit.effects if each.name == name)
     own = {spec.name for spec in effect.parameters}
     if not effect.again.keys() <= own or not effect.again:
         return False
-    nearly = TAKEN_BACK_EXACTLY if drop > SETTINGS.instead_of else TAKEN_BACK
     step = max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
 
-    def is_undone(values: Values) -> bool:
+    def is_undone(values: Values, nearly: float) -> bool:
         near = False
         for second, first in effect.again.items():
             spec = next(each for each in effect.parameters if each.name == second)
@@ -547,7 +569,15 @@ def _is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float) -> bool:
                 near |= abs(values[first] + values[second]) < nearly * largest
         return near
 
-    return all(is_undone(values) for values in fit.values[effect.name])
+    exactly, at_all = (
+        all(is_undone(each, nearly) for each in fit.values[name]) for nearly in (TAKEN_BACK_EXACTLY, TAKEN_BACK)
+    )
+    if exactly or not at_all or drop > SETTINGS.instead_of:
+        return exactly
+    if drop < MUCH or rest is None:
+        return drop < MUCH
+    other = unexplained(fitter, rest)
+    return other.clear_energy - other.price > drop
 
 
 def _either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] | None = None) -> list[Hypothesis]:
@@ -627,19 +657,20 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         explained = base.deviance - fit.deviance
         rests = [(effect, _without(fitter, fit, effect)) for effect in fit.effects]
-        weak = [
-            (rest.deviance, rest)
-            for effect, rest in rests
-            if _log_p(fit, rest, effect) > threshold
-            or _is_taken_back(fitter, fit, effect.name, rest.deviance - fit.deviance)
-            or (
-                _is_ghost(effect, rest.deviance - fit.deviance, explained, fit.deviance)
-                and not _is_late_before_a_leap(fit, effect)
-            )
-        ]
+        weak = []
+        for effect, rest in rests:
+            drop = rest.deviance - fit.deviance
+            if _log_p(fit, rest, effect) > threshold or (
+                _is_ghost(effect, drop, explained, fit.deviance) and not _is_late_before_a_leap(fit, effect)
+            ):
+                weak.append(rest)
+            elif _is_taken_back(fitter, fit, effect.name, drop, rest):
+                # a clock that is late before it leaps may be what makes two leaps one that is taken back
+                either = [each for other, each in rests if other.name in (effect.name, DVL_CLOCK)]
+                weak.append(min(either, key=lambda each: each.deviance))
         if not weak:
             return fit
-        fit = min(weak, key=lambda each: each[0])[1]
+        fit = min(weak, key=lambda each: each.deviance)
     return fit
 
 
@@ -656,6 +687,20 @@ def _without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             return fit
         fit = worst
     return fit
+
+
+def _with_all_of_the_arm(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
+    """A fit with the whole lever arm, where that part which usual ones do not show is so large that it is what is left.
+
+    A height of 3 m shows as one of 0.3 m does not. every: effects with all that they have; effects: with what is shown.
+    """
+    if ARM not in fit.values or effects[ARM].parameters == every[ARM].parameters or not unexplained(fitter, fit).found:
+        return fit
+    values = tuple(every[ARM].defaults | dict(each) for each in fit.values[ARM])
+    others = [effect for effect in fit.effects if effect.name != ARM]
+    hypothesis = fit.hypothesis.with_effects([*others, every[ARM]], len(fit.seen), {ARM: values})
+    whole = min(fit, fitter.fit(hypothesis, fit.noise), key=lambda each: _criterion(each, len(every)))
+    return fit if whole is fit or unexplained(fitter, whole).found else whole
 
 
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:

@@ -15,20 +15,25 @@ from .composed import Problem, Seen, Values, amplitudes, is_time_of_run, no_effe
 SHOWN_FROM, USUAL_MPS = 0.2, 0.02
 
 
-def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
-    """Effects without the parameters that references which do not measure the vertical do not show."""
+def shown_parts(
+    effects: Mapping[str, Effect], problem: Problem, guessed: Mapping[str, Values] | None = None
+) -> dict[str, Effect]:
+    """Effects without the parameters that references which do not measure the vertical do not show.
+
+    guessed: of effects, how large a first guess has them. A height that does more than usual ones is shown by that.
+    """
     if problem.measured[2]:
         return dict(effects)
-    seen = problem.all_seen(no_effect())
-    return {name: _shown_part(each, problem, seen) for name, each in effects.items()}
+    seen, guessed = problem.all_seen(no_effect()), guessed or {}
+    return {name: _shown_part(each, problem, seen, guessed.get(name, {})) for name, each in effects.items()}
 
 
-def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
+def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen], guessed: Values) -> Effect:
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
     squares = (columns**2).sum(axis=1).mean(axis=0)
     of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of days the one that shows most
-    sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
+    sizes = np.sqrt(of_each) * [max(spec.typical, abs(guessed.get(spec.name, 0.0))) for spec in specs]
     least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
     return effect.without({spec.name for spec, size in zip(specs, sizes, strict=True) if size < least})
 

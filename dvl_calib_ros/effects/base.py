@@ -171,7 +171,8 @@ class Effect(AnyEffect, ABC):
     remedy: what to do about it where it is found, as part of a sentence. manoeuvre: what to fly to see it and tell it
     from what it is confounded with. of_the_day: whether its size is another in every recording; else it belongs to the
     vehicle. relative_to_first: whether it is a change against the first of several recordings. bends_arm: whether
-    little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres. again:
+    little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres.
+    has_memory: whether its trace is that of a filter, linear in the velocity. again:
     parameters of a second time that it happens, which is looked for where a first was found -> those of the first.
     rarer: parameters that are looked for where several recordings ask for them.
     """
@@ -181,6 +182,7 @@ class Effect(AnyEffect, ABC):
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
     bends_arm: ClassVar[bool] = False
+    has_memory: ClassVar[bool] = False
     again: ClassVar[Mapping[str, str]] = {}
     rarer: ClassVar[frozenset[str]] = frozenset()
 

@@ -156,6 +156,7 @@ class ReferenceLag(Effect):
     )
     acts_on = ActsOn.REFERENCE
     bends_arm = True
+    has_memory = True
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:

@@ -14,7 +14,7 @@ from command_line import fail, succeed
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.diagnosis import intervals
+from dvl_calib_ros.diagnosis import intervals, selection
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem, no_effect
@@ -29,13 +29,16 @@ from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.selection import (
+    _about,
     _by_fewer_clocks,
+    _called_for,
     _clock_or_arm,
     _happening_again,
     _is_late_before_a_leap,
     _is_taken_back,
     _once_borne_out,
     _selected,
+    _with_all_of_the_arm,
 )
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -282,16 +285,32 @@ def test_a_clock_that_is_late_before_it_leaps_is_no_ghost_of_the_leap_unless_it_
     assert not _is_late_before_a_leap(Mock(spec=Fit, values={clock.name: ({"seconds": 1.0},)}), clock)
 
 
-@pytest.mark.parametrize(("drop", "is_taken_back"), [(200.0, True), (5000.0, False)])
+@pytest.mark.parametrize(
+    ("drop", "instead", "is_taken_back"),
+    [(100.0, 0.0, True), (5000.0, 9000.0, False), (500.0, 90.0, False), (500.0, 700.0, True)],
+)
 def test_a_clock_that_is_nearly_set_right_again_has_leapt_twice_where_nothing_else_explains_as_much(
-    drop, is_taken_back
+    drop, instead, is_taken_back, monkeypatch
 ):
     """A leap of -1.30 s and one back by 1.00 s were not named, beside a lag and an arm."""
     leap = EFFECTS["time_offset_jump"]
     values = {"seconds": -1.3, "at_s": 96.0, "again_seconds": 1.004, "again_at_s": 220.0}
     problem = SimpleNamespace(recordings=[SimpleNamespace(seconds=370.0)])
     fit = Mock(spec=Fit, effects=(leap,), values={leap.name: (values,)})
-    assert _is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop) is is_taken_back
+    monkeypatch.setattr(selection, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0))
+    assert _is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop, Mock(spec=Fit)) is is_taken_back
+
+
+def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clock_goes():
+    """Leaps of 1.13 and -1.20 s were one of 1.27 s taken back, after a clock late by -0.27 s, and none was named."""
+    leaps = {"seconds": 1.27, "at_s": 100.0, "again_seconds": -1.26, "again_at_s": 200.0}
+    fitter, fit, _ = fitted(
+        scenario(effects=["time_offset_jump:seconds=1.0,at_s=100,again_seconds=-1.26,again_at_s=200"], gnss_std=0.02),
+        {"dvl_time_offset": {"seconds": -0.27}, "time_offset_jump": leaps},
+    )
+    taken_back = {name: per if name != "time_offset_jump" else (leaps,) for name, per in fit.values.items()}
+    fit = replace(fit, hypothesis=replace(fit.hypothesis, values=taken_back), deviance=fit.deviance - 60.0)
+    assert [each.name for each in _called_for(fitter, fit, len(EFFECTS)).effects] == ["time_offset_jump"]
 
 
 def test_a_second_leap_that_is_not_there_is_taken_back():
@@ -814,3 +833,50 @@ def test_what_is_left_beyond_all_doubt_is_told_by_what_explains_it():
     tests = [(-np.inf, "turn rate", wide), (-np.inf, "speed", narrow), (-20.0, "time", narrow[:, :, :0])]
     assert _plainest(tests, -np.inf)[1] == "speed"
     assert _plainest(tests[2:], -20.0)[1] == "time"
+
+
+@pytest.mark.parametrize("name", ["lever_arm", "quadratic_scale", "mount_flexure", "attitude_time_offset"])
+def test_the_derivatives_beside_a_lag_are_those_of_what_lags(name):
+    """Those of a velocity that does not lag led a fit astray: a pitch of 6 degrees for one of -2."""
+    problem = problem_of(simulate(scenario(effects=[LAGGING], **SMOOTH)))
+    lag, effect = EFFECTS["reference_lag"], EFFECTS[name]
+    values = {lag.name: ({"time_constant_s": 1.3},), name: (effect.defaults,)}
+    about = no_effect().with_effects([lag, effect], 1, values)
+    fitter = Fitter(problem)
+    columns = fitter.columns(about, problem.all_seen(about))
+    for number in (0, 1, 2, 3, *range(7, columns.shape[2])):  # scales of sway and heave do next to nothing
+        step = np.zeros(columns.shape[2])
+        step[number] = 0.01
+        ends = [problem.residual(problem.all_seen(about.moved(sign * step))) for sign in (-1.0, 1.0)]
+        expected = (ends[1] - ends[0])[8:-8] / 0.02
+        error = np.sqrt(np.mean((columns[8:-8, :, number] - expected) ** 2)) / np.sqrt(np.mean(expected**2))
+        assert error < 0.1, (name, number, error)
+
+
+def test_a_height_that_is_known_and_not_fitted_is_no_part_of_the_derivatives_of_the_rest():
+    problem = problem_of(simulate(scenario(**SMOOTH)))
+    arm = EFFECTS["lever_arm"]
+    values = {"x_m": 1.0, "y_m": 0.0, "z_m": -1.4}
+    about = no_effect().with_effects([arm], 1, {arm.name: (values,)})
+    seen = problem.all_seen(about)
+    of_all = problem.columns(about, seen, arm, [values])
+    np.testing.assert_allclose(problem.columns(about, seen, arm.without({"z_m"}), [values]), of_all[:, :, :2])
+
+
+@pytest.mark.parametrize("z", [-2.8, 0.0])
+def test_a_height_of_three_metres_is_found_where_one_of_a_third_would_not_be_shown(z):
+    """It was what is left, and an unknown cause; where nothing is left, no height is looked for."""
+    given = scenario(effects=[f"lever_arm:x_m=-0.6,y_m=-1.6,z_m={z}"], gnss_std=0.015, waves=Waves(0.2, 6.0))
+    recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
+    problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
+    arm = EFFECTS["lever_arm"]
+    flat = arm.without({"z_m"})
+    start = no_effect().with_effects([flat], 1, {arm.name: ({"x_m": -0.5, "y_m": -1.5},)})
+    fitter = Fitter(problem)
+    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
+    fitter, fit = _about(fitter, fitter.fit(start, noise), EFFECTS)
+    whole = _with_all_of_the_arm(fitter, fit, EFFECTS, {arm.name: flat})
+    if z:
+        assert whole.values[arm.name][0]["z_m"] == pytest.approx(z, abs=0.1)
+    else:
+        assert whole is fit
