@@ -66,8 +66,7 @@ AS_WELL = 2.0
 CLEAR = 6.0
 # What is taken back but for this share of it, or within a step of the grid, may be anything that is there for a while
 TAKEN_BACK = 0.25
-# and where it explains as much as an unknown cause would not without being seen, or so much and more than an unknown
-# cause in its place, but for this share
+# where an unknown cause explains more in its place, or it explains less than that much. And taken back exactly
 TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
 # A clock is late for sure from so many σ of what registration leaves open
 LATER = 2.0
@@ -549,33 +548,30 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
 def _is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | None = None) -> bool:
     """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
 
-    drop: deviance that it explains. What explains much may be nearly undone, but not exactly; if it is not beyond
-    what an unknown cause can explain, where that explains less in its place, without it (rest).
+    drop: deviance that it explains. What explains much may be undone where an unknown cause in its place (rest: without
+    it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly.
     """
     effect = next(each for each in fit.effects if each.name == name)
     own = {spec.name for spec in effect.parameters}
     if not effect.again.keys() <= own or not effect.again:
         return False
-    step = max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
-
-    def is_undone(values: Values, nearly: float) -> bool:
-        near = False
+    seconds = max(recording.seconds for recording in fitter.problem.recordings)
+    at_once, nearly, exactly = True, True, True
+    for values in fit.values[name]:
+        apart, share = np.inf, np.inf
         for second, first in effect.again.items():
-            spec = next(each for each in effect.parameters if each.name == second)
-            if is_time_of_run(spec):
-                near |= values[second] - values[first] < step
+            if is_time_of_run(next(each for each in effect.parameters if each.name == second)):
+                apart = min(apart, values[second] - values[first])
             else:
                 largest = max(abs(values[first]), abs(values[second]))
-                near |= abs(values[first] + values[second]) < nearly * largest
-        return near
-
-    exactly, at_all = (
-        all(is_undone(each, nearly) for each in fit.values[name]) for nearly in (TAKEN_BACK_EXACTLY, TAKEN_BACK)
-    )
-    if exactly or not at_all or drop > SETTINGS.instead_of:
-        return exactly
-    if drop < MUCH or rest is None:
-        return drop < MUCH
+                share = min(share, abs(values[first] + values[second]) / max(largest, 1e-12))
+        at_once &= apart < seconds / WINDOW_STEPS
+        nearly &= share < TAKEN_BACK
+        exactly &= share < TAKEN_BACK_EXACTLY
+    if at_once or not nearly or drop < MUCH:
+        return at_once or nearly
+    if rest is None or (drop > SETTINGS.instead_of and not exactly):
+        return False
     other = unexplained(fitter, rest)
     return other.clear_energy - other.price > drop
 
