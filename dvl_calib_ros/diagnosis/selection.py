@@ -68,6 +68,8 @@ CLEAR = 6.0
 TAKEN_BACK = 0.25
 # where an unknown cause explains more in its place, or it explains less than that much. And taken back exactly
 TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
+# A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
+LITTLE_OF_LEAPS = 0.02
 # A clock is late for sure from so many σ of what registration leaves open
 LATER = 2.0
 # Fits with outliers drawn in about the one before, from the first guess on
@@ -551,29 +553,32 @@ def _is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit |
     drop: deviance that it explains. What explains much may be undone where an unknown cause in its place (rest: without
     it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly.
     """
-    effect = next(each for each in fit.effects if each.name == name)
-    own = {spec.name for spec in effect.parameters}
-    if not effect.again.keys() <= own or not effect.again:
-        return False
-    seconds = max(recording.seconds for recording in fitter.problem.recordings)
-    at_once, nearly, exactly = True, True, True
-    for values in fit.values[name]:
-        apart, share = np.inf, np.inf
-        for second, first in effect.again.items():
-            if is_time_of_run(next(each for each in effect.parameters if each.name == second)):
-                apart = min(apart, values[second] - values[first])
-            else:
-                largest = max(abs(values[first]), abs(values[second]))
-                share = min(share, abs(values[first] + values[second]) / max(largest, 1e-12))
-        at_once &= apart < seconds / WINDOW_STEPS
-        nearly &= share < TAKEN_BACK
-        exactly &= share < TAKEN_BACK_EXACTLY
-    if at_once or not nearly or drop < MUCH:
-        return at_once or nearly
-    if rest is None or (drop > SETTINGS.instead_of and not exactly):
+    apart, share = _undone(fit, name)
+    at_once = apart < max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
+    if at_once or share >= TAKEN_BACK or drop < MUCH:
+        return at_once or share < TAKEN_BACK
+    if rest is None or (drop > SETTINGS.instead_of and share >= TAKEN_BACK_EXACTLY):
         return False
     other = unexplained(fitter, rest)
     return other.clear_energy - other.price > drop
+
+
+def _undone(fit: Fit, name: str) -> tuple[float, float]:
+    """How far (s) the second time that something happens in a fit is from the first, and what share is not undone by
+    it, of the larger; the most of all recordings. Infinite where it cannot happen twice."""
+    effect = next(each for each in fit.effects if each.name == name)
+    own = {spec.name: spec for spec in effect.parameters}
+    if not effect.again or not effect.again.keys() <= own.keys():
+        return np.inf, np.inf
+    apart, share = [], []
+    for second, first in effect.again.items():
+        for values in fit.values[name]:
+            if is_time_of_run(own[second]):
+                apart.append(values[second] - values[first])
+            else:
+                largest = max(abs(values[first]), abs(values[second]), 1e-12)
+                share.append(abs(values[first] + values[second]) / largest)
+    return max(apart), max(share)
 
 
 def _either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] | None = None) -> list[Hypothesis]:
@@ -653,21 +658,32 @@ def _called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         explained = base.deviance - fit.deviance
         rests = [(effect, _without(fitter, fit, effect)) for effect in fit.effects]
-        weak = []
-        for effect, rest in rests:
-            drop = rest.deviance - fit.deviance
-            if _log_p(fit, rest, effect) > threshold or (
-                _is_ghost(effect, drop, explained, fit.deviance) and not _is_late_before_a_leap(fit, effect)
-            ):
-                weak.append(rest)
-            elif _is_taken_back(fitter, fit, effect.name, drop, rest):
-                # a clock that is late before it leaps may be what makes two leaps one that is taken back
-                either = [each for other, each in rests if other.name in (effect.name, DVL_CLOCK)]
-                weak.append(min(either, key=lambda each: each.deviance))
+        drops = {effect.name: rest.deviance - fit.deviance for effect, rest in rests}
+        weak = [
+            rest
+            for effect, rest in rests
+            if _log_p(fit, rest, effect) > threshold
+            or _is_taken_back(fitter, fit, effect.name, drops[effect.name], rest)
+            or _makes_leaps_cancel(fit, effect, drops)
+            or (
+                _is_ghost(effect, drops[effect.name], explained, fit.deviance)
+                and not _is_late_before_a_leap(fit, effect)
+            )
+        ]
         if not weak:
             return fit
         fit = min(weak, key=lambda each: each.deviance)
     return fit
+
+
+def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
+    """Whether an effect is a clock, late before two leaps that cancel with it alone, and little of what they explain.
+
+    drops: deviance that each effect explains, by name.
+    """
+    if effect.name != DVL_CLOCK or LEAP not in fit.values or _undone(fit, LEAP)[1] > TAKEN_BACK_EXACTLY:
+        return False
+    return drops[DVL_CLOCK] < LITTLE_OF_LEAPS * drops[LEAP]
 
 
 def _without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:

@@ -305,7 +305,7 @@ def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clo
     """Leaps of 1.13 and -1.20 s were one of 1.27 s taken back, after a clock late by -0.27 s, and none was named."""
     leaps = {"seconds": 1.27, "at_s": 100.0, "again_seconds": -1.26, "again_at_s": 200.0}
     fitter, fit, _ = fitted(
-        scenario(effects=["time_offset_jump:seconds=1.0,at_s=100,again_seconds=-1.26,again_at_s=200"], gnss_std=0.02),
+        scenario(effects=["time_offset_jump:seconds=1.0,at_s=100,again_seconds=-1.26,again_at_s=200"], gnss_std=0.005),
         {"dvl_time_offset": {"seconds": -0.27}, "time_offset_jump": leaps},
     )
     taken_back = {name: per if name != "time_offset_jump" else (leaps,) for name, per in fit.values.items()}
