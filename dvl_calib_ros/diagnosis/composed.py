@@ -453,8 +453,7 @@ class Problem:
         for recording, each in enumerate(seen):
             body = self._derivatives(hypothesis, each, effect, values[recording])
             if effect.acts_on is not ActsOn.REFERENCE:
-                lags = hypothesis.lags(recording)
-                body = _lagging(lags, each, body)
+                body = _lagging(hypothesis.lags(recording), each, body)
             per_recording.append(body)
         joined = self.binned(per_recording, seen)
         if not effect.of_the_day or len(seen) == 1:

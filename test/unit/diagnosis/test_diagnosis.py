@@ -15,6 +15,7 @@ from command_line import fail, succeed
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis import intervals, selection
+from dvl_calib_ros.diagnosis.clock_or_arm import lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem, no_effect
@@ -880,3 +881,22 @@ def test_a_height_of_three_metres_is_found_where_one_of_a_third_would_not_be_sho
         assert whole.values[arm.name][0]["z_m"] == pytest.approx(z, abs=0.1)
     else:
         assert whole is fit
+
+
+@pytest.mark.parametrize(
+    ("late", "starts"),
+    [
+        ({"reference_time_offset": 1.5}, [("reference_lag", 1.5)]),
+        ({"reference_lag": 1.5}, [("reference_time_offset", 1.5)]),
+        (
+            {"reference_lag": 1.0, "reference_time_offset": 0.5},
+            [("reference_lag", 1.5), ("reference_time_offset", 1.5)],
+        ),
+        ({"reference_time_offset": -1.5}, []),
+        ({}, []),
+    ],
+)
+def test_what_makes_a_reference_late_is_tried_as_a_lag_and_as_a_delay(late, starts):
+    values = {name: ({EFFECTS[name].parameters[0].name: seconds},) for name, seconds in late.items()}
+    found = lags_and_delays(Mock(spec=Fit, values=values, seen=[None]), EFFECTS)
+    assert [(name, *per[0].values()) for one in found for name, per in one.items()] == starts
