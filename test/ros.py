@@ -17,6 +17,7 @@ import rclpy
 from conftest import ROOT
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 
@@ -57,14 +58,18 @@ class World:
         self._clients: dict[str, Any] = {}
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
+        self._ends = False
         self._spinning = threading.Thread(target=self._spin, daemon=True)
         self._spinning.start()
 
     def _spin(self) -> None:
         with suppress(ExternalShutdownException):
-            self._executor.spin()
+            while self.context.ok() and not self._ends:
+                with suppress(InvalidHandle):  # a test has destroyed what was about to be waited for
+                    self._executor.spin()
 
     def close(self) -> None:
+        self._ends = True
         self._executor.shutdown()
         self._spinning.join()
         self.node.destroy_node()
