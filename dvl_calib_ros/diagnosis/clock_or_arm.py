@@ -79,25 +79,19 @@ def is_open(guesses: Sequence[FirstGuess]) -> bool:
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
 
 
-def known_arm(guesses: Sequence[FirstGuess]) -> dict[str, float]:
-    """The parts of the lever arm that registration knows, whatever the columns show; as most recordings have it.
-
-    A height of 5 m for one of 1 turns the rest of the arm.
-    """
-    stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
-    if not stds:
-        return {}
-    arm = np.median([guess.lever_arm for guess in guesses], axis=0).tolist()
-    known = (np.min(stds, axis=0) < GUESSED_STD_M).tolist()
-    return {name: value for name, value, is_known in zip(ARM_PARAMETERS, arm, known, strict=True) if is_known}
-
-
 def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
-    """The lever arm to start from: what is not shown of it only where it is known. effects: with what is shown."""
+    """The lever arm to start from, as most recordings have it: what is not shown of it only where it is known.
+
+    A height of 5 m for one of 1 turns the rest of the arm. effects: with what of each is shown.
+    """
     shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
-    arm = np.median([guess.lever_arm for guess in guesses], axis=0).tolist()
-    guessed = {name: value if name in shown else 0.0 for name, value in zip(ARM_PARAMETERS, arm, strict=True)}
-    return guessed | known_arm(guesses)
+    stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
+    known = np.min(stds, axis=0) < GUESSED_STD_M if stds else np.zeros(3, dtype=bool)
+    arm = np.median([guess.lever_arm for guess in guesses], axis=0)
+    return {
+        name: value if name in shown or is_known else 0.0
+        for name, value, is_known in zip(ARM_PARAMETERS, arm.tolist(), known.tolist(), strict=True)
+    }
 
 
 def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> Fit:

@@ -34,7 +34,7 @@ from .results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_documen
 from .selection import EffectSelection, Selected, select
 from .series import collect_series
 from .settings import SETTINGS
-from .shown import somewhere
+from .shown import somewhere, with_shown
 from .standing import is_borne_out, matters, settled
 from .twin import twins
 from .unexplained import Unexplained, moved_by, unexplained
@@ -115,6 +115,7 @@ def diagnose_recordings(
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
         moved = moved_by(selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
+    covariance = with_shown(selection.fitter.problem, selection.fit, covariance)
     unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
     covariance = with_moved(selection.fit, covariance, selection.moved)
     found = tuple(

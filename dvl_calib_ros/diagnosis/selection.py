@@ -32,7 +32,6 @@ from .clock_or_arm import (
     OpenArm,
     guessed_arm,
     is_open,
-    known_arm,
     lags_and_delays,
     moved_arm,
     opened_arm,
@@ -50,7 +49,7 @@ from .noise import Noise, white_noise
 from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
 from .settings import SETTINGS
-from .shown import shown_parts
+from .shown import shown_parts, without_faint
 from .unexplained import unexplained
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
@@ -133,7 +132,7 @@ def started(
     with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-    effects = shown_parts({name: effect.once for name, effect in effects.items()}, problem, {ARM: known_arm(guesses)})
+    effects = shown_parts({name: effect.once for name, effect in effects.items()}, problem)
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
@@ -188,6 +187,12 @@ def select(
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fit = _without_nothing(fitter, fit, len(effects))
+    arm = without_faint(fitter.problem, fit)
+    if arm is not None:
+        effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
+        values = tuple({spec.name: each[spec.name] for spec in arm.parameters} for each in fit.values[ARM])
+        hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
+        fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
     whole = _with_all_of_the_arm(fitter, fit, every, effects)
     if whole is not fit:
         effects = {**effects, ARM: every[ARM]}
@@ -702,9 +707,9 @@ def _without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
 
 
 def _with_all_of_the_arm(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
-    """A fit with the whole lever arm, where that part which usual ones do not show is so large that it is what is left.
+    """A fit with the whole lever arm, where that part which is not shown is so large that it is what is left.
 
-    A height of 3 m shows as one of 0.3 m does not. every: effects with all that they have; effects: with what is shown.
+    every: effects with all that they have; effects: with what is shown.
     """
     if ARM not in fit.values or effects[ARM].parameters == every[ARM].parameters or not unexplained(fitter, fit).found:
         return fit
@@ -712,7 +717,9 @@ def _with_all_of_the_arm(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], 
     others = [effect for effect in fit.effects if effect.name != ARM]
     hypothesis = fit.hypothesis.with_effects([*others, every[ARM]], len(fit.seen), {ARM: values})
     whole = min(fit, fitter.fit(hypothesis, fit.noise), key=lambda each: _criterion(each, len(every)))
-    return fit if whole is fit or unexplained(fitter, whole).found else whole
+    if whole is fit or without_faint(fitter.problem, whole) is not None:
+        return fit
+    return fit if unexplained(fitter, whole).found else whole
 
 
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:

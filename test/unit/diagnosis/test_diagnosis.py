@@ -14,11 +14,11 @@ from command_line import fail, succeed
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.diagnosis import intervals, selection
+from dvl_calib_ros.diagnosis import fitting, intervals, selection
 from dvl_calib_ros.diagnosis.clock_or_arm import lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
-from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem, no_effect
+from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, Problem, make_problem, no_effect
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
@@ -41,6 +41,7 @@ from dvl_calib_ros.diagnosis.selection import (
     _selected,
     _with_all_of_the_arm,
 )
+from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -336,6 +337,22 @@ def test_a_first_leap_that_the_blocks_do_not_bear_out_is_dropped_and_the_other_s
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
     assert alone.values["time_offset_jump"][0]["at_s"] == pytest.approx(200.0, abs=20.0)  # on a straight leg
+
+
+def test_times_of_a_leap_that_are_as_good_are_looked_for_beyond_such_as_are_not(monkeypatch):
+    """On straight legs nothing shows when: 172.6 to 176.2 s were said of a leap at 248 s, which came out 5 worse."""
+    leap = EFFECTS["time_offset_jump"]
+    problem = SimpleNamespace(interval=2.0, recordings=[SimpleNamespace(seconds=400.0)])
+    fit = Mock(spec=Fit, values={leap.name: ({"seconds": 2.0, "at_s": 174.0},)})
+
+    def worse(_, moved, fit):
+        at = moved - 174.0
+        return 100.0 if at < -5.0 or at > 90.0 else 15.0 if abs(at) < 20.0 else 5.0
+
+    monkeypatch.setattr(fitting, "_with_time", lambda fit, effect, name, recording, at: at)
+    monkeypatch.setattr(Fitter, "_worse_at", worse)
+    at, low, high = Fitter(problem).time_interval(fit, leap, "at_s", 0)
+    assert at == 174.0 and 174.0 - 5.0 < low < 174.0 and 248.0 < high < 350.0
 
 
 def test_what_is_not_known_of_the_time_of_a_leap_is_in_the_intervals_of_all_sizes():
@@ -862,6 +879,32 @@ def test_a_height_that_is_known_and_not_fitted_is_no_part_of_the_derivatives_of_
     seen = problem.all_seen(about)
     of_all = problem.columns(about, seen, arm, [values])
     np.testing.assert_allclose(problem.columns(about, seen, arm.without({"z_m"}), [values]), of_all[:, :, :2])
+
+
+@pytest.mark.parametrize(
+    ("by_metre", "is_shown", "std"),
+    [(0.005, False, 0.004 / 0.005), (0.0096, True, 0.004 / 0.0096), (0.02, True, 0.0)],
+)
+def test_a_height_is_looked_for_where_one_of_a_metre_shows_and_known_by_what_a_model_lacks(by_metre, is_shown, std):
+    """Held at nothing at 9.6 mm/s a metre, one of 2.8 m turned the rest of the arm and was an unknown cause."""
+    arm = EFFECTS["lever_arm"]
+    columns = np.zeros((100, 2, 3))
+    columns[:, 0, 0] = columns[:, 1, 1] = 0.07
+    columns[:, 0, 2] = by_metre
+    problem = Mock(spec=Problem, measured=(True, True, False), recordings=[], columns=lambda *_: columns)
+    shown = shown_parts({arm.name: arm}, problem)[arm.name]
+    assert [each.name for each in shown.parameters] == ["x_m", "y_m", "z_m"][: 2 + is_shown]
+    hypothesis = no_effect().with_effects([arm], 1, {})
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values)
+    fit.columns = np.concatenate([np.zeros((100, 2, 6)), columns], axis=2)
+    added = np.diag(with_shown(problem, fit, np.zeros((9, 9))))
+    assert np.sqrt(added) == pytest.approx([0.0] * 8 + [std])
+    assert not with_shown(Mock(spec=Problem, measured=(True, True, True)), fit, np.zeros((9, 9))).any()
+    for times, stands in ((1.9, not std), (-2.1, True)):
+        fit.values = {arm.name: ({"x_m": 0.0, "y_m": 0.0, "z_m": times * std},)}
+        fit.effects = (arm,)
+        left = without_faint(problem, fit)
+        assert left is None if stands else [each.name for each in left.parameters] == ["x_m", "y_m"]
 
 
 @pytest.mark.parametrize("z", [-2.8, 0.0])
