@@ -215,12 +215,14 @@ class Grid:
         """(F,) s, increasing, at which what is stamped so was measured.
 
         A leap that is tried where there is none would have samples measured before those that came first; these then
-        follow one another at half the time between their stamps, until they are as late as the leap has them.
+        follow one another at half the usual time between stamps, until they are as late as the leap has them. A leap
+        that is there leaves its gap in the stamps, not in time.
         """
         time = self.stamps
         for _ in range(_PASSES):
             time = self.stamps - late(injections, self.clock, time)
-        least = 0.5 * (self.stamps - self.stamps[:1])
+        steps = np.diff(self.stamps, prepend=self.stamps[:1])
+        least = 0.5 * np.cumsum(np.minimum(steps, np.median(steps)))
         return time if (np.diff(time - least) > 0.0).all() else np.maximum.accumulate(time - least) + least
 
 

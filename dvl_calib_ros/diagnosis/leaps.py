@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..calibration.frames import Array
 from ..effects.base import ActsOn, Effect
+from ..effects.composition import late
 from .clock_or_arm import ARM, CLOCKS, DVL_CLOCK, LAG, LAG_OR_DELAY, lags_and_delays
 from .composed import Hypothesis, Values
-from .fitting import Fit, Fitter
+from .fitting import OF_A_TIME, Fit, Fitter
 from .settings import SETTINGS
 
 LEAP = "time_offset_jump"
@@ -29,6 +30,9 @@ DELAYS = np.arange(-4.0, 4.01, 0.25)
 PARTS, FEWEST_PARTS = 60, 3
 # Squares of white noise that a leap takes off, from which on it is fitted, and a delay that is none, s
 WORTH_FITTING, NO_DELAY = 40.0, 0.13
+# The largest gaps in the stamps, from so many seconds on, are times at which a clock may have leapt ahead, if by as
+# much (but for that many seconds)
+GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
 
 
 @dataclass(frozen=True)
@@ -52,13 +56,61 @@ def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping
     found = _found(squares)
     if not found.begins:
         return []
-    times = [_time(fitter, ends, part, late) for part, late in zip(found.begins, found.seconds[1:], strict=True)]
+    times = [_time(fitter, ends, part, by) for part, by in zip(found.begins, found.seconds[1:], strict=True)]
     steps = np.diff(found.seconds).tolist()
     values = {"seconds": steps[0], "at_s": times[0]}
     if len(steps) > 1:
         values |= {"again_seconds": steps[1], "again_at_s": max(times[1], times[0])}
     leap = every[LEAP] if len(steps) > 1 else once[LEAP]
     return _hypotheses(fit, rest, once, leap, values, found.seconds[0])
+
+
+def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
+    """True times (s of the run) of the largest gaps in the stamps of the DVL of one recording, and what each is longer
+    than usual, s.
+
+    A clock that leaps ahead leaves a gap as large as the leap; lost samples leave gaps as well.
+    """
+    if len(fit.seen) > 1:
+        return []
+    stamps = fitter.problem.recordings[0].dvl.time
+    steps = np.diff(stamps)
+    usual = float(np.median(steps))
+    largest = np.argsort(-steps)[:GAPS]
+    stamps, longer = stamps[largest], steps[largest] - usual
+    injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
+    leaps = [(each["at_s"], each["seconds"]) for each in fit.values.get(LEAP, ())]
+    leaps += [(each["again_at_s"], each["again_seconds"]) for each in fit.values.get(LEAP, ()) if "again_at_s" in each]
+    found = []
+    for stamp, gap in zip(stamps.tolist(), longer.tolist(), strict=True):
+        before = sum(seconds for at, seconds in leaps if at + AS_LARGE_S < stamp and abs(seconds - gap) > AS_LARGE_S)
+        at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
+        if gap > GAP_FROM_S and at > 0.0:
+            found.append((at, gap))
+    return found
+
+
+def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
+    """A fit whose leaps ahead lie where the stamps have a gap as large, if the data takes that for as good a time.
+
+    Without the outliers there that a wrong time has made: they would be for it.
+    """
+    for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
+        if not all(at_s in each for each in fit.values.get(LEAP, ({},))):
+            continue
+        for at, gap in gaps(fitter, fit):
+            (values,) = fit.values[LEAP]
+            if abs(values[seconds] - gap) > AS_LARGE_S:
+                continue
+            tried = replace(fit.hypothesis, values={**fit.values, LEAP: ({**values, at_s: at},)})
+            times = fitter.problem.time
+            near = (times > min(at, values[at_s]) - gap) & (times < max(at, values[at_s]) + gap)
+            fair = replace(fitter, outliers=np.where(near[:, None], 0.0, fitter.outliers), _fits={})
+            left = [fair.fit(each, fit.noise) for each in (fit.hypothesis, tried)]
+            before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in left)
+            if after < before + OF_A_TIME:
+                fit = fitter.fit(left[1].hypothesis, fit.noise)
+    return fit
 
 
 def _hypotheses(
@@ -121,9 +173,9 @@ def _found(squares: Array) -> Delays:
     return Delays(delays, tuple(edges[1:-1]))
 
 
-def _time(fitter: Fitter, ends: Array, part: int, late: float) -> float:
-    """When a part begins, s of the run by a true clock, in which the DVL is late."""
+def _time(fitter: Fitter, ends: Array, part: int, by: float) -> float:
+    """When a part begins, s of the run by a true clock, in which the DVL is late by so many seconds."""
     problem = fitter.problem
     (grid,) = problem.grids
     at = float(problem.time[min(int(ends[part - 1]), len(problem.time) - 1)])
-    return max(0.0, at + grid.late - late) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, at)
+    return max(0.0, at + grid.late - by) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, at)

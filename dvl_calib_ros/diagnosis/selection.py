@@ -42,7 +42,7 @@ from .compass import HEADING, heading_first, with_two_cycles
 from .composed import Hypothesis, Offsets, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, n_amplitudes, prior_std
-from .leaps import LEAP, leaping
+from .leaps import LEAP, gaps, in_gaps, leaping
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
@@ -175,7 +175,7 @@ def select(
         finer = _finer_steps(problem)
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = fitter.refined_as_white(fitter.refined(_best(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
-        best = _by_fewer_clocks(fitter, best, effects)
+        best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
         best = _called_for(fitter, best, len(effects))
         names = frozenset(effect.name for effect in best.effects)
         fitter, fit = _about(fitter, best, every)
@@ -538,7 +538,8 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
     left = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
     tried = []
-    for at in np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist():
+    grid = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
+    for at in [*grid, *(at for at, _ in gaps(fitter, fit) if whole.name == LEAP)]:
         values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
         start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
         misfit, start = fitter.straight_on(fit, start)

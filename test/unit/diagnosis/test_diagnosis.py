@@ -18,12 +18,12 @@ from dvl_calib_ros.diagnosis import fitting, intervals, selection
 from dvl_calib_ros.diagnosis.clock_or_arm import lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
-from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, Problem, make_problem, no_effect
+from dvl_calib_ros.diagnosis.composed import Grid, Hypothesis, Offsets, Problem, make_problem, no_effect
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
 from dvl_calib_ros.diagnosis.holm import holm
-from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays
+from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps
 from dvl_calib_ros.diagnosis.leaps import _found as _delays
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
@@ -43,6 +43,7 @@ from dvl_calib_ros.diagnosis.selection import (
 )
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
+from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.recordings.topics import Topics
@@ -337,6 +338,37 @@ def test_a_first_leap_that_the_blocks_do_not_bear_out_is_dropped_and_the_other_s
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
     assert alone.values["time_offset_jump"][0]["at_s"] == pytest.approx(200.0, abs=20.0)  # on a straight leg
+
+
+def test_a_leap_ahead_leaves_a_gap_in_the_stamps_and_none_in_time():
+    """Samples after a leap of 1.84 s were taken for as much as 0.9 s late, for the 1.7 s until they had caught up."""
+    time = np.arange(0.0, 40.0, 0.1)
+    leap = injection("time_offset_jump:seconds=1.84,at_s=20.05")
+    grid = Grid(ActsOn.DVL_CLOCK, time + 1.84 * (time >= 20.05), 1)
+    np.testing.assert_allclose(grid.true_time([leap]), time, atol=1e-9)
+    tried = Grid(ActsOn.DVL_CLOCK, time, 1).true_time([leap])  # where there is none, time still goes on
+    assert (np.diff(tried) > 0.0).all() and tried[-1] == pytest.approx(time[-1] - 1.84)
+
+
+def test_leaps_ahead_are_put_where_the_stamps_have_a_gap_as_large():
+    """The stamps show it to a sample; a lost second elsewhere is no leap, and a leap back leaves no gap."""
+    given = scenario(
+        effects=["dvl_time_offset:seconds=0.5", "time_offset_jump:seconds=1.8,at_s=201.3"], gnss_std=0.02, seconds=400.0
+    )
+    run = simulate(given)
+    run = replace(run, dvl=[*run.dvl[:300], *run.dvl[305:]])
+    problem = make_problem([recording_of(run, given.gnss_frame)], np.eye(3), np.zeros(3), [Offsets(0.5, 0.0)])
+    effects = [EFFECTS["dvl_time_offset"], EFFECTS["time_offset_jump"].once]
+    values = {"dvl_time_offset": ({"seconds": 0.5},), "time_offset_jump": ({"seconds": 1.7, "at_s": 199.0},)}
+    start = no_effect().with_effects(effects, 1, values)
+    fitter = Fitter(problem)
+    fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
+    at = pytest.approx(201.3 - 0.5, abs=0.3)  # since the first stamp, which was late
+    assert [gap for _, gap in gaps(fitter, fit)] == pytest.approx([2.0, 1.8]) and gaps(fitter, fit)[1][0] == at
+    assert in_gaps(fitter, fit).values["time_offset_jump"][0]["at_s"] == at
+    back = {**fit.values, "time_offset_jump": ({"seconds": -1.8, "at_s": 199.0},)}
+    back = replace(fit, hypothesis=replace(fit.hypothesis, values=back))
+    assert in_gaps(fitter, back) is back
 
 
 def test_times_of_a_leap_that_are_as_good_are_looked_for_beyond_such_as_are_not(monkeypatch):
