@@ -221,9 +221,14 @@ class Grid:
         time = self.stamps
         for _ in range(_PASSES):
             time = self.stamps - late(injections, self.clock, time)
-        steps = np.diff(self.stamps, prepend=self.stamps[:1])
-        least = 0.5 * np.cumsum(np.minimum(steps, np.median(steps)))
+        least = self._least
         return time if (np.diff(time - least) > 0.0).all() else np.maximum.accumulate(time - least) + least
+
+    @cached_property
+    def _least(self) -> Array:
+        """(F,) s, least time since the first sample: asked for by every hypothesis, and the same for all."""
+        steps = np.diff(self.stamps, prepend=self.stamps[:1])
+        return np.asarray(0.5 * np.cumsum(np.minimum(steps, np.median(steps))))
 
 
 @dataclass(frozen=True)

@@ -190,7 +190,7 @@ def select(
     arm = without_faint(fitter.problem, fit)
     if arm is not None:
         effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
-        values = tuple({spec.name: each[spec.name] for spec in arm.parameters} for each in fit.values[ARM])
+        values = tuple(dict(each) for each in fit.values[ARM])  # what is not said of it is held where it is
         hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
         fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
     whole = _with_all_of_the_arm(fitter, fit, every, effects)
@@ -538,8 +538,10 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
     left = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
     tried = []
-    grid = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
-    for at in [*grid, *(at for at, _ in gaps(fitter, fit) if whole.name == LEAP)]:
+    times = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
+    if whole.name == LEAP:
+        times += [at for at, _ in gaps(fitter, fit)]
+    for at in times:
         values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
         start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
         misfit, start = fitter.straight_on(fit, start)

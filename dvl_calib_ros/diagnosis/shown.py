@@ -64,12 +64,14 @@ def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
     """What a model lacks makes of a lever arm, m, by its parts of which a usual size would not be shown."""
     if problem.measured[2] or ARM not in fit.values:
         return {}
-    known = {}
-    for number, each in enumerate(fit.hypothesis.parameters(), start=6):
-        size = float(np.sqrt((fit.columns[:, :, number] ** 2).sum(axis=1).mean()))
-        if each.effect.name == ARM and size * each.spec.typical < SHOWN_FROM * USUAL_MPS:
-            known[each.spec.name] = SHOWN_FROM * USUAL_MPS / size
-    return known
+    sizes = np.sqrt((fit.columns[:, :, 6:] ** 2).sum(axis=1).mean(axis=0)).tolist()
+    own = [
+        (each.spec, size)
+        for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
+        if each.effect.name == ARM
+    ]
+    least = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
+    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < least}
 
 
 def somewhere(effect: Effect, problem: Problem) -> list[Values]:

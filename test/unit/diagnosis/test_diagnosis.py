@@ -14,7 +14,7 @@ from command_line import fail, succeed
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.diagnosis import fitting, intervals, selection
+from dvl_calib_ros.diagnosis import fitting, intervals, selection, shown
 from dvl_calib_ros.diagnosis.clock_or_arm import lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
@@ -937,6 +937,27 @@ def test_a_height_is_looked_for_where_one_of_a_metre_shows_and_known_by_what_a_m
         fit.effects = (arm,)
         left = without_faint(problem, fit)
         assert left is None if stands else [each.name for each in left.parameters] == ["x_m", "y_m"]
+
+
+def test_what_turns_show_best_of_an_arm_is_said_however_little_they_show():
+    """Of a vehicle that hardly turns nothing of the arm would be left, and an effect without a parameter."""
+    arm = EFFECTS["lever_arm"]
+    hypothesis = no_effect().with_effects([arm], 1, {arm.name: ({"x_m": 0.1, "y_m": 0.1, "z_m": 0.1},)})
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values, effects=(arm,))
+    fit.columns = np.concatenate([np.zeros((100, 2, 6)), np.full((100, 2, 3), [0.005, 0.005, 0.0005])], axis=2)
+    left = without_faint(Mock(spec=Problem, measured=(True, True, False)), fit)
+    assert left is not None and [each.name for each in left.parameters] == ["x_m", "y_m"]
+
+
+def test_a_height_that_is_not_said_is_held_where_it_is(monkeypatch):
+    """At nothing, half a metre of it was what is left, and right answers were unknown for it."""
+    monkeypatch.setattr(shown, "SHOWN_FROM", 0.8)
+    monkeypatch.setattr(shown, "ARM_FROM_M", 10.0)
+    given = scenario(effects=["lever_arm:x_m=-0.6,y_m=-1.6,z_m=-0.5"], gnss_std=0.01, waves=Waves(0.2, 6.0))
+    diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())
+    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
+    assert {*found(diagnosis)["lever_arm"]} == {"x_m", "y_m"}
+    assert_within(diagnosis, "lever_arm", x_m=-0.6, y_m=-1.6)
 
 
 @pytest.mark.parametrize("z", [-2.8, 0.0])
