@@ -9,9 +9,10 @@ import numpy as np
 
 from ..calibration.frames import Array
 from .composed import is_time_of_run
+from .criteria import blocks_of
 from .fitting import Fit, Fitter
 from .made_up import made_up
-from .selection import EffectSelection, blocks_of
+from .selection import EffectSelection
 
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]

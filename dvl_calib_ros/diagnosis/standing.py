@@ -10,8 +10,9 @@ import numpy as np
 from ..effects.base import Effect
 from .closure import Gap
 from .composed import Problem
+from .criteria import price
 from .fitting import Fit
-from .selection import EffectSelection, price
+from .selection import EffectSelection
 from .settings import SETTINGS
 from .unexplained import Unexplained, holds_out, told_elsewhere, unexplained
 

@@ -18,8 +18,9 @@ from scipy.stats import norm, t
 from ..calibration.frames import Array
 from ..diagnosis.clock_or_arm import ATTITUDE_CLOCK, CLOCKS
 from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
+from ..diagnosis.criteria import blocks_of
 from ..diagnosis.fitting import Fit
-from ..diagnosis.selection import EffectSelection, blocks_of
+from ..diagnosis.selection import EffectSelection
 from ..diagnosis.where import BANDS_HZ, regimes
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS

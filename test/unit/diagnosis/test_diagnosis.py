@@ -14,7 +14,8 @@ from command_line import fail, succeed
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.diagnosis import fitting, intervals, selection, shown
+from dvl_calib_ros.diagnosis import fitting, intervals, shown, twice
+from dvl_calib_ros.diagnosis.called_for import _is_late_before_a_leap, once_where_borne_out, only_called_for
 from dvl_calib_ros.diagnosis.clock_or_arm import lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
@@ -29,19 +30,10 @@ from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.selection import (
-    _about,
-    _by_fewer_clocks,
-    _called_for,
-    _clock_or_arm,
-    _happening_again,
-    _is_late_before_a_leap,
-    _is_taken_back,
-    _once_borne_out,
-    _selected,
-    _with_all_of_the_arm,
-)
+from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
+from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
+from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -289,19 +281,19 @@ def test_a_clock_that_is_late_before_it_leaps_is_no_ghost_of_the_leap_unless_it_
 
 
 @pytest.mark.parametrize(
-    ("drop", "instead", "is_taken_back"),
+    ("drop", "instead", "is_wanted"),
     [(100.0, 0.0, True), (5000.0, 9000.0, False), (500.0, 90.0, False), (500.0, 700.0, True)],
 )
 def test_a_clock_that_is_nearly_set_right_again_has_leapt_twice_where_nothing_else_explains_as_much(
-    drop, instead, is_taken_back, monkeypatch
+    drop, instead, is_wanted, monkeypatch
 ):
     """A leap of -1.30 s and one back by 1.00 s were not named, beside a lag and an arm."""
     leap = EFFECTS["time_offset_jump"]
     values = {"seconds": -1.3, "at_s": 96.0, "again_seconds": 1.004, "again_at_s": 220.0}
     problem = SimpleNamespace(recordings=[SimpleNamespace(seconds=370.0)])
     fit = Mock(spec=Fit, effects=(leap,), values={leap.name: (values,)})
-    monkeypatch.setattr(selection, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0))
-    assert _is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop, Mock(spec=Fit)) is is_taken_back
+    monkeypatch.setattr(twice, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0))
+    assert is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop, Mock(spec=Fit)) is is_wanted
 
 
 def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clock_goes():
@@ -313,7 +305,7 @@ def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clo
     )
     taken_back = {name: per if name != "time_offset_jump" else (leaps,) for name, per in fit.values.items()}
     fit = replace(fit, hypothesis=replace(fit.hypothesis, values=taken_back), deviance=fit.deviance - 60.0)
-    assert [each.name for each in _called_for(fitter, fit, len(EFFECTS)).effects] == ["time_offset_jump"]
+    assert [each.name for each in only_called_for(fitter, fit, len(EFFECTS)).effects] == ["time_offset_jump"]
 
 
 def test_a_second_leap_that_is_not_there_is_taken_back():
@@ -322,7 +314,7 @@ def test_a_second_leap_that_is_not_there_is_taken_back():
         {"time_offset_jump": {"seconds": 0.8, "at_s": 100.0, "again_seconds": 0.02, "again_at_s": 200.0}},
     )
     once = {name: effect.once for name, effect in EFFECTS.items()}
-    (alone,) = _happening_again(fitter, [fit], EFFECTS, once)
+    (alone,) = happening_again(fitter, [fit], EFFECTS, once)
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
 
@@ -334,7 +326,7 @@ def test_a_first_leap_that_the_blocks_do_not_bear_out_is_dropped_and_the_other_s
         {"time_offset_jump": {"seconds": 0.02, "at_s": 60.0, "again_seconds": 0.8, "again_at_s": 200.0}},
     )
     once = {name: effect.once for name, effect in EFFECTS.items()}
-    alone = _once_borne_out(fitter, fit, EFFECTS, once)
+    alone = once_where_borne_out(fitter, fit, EFFECTS, once)
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
     assert alone.values["time_offset_jump"][0]["at_s"] == pytest.approx(200.0, abs=20.0)  # on a straight leg
@@ -420,7 +412,7 @@ def test_two_recordings_are_not_asked_for_a_second_leap_at_one_time_of_both():
     start = no_effect().with_effects([leap], 2, {leap.name: ({"seconds": 0.8, "at_s": 100.0},) * 2})
     fitter = Fitter(problem)
     fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
-    assert _happening_again(fitter, [fit], EFFECTS, once) == []
+    assert happening_again(fitter, [fit], EFFECTS, once) == []
 
 
 @pytest.mark.parametrize("seconds", [-2.7, 0.3, 1.2])

@@ -13,11 +13,11 @@ from dvl_calib_ros.diagnosis import levels
 from dvl_calib_ros.diagnosis.claims import claims_of, exponents, followed
 from dvl_calib_ros.diagnosis.composed import Offsets, make_problem, no_effect
 from dvl_calib_ros.diagnosis.contradicted import without_contradicted
+from dvl_calib_ros.diagnosis.criteria import blocks_of
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
-from dvl_calib_ros.diagnosis.selection import blocks_of
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

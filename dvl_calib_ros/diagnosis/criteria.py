@@ -1,0 +1,112 @@
+"""What a fit costs and gains, and how sure an effect is given all others."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
+from ..effects.base import Effect
+from .composed import Problem, is_time_of_run
+from .fitting import Fit, Fitter, n_amplitudes
+from .settings import SETTINGS
+
+# Parts of the run at whose ends effects that come and go are tried to begin or end
+WINDOW_STEPS = 10
+# Deviance within which the usual is preferred
+AS_WELL = 2.0
+
+
+def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
+    """Times of the run, by name, that are tried: none at all first, then every part of the grid."""
+    times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
+    if not times:
+        return [{}]
+    grid = np.linspace(0.0, seconds, WINDOW_STEPS + 1).tolist()
+    if len(times) == 1:
+        return [{times[0]: at} for at in grid[1:-1]]
+    whole = {name: effect.defaults[name] for name in times}
+    parts = [dict(zip(times, part, strict=True)) for part in itertools.combinations(grid, len(times))]
+    return [whole, *(part for part in parts if part != {times[0]: 0.0, times[-1]: seconds})]
+
+
+def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
+    """Deviance that an effect explains by chance, once in 1 / level data sets, having looked at all of them."""
+    dof = n_amplitudes(effect, n_recordings)
+    return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
+
+
+def criterion(fit: Fit, n_effects: int) -> float:
+    """Deviance and the price of every effect."""
+    n = len(fit.seen)
+    return fit.deviance + sum(price(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
+
+
+def times_tried(effect: Effect) -> float:
+    """How many alternatives are looked at for an effect: twice its times of the run, or one."""
+    return 2.0 * len(windows(effect, 1.0)) if any(is_time_of_run(s) for s in effect.parameters) else 1.0
+
+
+def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
+    """The fit that explains most for its price; of those that do as well, that of the most usual effects.
+
+    These come first in the library.
+    """
+    scores = [criterion(fit, len(effects)) for fit in fits]
+    rank = {name: index for index, name in enumerate(effects)}
+    alike = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
+    return min(alike, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
+
+
+def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
+    """A fit without one of its effects, under the same noise."""
+    rest = [other for other in fit.effects if other is not effect]
+    return fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
+
+
+def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
+    """log p of a drop in deviance, times how many alternatives were tried."""
+    return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
+
+
+def log_p_in_place(fit: Fit, rest: Fit, effect: Effect) -> float:
+    """log p of an effect of a fit, given all others. rest: the fit without it."""
+    return log_p_value(fit.gain_over(rest), fit.dof - rest.dof, times_tried(effect))
+
+
+def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "") -> float:
+    """p of a Wald test with the covariance that blocks show, of all parameters of an effect or of one by name."""
+    at, start = np.zeros(0, dtype=int), 6
+    for other in fit.effects:
+        p = len(fit.hypothesis.parameters_of(other))
+        if other is effect:
+            at = np.arange(start, start + p)
+        start += p
+    own = fit.hypothesis.parameters_of(effect)
+    is_asked = np.array([not name or each.spec.name == name for each in own])
+    at, defaults = at[is_asked], np.array([each.spec.default for each in own])[is_asked]
+    values = fit.hypothesis.vector()[at] - defaults
+    covariance = fit.covariance(block)[np.ix_(at, at)]
+    wald = float(values @ np.linalg.solve(covariance, values)) / len(at)
+    blocks = int(block.max()) + 1
+    return float(f_sf(wald, len(at), max(blocks - len(at), 2)))
+
+
+def blocks_of(problem: Problem) -> NDArray[np.intp]:
+    """(M,) block of each bin, from 0: stretches of time, half of those of hold-out."""
+    index = np.floor(problem.time / (0.5 * SETTINGS.block)).astype(int)
+    keys = problem.recording_of * (index.max() + 2) + index - index.min()
+    return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)
+
+
+def finer_steps(problem: Problem) -> list[float]:
+    """Steps (s) by which times of the run are refined: half of those tried, down to the time between samples."""
+    seconds = max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
+    steps: list[float] = []
+    while seconds > 0.7 * problem.interval and len(steps) < 8:
+        seconds /= 2.0
+        steps.append(seconds)
+    return steps
