@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-import struct
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
@@ -16,7 +15,6 @@ from urllib.parse import quote
 import yaml
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
-from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -63,36 +61,8 @@ class _Sqlite3Writer(Sqlite3Writer):
         self.cursor = self.conn.cursor()
 
 
-class _McapWriter(McapWriter):
-    """As rosbags', byte for byte, in a quarter of the time a message."""
-
-    def write(self, connection: Any, timestamp: int, data: bytes | memoryview) -> None:
-        chunk, number = self.chunk, connection.id
-        if timestamp < chunk.message_start_time:
-            chunk.message_start_time = timestamp
-            self.message_start_time = min(timestamp, self.message_start_time)
-        if timestamp > chunk.message_end_time:
-            chunk.message_end_time = timestamp
-            self.message_end_time = max(timestamp, self.message_end_time)
-        self.channel_stats[number] += 1
-        chunk.msgs[number].append((timestamp, chunk.bio.tell()))
-        chunk.bio.write(_MESSAGE.pack(5, _MESSAGE.size - 9 + len(data), number, 0, timestamp, timestamp))
-        chunk.bio.write(data)
-        if chunk.bio.tell() > _CHUNK:
-            self.close_chunk()
-
-
-# A message's record: its kind and length; channel, number, and when it was logged and published.
-_MESSAGE = struct.Struct("<BQHIQQ")
-_CHUNK = 2**20
-
-
 class _Writer(Writer):
-    STORAGE_PLUGINS = {  # noqa: RUF012
-        **Writer.STORAGE_PLUGINS,
-        StoragePlugin.MCAP: _McapWriter,
-        StoragePlugin.SQLITE3: _Sqlite3Writer,
-    }
+    STORAGE_PLUGINS = {**Writer.STORAGE_PLUGINS, StoragePlugin.SQLITE3: _Sqlite3Writer}  # noqa: RUF012
 
 
 class BagWriter:
@@ -154,16 +124,12 @@ class BagWriter:
 
     def message(self, topic: str, msgtype: str, log_ns: int, message: Any) -> None:
         """Write a message of a type that `typestore` has."""
-        self.serialised(topic, msgtype, log_ns, bytes(self.typestore.serialize_cdr(message, msgtype)))
-
-    def serialised(self, topic: str, msgtype: str, log_ns: int, data: bytes) -> None:
-        """Write what `message` makes of a message of a type that `typestore` has."""
         channel = self._channels.get((topic, msgtype))
         if channel is None:
             text, _ = self.typestore.generate_msgdef(msgtype, ros_version=2)
             channel = Channel(topic, msgtype, Definition(MessageDefinitionFormat.MSG, text))
             self._channels[topic, msgtype] = channel
-        self._write(channel, log_ns, data)
+        self._write(channel, log_ns, bytes(self.typestore.serialize_cdr(message, msgtype)))
 
     def raw(self, channel: Channel, log_ns: int, data: bytes) -> None:
         """Write a message as it was recorded, its definition with it."""

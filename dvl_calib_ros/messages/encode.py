@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-import struct
 from collections.abc import Iterable
-from functools import cache
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,11 +37,6 @@ class WaterReading(NamedTuple):
     salinity: float
 
 
-# CDR of what a recording has by the ten thousand: little-endian, numbers at multiples of their size behind four bytes
-_CDR = b"\0\1\0\0"
-_THREE, _FOUR = struct.Struct("<3d"), struct.Struct("<4d")
-_NO_VECTOR, _NO_COVARIANCE, _NO_TWIST_COVARIANCE = bytes(24), bytes(72), bytes(288)
-_UNKNOWN = struct.pack("<9d", -1.0, *[0.0] * 8)
 # What is written of each second is enough of what changes slowly
 _WATER_EVERY_NS = 1_000_000_000
 
@@ -58,7 +50,7 @@ class SampleWriter:
 
     def recording(self, *sensors: Iterable[Sample | SatelliteFix]) -> None:
         """Write the samples of any sensors, each in order of time, to the node's topics in order of time."""
-        for sample in heapq.merge(*sensors, key=attrgetter("stamp_ns")):
+        for sample in heapq.merge(*sensors, key=lambda sample: sample.stamp_ns):
             if isinstance(sample, DvlSample):
                 self.dvl("dvl/twist", sample)
             elif isinstance(sample, ReferenceSample):
@@ -70,11 +62,11 @@ class SampleWriter:
 
     def dvl(self, topic: str, sample: DvlSample, frame_id: str = "dvl_link") -> None:
         """Write a DVL velocity as TwistWithCovarianceStamped."""
-        self._bag.serialised(topic, TWIST_TYPE, sample.stamp_ns, _twist(sample, frame_id))
+        self._bag.message(topic, TWIST_TYPE, sample.stamp_ns, self._twist(sample, frame_id))
 
     def reference(self, topic: str, sample: ReferenceSample, frame_id: str) -> None:
         """Write a reference velocity as TwistWithCovarianceStamped."""
-        self._bag.serialised(topic, TWIST_TYPE, sample.stamp_ns, _twist(sample, frame_id))
+        self._bag.message(topic, TWIST_TYPE, sample.stamp_ns, self._twist(sample, frame_id))
 
     def fix(self, topic: str, fix: SatelliteFix, frame_id: str = "gnss") -> None:
         """Write a position as NavSatFix, without a covariance."""
@@ -92,16 +84,18 @@ class SampleWriter:
 
     def imu(self, topic: str, sample: ImuSample, frame_id: str = "base_link") -> None:
         """Write attitude and angular velocity as Imu, with covariance -1 where there is none."""
-        data = (
-            _header(sample.stamp_ns, frame_id),
-            _FOUR.pack(*(sample.orientation or (0.0, 0.0, 0.0, 1.0))),
-            _NO_COVARIANCE if sample.orientation else _UNKNOWN,
-            _THREE.pack(*sample.angular_velocity) if sample.angular_velocity else _NO_VECTOR,
-            _NO_COVARIANCE if sample.angular_velocity else _UNKNOWN,
-            _NO_VECTOR,
-            _UNKNOWN,
+        quaternion, vector = self._types["geometry_msgs/msg/Quaternion"], self._types["geometry_msgs/msg/Vector3"]
+        unknown = np.array([-1.0, *[0.0] * 8])
+        message = self._types[IMU_TYPE](
+            header=self._header(sample.stamp_ns, frame_id),
+            orientation=quaternion(*(sample.orientation or (0.0, 0.0, 0.0, 1.0))),
+            orientation_covariance=np.zeros(9) if sample.orientation else unknown,
+            angular_velocity=vector(*(sample.angular_velocity or (0.0, 0.0, 0.0))),
+            angular_velocity_covariance=np.zeros(9) if sample.angular_velocity else unknown,
+            linear_acceleration=vector(0.0, 0.0, 0.0),
+            linear_acceleration_covariance=unknown,
         )
-        self._bag.serialised(topic, IMU_TYPE, sample.stamp_ns, b"".join(data))
+        self._bag.message(topic, IMU_TYPE, sample.stamp_ns, message)
 
     def water(self, readings: Iterable[WaterReading]) -> int:
         """Write what a DVL says of its water, at most one reading a second; how many were written."""
@@ -118,28 +112,16 @@ class SampleWriter:
                     self._bag.message(f"dvl/{name}", NUMBER_TYPE, each.stamp_ns, types[NUMBER_TYPE](value))
         return written
 
+    def _twist(self, sample: DvlSample | ReferenceSample, frame_id: str) -> Any:
+        types = self._types
+        vector = types["geometry_msgs/msg/Vector3"]
+        covariance = np.zeros((6, 6))
+        if sample.covariance is not None:
+            covariance[:3, :3] = sample.covariance
+        twist = types["geometry_msgs/msg/Twist"](vector(*sample.velocity), vector(0.0, 0.0, 0.0))
+        inner = types["geometry_msgs/msg/TwistWithCovariance"](twist, covariance.ravel())
+        return types[TWIST_TYPE](self._header(sample.stamp_ns, frame_id), inner)
+
     def _header(self, stamp_ns: int, frame_id: str) -> Any:
         time = self._types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 1_000_000_000))
         return self._types["std_msgs/msg/Header"](time, frame_id)
-
-
-def _header(stamp_ns: int, frame_id: str) -> bytes:
-    """The beginning of a message with a header, up to where numbers of eight bytes go on."""
-    layout, text = _behind_header(frame_id)
-    return layout.pack(_CDR, *divmod(stamp_ns, 1_000_000_000), len(text), text)
-
-
-@cache
-def _behind_header(frame_id: str) -> tuple[struct.Struct, bytes]:
-    text = frame_id.encode() + b"\0"
-    return struct.Struct(f"<4siII{len(text)}s{-(12 + len(text)) % 8}x"), text
-
-
-def _twist(sample: DvlSample | ReferenceSample, frame_id: str) -> bytes:
-    """A TwistWithCovarianceStamped, serialised."""
-    covariance = _NO_TWIST_COVARIANCE
-    if sample.covariance is not None:
-        whole = np.zeros((6, 6), dtype="<f8")
-        whole[:3, :3] = sample.covariance
-        covariance = whole.tobytes()
-    return b"".join((_header(sample.stamp_ns, frame_id), _THREE.pack(*sample.velocity), _NO_VECTOR, covariance))
