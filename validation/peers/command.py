@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import math
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dvl_calib_ros.cli import common
@@ -17,7 +20,7 @@ from dvl_calib_ros.present.terminal import rich_table
 from ..trial.motion import BOAT, RECORDED
 from ..trial.plan import Case, Family, plan
 from ..trial.recorded import has_ins, recordings_folder
-from ..trial.run import Trial
+from ..trial.run import Document, Identified, Trial, read_answers
 from ..trial.truth import Category, unseal
 from .asked import PEERS, peers
 from .foreign import FOREIGN, foreign_cases, has_physics, record_foreign
@@ -43,6 +46,10 @@ def main(argv: Sequence[str]) -> int:
         "--out", type=Path, default=Path("dvl_calib_peers"), metavar="FOLDER",
         help="folder of the answers, which goes on where it was stopped; default: %(default)s",
     )  # fmt: skip
+    parser.add_argument(
+        "--anew", action="store_true",
+        help="ask the diagnosis, which has changed, once more about the cases that the folder has; the peers have not",
+    )  # fmt: skip
     arguments = parser.parse_args(argv)
     if arguments.cases < 1 or arguments.jobs < 0 or arguments.seed < 0 or not arguments.minutes >= 0.0:
         raise InputError("wrong number: give --cases 1 or more, and --jobs, --seed and --minutes 0 or more")
@@ -59,15 +66,34 @@ def main(argv: Sequence[str]) -> int:
         arguments.out / FOREIGN, arguments.seed, arguments.jobs, beside=beside, recorder=record_foreign
     )  # fmt: skip
     with common.progress("peers") as on_progress:
-        chosen = generator_cases(arguments.cases - n_foreign)
-        answers = dict(inside.run(chosen, on_progress, seconds * (1.0 - n_foreign / arguments.cases)))
-        answers |= outside.run(foreign_cases(n_foreign), on_progress, seconds * n_foreign / arguments.cases)
+        chosen, strange = generator_cases(arguments.cases - n_foreign), foreign_cases(n_foreign)
+        run = asked_anew if arguments.anew else Trial.run
+        answers = run(inside, chosen, on_progress, seconds * (1.0 - n_foreign / arguments.cases))
+        answers = answers | run(outside, strange, on_progress, seconds * n_foreign / arguments.cases)
     truths = {**unseal(inside.sealed), **unseal(outside.sealed)}
     found = tables(sides(truths, answers))
     save_text(arguments.out / "score.md", markdown(found))
     for title, columns, rows in found:
         out.print(rich_table(Table(columns, tuple(rows), title)))
     return 0
+
+
+def asked_anew(
+    trial: Trial, cases: Sequence[Identified], on_progress: Callable[[float], None], seconds: float
+) -> dict[str, Document]:
+    """Answers to those cases that the trial's folder has: of the diagnosis anew, of the peers as they were.
+
+    The folder has the new ones when all are there; until then a further call goes on. Raises InputError.
+    """
+    before = read_answers(trial.answers)
+    asked = [case for case in cases if case.id in before]
+    again = replace(trial, folder=trial.folder / "anew", beside={})
+    found = {key: before[key] | answer for key, answer in again.run(asked, on_progress, seconds).items()}
+    if len(found) == len(asked):
+        lines = [json.dumps(answer, sort_keys=True) + "\n" for answer in (before | found).values()]
+        save_text(trial.answers, "".join(lines))
+        shutil.rmtree(again.folder)
+    return found
 
 
 def generator_cases(n: int) -> list[Case]:

@@ -15,7 +15,7 @@ from ..trial.truth import Category, Truth
 from ..trial.vehicle import FAULTS
 from .needed import needed
 
-OURS = "diagnose"
+OURS, ALL = "diagnose", "all"
 # Error with what was said compensated may be so much larger than the possible one
 CLOSE = 1.1
 KNOWN = (Category.SINGLE, Category.PAIR, Category.TRIPLE)
@@ -47,7 +47,12 @@ def _whole_cpu(said: Document) -> Document:
 
 def class_of(truth: Truth) -> str:
     """Family and kind of a case, by which the figures are told."""
-    return f"{truth.family}: {CLASSES.get(truth.category, truth.category).value}"
+    return f"{truth.family}: {kind_of(truth)}"
+
+
+def kind_of(truth: Truth) -> str:
+    """Null, single, pair or unknown."""
+    return CLASSES.get(truth.category, truth.category).value
 
 
 def is_right(case: Scored) -> bool:
@@ -58,20 +63,19 @@ def is_right(case: Scored) -> bool:
 
 
 def tables(all_sides: Sequence[Side]) -> list[Shown]:
-    """Title, columns and rows: by class, one row for each that answers, and the differences in pairs."""
+    """Title, columns and rows: by class, by kind and of all; a row for each that answers, and differences in pairs."""
     found: list[Shown] = []
     ours = all_sides[0]
     columns = ("", "n", "right (95 %)", "truth in sets", "false alarms", "intervals hold", "interval score",
                "error <= 1.1 possible", "CPU s", "ours alone right / it alone (p)")  # fmt: skip
-    for name in sorted({class_of(case.truth) for case in ours.cases.values()}):
-        rows = [_row(side, ours, name) for side in all_sides]
-        found.append((name, columns, rows))
-    found.append(("all", columns, [_row(side, ours, "") for side in all_sides]))
+    truths = [case.truth for case in ours.cases.values()]
+    for name in (*sorted({class_of(each) for each in truths}), *sorted({kind_of(each) for each in truths}), ALL):
+        found.append((name, columns, [_row(side, ours, name) for side in all_sides]))
     return found
 
 
 def _row(side: Side, ours: Side, name: str) -> tuple[str, ...]:
-    cases = [case for case in side.cases.values() if name in ("", class_of(case.truth))]
+    cases = [case for case in side.cases.values() if name in (ALL, kind_of(case.truth), class_of(case.truth))]
     known = [case for case in cases if case.truth.category in KNOWN]
     errors = [case.error_over_possible <= CLOSE for case in known if math.isfinite(case.error_over_possible)]
     inside = [each.holds for case in known for each in case.intervals]

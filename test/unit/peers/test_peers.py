@@ -18,7 +18,7 @@ from dvl_calib_ros.errors import InputError
 from validation.__main__ import main
 from validation.peers import needed as libraries
 from validation.peers.asked import PEERS, ask, peers
-from validation.peers.command import generator_cases
+from validation.peers.command import asked_anew, generator_cases
 from validation.peers.foreign import foreign_cases, has_physics, record_foreign
 from validation.peers.forward import CLOCKS, LINEAR, Clock, Forward
 from validation.peers.scores import is_right, sides, tables
@@ -26,7 +26,7 @@ from validation.peers.search import Fitted, Member, Search, Whitening, residual_
 from validation.peers.streams import read_streams
 from validation.trial.generator import record
 from validation.trial.plan import Case, Family
-from validation.trial.run import Trial
+from validation.trial.run import Trial, read_answers
 from validation.trial.truth import Category, unseal
 from validation.trial.vehicle import FAULTS
 
@@ -138,6 +138,13 @@ def test_who_is_asked_beside_is_asked_of_the_same_bags_and_scored_with_the_same_
     answers = trial.run(cases)
     assert seen["ours"] == seen["other"] and len(seen["ours"]) == 2
     assert trial.run(cases) == answers and len(seen["ours"]) == 2  # gone on with: nothing is left
+    changed = replace(trial, answerer=partial(noting, "lever_arm", "ours"))
+    half = asked_anew(changed, cases, lambda _: None, 0.0)
+    assert not half and read_answers(trial.answers) == answers  # as they were until all are there
+    anew = asked_anew(changed, [*cases, Case(Category.NULL, "free", number=2)], lambda _: None, np.inf)
+    assert [each["document"]["effects"][0]["name"] for each in anew.values()] == ["lever_arm"] * 2
+    assert [each["beside"] for each in anew.values()] == [each["beside"] for each in answers.values()]
+    assert len(seen["other"]) == 2 and read_answers(trial.answers) == anew and not (tmp_path / "anew").exists()
     both = sides(unseal(trial.sealed), answers)
     assert [side.name for side in both] == ["diagnose", "other"]
     right = [{case.truth.category: is_right(case) for case in side.cases.values()} for side in both]
