@@ -35,9 +35,9 @@ from .selection import EffectSelection, Selected, select
 from .series import collect_series
 from .settings import SETTINGS
 from .shown import somewhere, with_shown
-from .standing import is_borne_out, matters, settled
+from .standing import is_borne_out, settled
 from .twin import twins
-from .unexplained import Unexplained, moved_by, unexplained
+from .unexplained import Unexplained, matters, moved_by, unexplained
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]

@@ -25,6 +25,8 @@ from .settings import SETTINGS
 
 # Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
 SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
+# Of these, places of what adds most: beside seconds of a clock all others explain more by themselves than a drift adds
+ADDING_MOST = 4
 # How many times of the run are kept of an effect that comes and goes
 KEPT_VARIANTS = 2
 
@@ -143,26 +145,28 @@ def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]
     """Variants that promise most, alone or on top of the fit's own; all of the fit's own."""
     alone, none = table.drop(own), table.drop([])
     gains: dict[int, float] = {}
-    for index, variant in enumerate(table.variants):
+    adds: dict[int, float] = {}
+    for index in range(len(table.variants)):
         if index in own:
             continue
         by_itself = none - table.drop([index]) - cost[index]
-        on_top = alone - table.drop([*own, index]) - cost[index]
+        adds[index] = alone - table.drop([*own, index]) - cost[index]
         instead = max(
             (table.drop([i for i in own if i != out]) - table.drop([*(i for i in own if i != out), index]) - cost[index]
              for out in own),
             default=-np.inf,
         )  # fmt: skip
         # of what explains much by itself, strong effects make all look alike: what it adds counts more
-        gains[index] = max(on_top, 0.1 * instead, 0.01 * by_itself)
-        del variant
+        gains[index] = max(adds[index], 0.1 * instead, 0.01 * by_itself)
     kept: list[int] = []
     of_effect: dict[str, int] = {}
-    for index in sorted(gains, key=lambda i: -gains[i]):
-        name = table.variants[index].effect.name
-        if of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < SHORTLIST:
-            kept.append(index)
-            of_effect[name] = of_effect.get(name, 0) + 1
+    most = sorted((i for i in adds if adds[i] > 0.0), key=lambda i: -adds[i])
+    for places, ranked in ((ADDING_MOST, most), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
+        for index in ranked:
+            name = table.variants[index].effect.name
+            if index not in kept and of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < places:
+                kept.append(index)
+                of_effect[name] = of_effect.get(name, 0) + 1
     return [*own, *kept]
 
 

@@ -9,12 +9,10 @@ import numpy as np
 
 from ..effects.base import Effect
 from .closure import Gap
-from .composed import Problem
 from .criteria import price
-from .fitting import Fit
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import Unexplained, holds_out, told_elsewhere, unexplained
+from .unexplained import Unexplained, matters, told_elsewhere, unexplained
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
@@ -55,13 +53,6 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     effects = selection.fit.effects
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
-
-
-def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
-    """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
-    if not rest.found or rest.energy < SETTINGS.unexplained_energy:
-        return False
-    return holds_out(problem, fit, rest) > SETTINGS.unexplained_held_out
 
 
 def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:

@@ -270,6 +270,13 @@ def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     return told_elsewhere(problem, noise, fit.columns, rest.clearest, fit.residual)
 
 
+def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
+    """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
+    if not rest.found or rest.energy < SETTINGS.unexplained_energy:
+        return False
+    return holds_out(problem, fit, rest) > SETTINGS.unexplained_held_out
+
+
 def moved_by(fit: Fit, rest: Unexplained) -> Array:
     """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
     noise, raw = fit.noise, rest.clearest

@@ -440,6 +440,22 @@ def test_a_large_and_a_small_effect_in_one_recording_are_both_found():
     assert set(found(diagnosis)) == {"lever_arm", "velocity_bias"}
 
 
+@pytest.mark.parametrize(
+    ("strong", "name", "value"),
+    [
+        (["reference_time_offset:seconds=2.5"], "scale_drift", {"rate_per_hour": 0.05}),
+        ([LEVER, "dvl_time_offset:seconds=2.5"], "misalignment_drift", {"z_rad_per_hour": 0.05}),
+    ],
+)
+def test_a_drift_of_a_thousandth_of_what_a_delay_of_seconds_explains_is_named(strong, name, value):
+    """It was not proposed, for beside the delay all others explain more by themselves; and then taken for its ghost."""
+    (parameter,) = value
+    diagnosis = diagnosed(effects=[*strong, f"{name}:{parameter}={value[parameter]}"], gnss_std=0.01, seconds=600.0)
+    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
+    assert set(found(diagnosis)) == {each.split(":")[0] for each in strong} | {name}
+    assert_within(diagnosis, name, **value)
+
+
 def test_two_late_streams_are_told_by_the_two_differences_that_matter_and_the_third_clock_is_named():
     diagnosis = diagnosed(
         effects=["reference_time_offset:seconds=0.6", "attitude_time_offset:seconds=0.3"], gnss_std=0.03
