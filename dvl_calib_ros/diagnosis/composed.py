@@ -378,6 +378,8 @@ class Problem:
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
         error = _turned(matrix, raw) - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
+        for lag, values in hypothesis.lags(recording):
+            error = error - lag.of_before(motion, error, values)
         projection = self._kept_projection(stream, rotation, attitude)
         angles = hypothesis.phi + turn
         change = partial(_change, stream.dvl, dvl)
@@ -451,7 +453,8 @@ class Problem:
             columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
             unscaled = measured / (1.0 + hypothesis.scale)
             np.multiply(-unscaled[:, None, :], each.body_from_measured, out=columns[:, :, 3:])
-            parts.append(columns if is_linear else self._in_bins(grid, _lagging(lags, each, columns), each))
+            lagging = columns if is_linear else _begun(lags, each, _lagging(lags, each, columns))
+            parts.append(lagging if is_linear else self._in_bins(grid, lagging, each))
         return np.concatenate(parts)
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
@@ -459,9 +462,10 @@ class Problem:
         per_recording = []
         for recording, each in enumerate(seen):
             body = self._derivatives(hypothesis, each, effect, values[recording])
+            lags = hypothesis.lags(recording)
             if effect.acts_on is not ActsOn.REFERENCE:
-                body = _lagging(hypothesis.lags(recording), each, body)
-            per_recording.append(body)
+                body = _lagging(lags, each, body)
+            per_recording.append(_begun(lags, each, body))
         joined = self.binned(per_recording, seen)
         if not effect.of_the_day or len(seen) == 1:
             return joined
@@ -565,6 +569,14 @@ def _lagging(lags: Sequence[tuple[Effect, Values]], seen: Seen, columns: Array) 
     for lag, values in lags:
         moved = [replace(seen.motion, velocity_body=column) for column in np.moveaxis(columns, 2, 0)]
         columns = columns - np.stack([lag.trace(one, values) for one in moved], axis=2)
+    return columns
+
+
+def _begun(lags: Sequence[tuple[Effect, Values]], seen: Seen, columns: Array) -> Array:
+    """Derivatives (F, 3, p) m/s without what a lag explains of them by what it remembers of before."""
+    for lag, values in lags:
+        of_before = [lag.of_before(seen.motion, column, values) for column in np.moveaxis(columns, 2, 0)]
+        columns = columns - np.stack(of_before, axis=2)
     return columns
 
 

@@ -186,6 +186,11 @@ class Effect(AnyEffect, ABC):
     again: ClassVar[Mapping[str, str]] = {}
     rarer: ClassVar[frozenset[str]] = frozenset()
 
+    def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
+        """That part (N, 3) m/s of a velocity (N, 3) m/s, body frame, that what an effect with a memory has kept of the
+        time before the motion explains, by least squares. values: of the effect."""
+        return np.zeros_like(velocity)
+
     @property
     def usual(self) -> Effect:
         """The same, without what is rarer."""

@@ -164,6 +164,15 @@ class ReferenceLag(Effect):
         reference = _in_reference_frame(motion)
         return _in_body(motion, -lag_error(motion.time, reference, values["time_constant_s"]))
 
+    def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
+        """What the filter had in it at the first sample dies away with its time constant, whatever it was."""
+        constant = values["time_constant_s"]
+        if constant <= 0.0:
+            return np.zeros_like(velocity)
+        left = np.exp((motion.time[0] - motion.time) / constant)
+        at_first = left @ (_in_reference_frame(replace(motion, velocity_body=velocity)) / (left @ left))
+        return _in_body(motion, np.outer(left, at_first))
+
 
 def delayed(time: Array, values: Array, delay: float | Array) -> Array:
     """What `values` (N, 3) were `delay` s before, one or (N,); before the first and after the last, as there.

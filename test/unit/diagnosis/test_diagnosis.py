@@ -911,6 +911,19 @@ def test_the_derivatives_beside_a_lag_are_those_of_what_lags(name):
         assert error < 0.1, (name, number, error)
 
 
+def test_what_a_filter_remembers_of_before_the_recording_is_no_error_of_its_first_seconds():
+    """A lag of 1.2 s was 1.06 s, and unknown: the filter was taken to begin with the recording."""
+    given = scenario(effects=["reference_lag:time_constant_s=1.2"], gnss_std=0.002, errors=DvlErrors())
+    run = simulate(given)
+    from_ns = run.dvl[0].stamp_ns + 10**11
+    later = Run(*([each for each in stream if each.stamp_ns >= from_ns] for stream in (run.dvl, run.gnss, run.imu)))
+    problem = problem_of(later)
+    lag = EFFECTS["reference_lag"]
+    hypothesis = no_effect().with_effects([lag], 1, {lag.name: ({"time_constant_s": 1.2},)})
+    left = np.linalg.norm(problem.residual(problem.all_seen(hypothesis)), axis=1)
+    assert left[:4].max() < 0.01
+
+
 def test_a_height_that_is_known_and_not_fitted_is_no_part_of_the_derivatives_of_the_rest():
     problem = problem_of(simulate(scenario(**SMOOTH)))
     arm = EFFECTS["lever_arm"]
