@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from ..effects.base import Effect
 from .clock_or_arm import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
-from .composed import Hypothesis, Values, is_time_of_run, no_effect
+from .composed import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
 from .criteria import WINDOW_STEPS, price, windows
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
 from .leaps import LEAP
@@ -84,6 +84,8 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
     scored.sort()
     scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
     worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
+    if not any(_is_possible(table, chosen) for chosen in worth):  # lines are straight no more: the likely is tried too
+        worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
     if tuple(own) not in worth:
         worth.append(tuple(own))
     return [
@@ -189,6 +191,18 @@ def combined(fitter: Fitter, fit: Fit, table: StraightLines, chosen: Sequence[in
         start[variant.effect.name] = moved.values[variant.effect.name]
     effects = [table.variants[index].effect for index in chosen]
     return fit.hypothesis.with_effects(effects, n, start)
+
+
+def _is_possible(table: StraightLines, chosen: Sequence[int]) -> bool:
+    """Whether straight lines put every parameter of a combination within its bounds."""
+    part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
+    variants = [table.variants[index] for index in chosen]
+    specs = [
+        spec
+        for variant in variants
+        for spec in amplitudes(variant.effect) * (variant.p // len(amplitudes(variant.effect)))
+    ]
+    return all(spec.low < x < spec.high for spec, x in zip(specs, part.solution()[6:].tolist(), strict=True))
 
 
 def _is_told_by_two_clocks(table: StraightLines, chosen: Sequence[int]) -> bool:

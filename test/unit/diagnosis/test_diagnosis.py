@@ -175,6 +175,14 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
 # ------------------------------------------------------------------ what is found
 
 
+def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well():
+    """A shear of 17° and more was in every proposal, no fit of them went anywhere, and the current was not found."""
+    told = ["attitude_time_offset:seconds=-0.26", "water_lock:east_mps=0.14,north_mps=0.26,from_s=61,to_s=140"]
+    diagnosis = diagnosed(effects=told, seed=7, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.02)
+    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
+    assert set(found(diagnosis)) == {"attitude_time_offset", "water_lock"}
+
+
 def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
     diagnosis = diagnosed()
     assert diagnosis.verdict is DiagnosisVerdict.NO_GAP
