@@ -81,13 +81,17 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     problem, noise = fitter.problem, fit.noise
     looks, white, raw, known = _looked(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
-    followed = lines(problem, white[: fit.residual.size].reshape(-1, problem.axes))
+    # Noise in the columns keeps a fit from standing where the residual is at right angles to them. Put there, it would
+    # follow the vehicle's speed, and have its periods
+    left = noise.whiten(fit.residual)
+    left = left / np.sqrt(float(left @ left) / (left.size - known.shape[1]))
+    followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
     if asked > -np.inf:
         most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
         for line in followed:
             waves = _along_axes(line.waves, problem.axes)
-            energy = explained(known, _with_rows_of_prior(noise.whiten(waves), white), white, 1.0)[1]
+            energy = explained(known[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
             most.append((energy + waves.shape[2], waves.shape[2]))
         prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
         if max(each - prices[columns] for each, columns in most) < asked:
@@ -129,7 +133,10 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    clear_energy = explained(known, _with_rows_of_prior(noise.whiten(best[2]), white), white, 1.0)[1]
+    beside = (known[: left.size, :0], noise.whiten(best[2]), left)
+    if not isinstance(best[1], float):
+        beside = (known, _with_rows_of_prior(beside[1], white), white)
+    clear_energy = explained(*beside, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
     cost = _price(tested, best[2].shape[2])
     found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_diagnosis import fitted, scenario, with_added
@@ -79,3 +81,14 @@ def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_ne
     assert promised > 3.0 and not is_surely_worse(0.0, promised)
     beyond = NEARBY * SURELY + 0.1
     assert is_surely_worse(beyond, promised) and not is_surely_worse(beyond, 0.0)
+
+
+def test_lines_are_looked_for_in_what_a_fit_leaves(stepped, monkeypatch):
+    """At right angles to noisy columns it followed the vehicle's speed: a period of 82 s was an unknown cause."""
+    fitter, fit = stepped
+    off = replace(fit, residual=fit.residual - 0.003 * fit.columns[:, :, 3])  # as what noise in the columns makes of it
+    seen = []
+    monkeypatch.setattr(looking, "lines", lambda _, innovations: seen.append(innovations) or [])
+    unexplained(fitter, off)
+    white = fit.noise.whiten(off.residual).reshape(off.residual.shape)
+    np.testing.assert_allclose(seen[0] / np.sqrt(np.mean(seen[0] ** 2)), white / np.sqrt(np.mean(white**2)))
