@@ -30,7 +30,7 @@ def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         weak = [
             rest
             for effect, rest in rests
-            if log_p_in_place(fit, rest, effect) > threshold
+            if log_p_in_place(fitter, fit, rest, effect) > threshold
             or is_taken_back(fitter, fit, effect.name, drops[effect.name], rest)
             or _makes_leaps_cancel(fit, effect, drops)
             or (
@@ -92,7 +92,8 @@ def without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """
     while fit.effects:
         rests = [
-            (rest := fit_without(fitter, fit, effect), log_p_in_place(fit, rest, effect)) for effect in fit.effects
+            (rest := fit_without(fitter, fit, effect), log_p_in_place(fitter, fit, rest, effect))
+            for effect in fit.effects
         ]
         worst, log_p = max(rests, key=lambda each: each[1])
         if log_p < -float(np.log(n_effects)):

@@ -235,7 +235,8 @@ class Grid:
 class Problem:
     """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
     bursts: of how many samples an instrument was far off, which are left out. shown_turns: (3, 3) projection of φ on
-    the turns of the mounting that a reference without a vertical shows; by the others it is not turned.
+    the turns of the mounting that a reference without a vertical shows; by the others it is not turned. unshown: what
+    it does not show of effects that every vehicle has a little of.
     """
 
     recordings: tuple[RecordedStreams, ...]
@@ -245,6 +246,7 @@ class Problem:
     of_axes: tuple[bool, bool, bool] = (True, True, True)
     bursts: int = 0
     shown_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
+    unshown: tuple[Effect, ...] = ()
     # Hypotheses as they were fitted last, by what they are made of: where to start from again
     fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
@@ -472,6 +474,26 @@ class Problem:
         whose = whose_parameters(effect, len(seen))
         blocks = [np.where((self.recording_of == r)[:, None, None], joined, 0.0) for r in whose]
         return np.concatenate(blocks, axis=2)
+
+    def unshown_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> tuple[Array, Array]:
+        """(M, A, u) d e / d what is not shown and not fitted: turns of the mounting, parts of effects; and their usual
+        sizes (u,).
+
+        Each is next to nothing, but so is an effect of which there is little: what these explain is not its.
+        """
+        parts, sizes = [], []
+        held, turns = np.linalg.eigh(np.eye(3) - self.shown_turns)
+        if (held > 0.5).any():
+            turned = replace(self, shown_turns=np.eye(3)).calibration_columns(hypothesis, seen)[:, :, :3]
+            parts.append(turned @ turns[:, held > 0.5])
+            sizes.append(np.full(parts[-1].shape[2], SETTINGS.prior_angle))
+        for effect in self.unshown:
+            parts.append(self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen)))
+            own = [spec.typical for spec in amplitudes(effect)]
+            sizes.append(np.tile(own, parts[-1].shape[2] // len(own)))
+        if not parts:
+            return np.zeros((len(self.time), self.axes, 0)), np.zeros(0)
+        return np.concatenate(parts, axis=2), np.concatenate(sizes)
 
     def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """(M, A) m/s that an effect adds to the residual of a hypothesis that has not got it."""

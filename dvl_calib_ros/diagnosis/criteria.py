@@ -72,9 +72,10 @@ def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
     return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 
-def log_p_in_place(fit: Fit, rest: Fit, effect: Effect) -> float:
-    """log p of an effect of a fit, given all others. rest: the fit without it."""
-    return log_p_value(fit.gain_over(rest), fit.dof - rest.dof, times_tried(effect))
+def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float:
+    """log p of an effect of a fit, given all others and what is not shown. rest: the fit without it."""
+    gain = fit.gain_over(rest) - max(fitter.told_by_unshown(rest) - fitter.told_by_unshown(fit), 0.0)
+    return log_p_value(gain, fit.dof - rest.dof, times_tried(effect))
 
 
 def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "") -> float:

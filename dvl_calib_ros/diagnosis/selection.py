@@ -34,7 +34,7 @@ from .noise import Noise, white_noise
 from .proposing import leaps_at_the_beginning, proposed, told_by_other_clocks, variants_about
 from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
-from .shown import shown_parts, without_faint
+from .shown import shown_parts, unshown_parts, without_faint
 from .told_apart import Selected, tell_apart
 from .twice import happening_again, is_taken_back
 from .unexplained import unexplained
@@ -77,7 +77,8 @@ def started(
     with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-    effects = shown_parts({name: effect.once for name, effect in effects.items()}, problem)
+    every, effects = effects, shown_parts({name: effect.once for name, effect in effects.items()}, problem)
+    problem = replace(problem, unshown=unshown_parts(every, effects))
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
@@ -103,6 +104,7 @@ def select(
     kept = without_contradicted(problem, fit.hypothesis)
     if kept is not None:
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+        problem = replace(problem, unshown=fitter.problem.unshown)
         fitter, fit = _first_fit(problem, fit.hypothesis)
     fitter, fit = _about(fitter, fit, every)
     far = fitter.bursts(fit)

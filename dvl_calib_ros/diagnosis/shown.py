@@ -19,6 +19,8 @@ SHOWN_FROM, USUAL_MPS = 0.2, 0.02
 # A part of the lever arm is looked for where so much of it (m) would do as much, since metres left out turn all the
 # rest: an AUV that rolls at 0.5°/s. It stands if it is so many times what a model lacks makes of it
 ARM_FROM_M, FAINT = 0.6, 2.0
+# Every DVL has a little of these
+OF_EVERY = ARM, "velocity_bias"
 
 
 def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
@@ -27,6 +29,13 @@ def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Ef
         return dict(effects)
     seen = problem.all_seen(no_effect())
     return {name: _shown_part(each, problem, seen) for name, each in effects.items()}
+
+
+def unshown_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
+    """What is not shown of effects that every vehicle has a little of: where its DVL sits, and the DVL's bias."""
+    of_every = [(effects[name], {spec.name for spec in shown[name].parameters}) for name in OF_EVERY if name in effects]
+    left_out = (effect.without(names) for effect, names in of_every)
+    return tuple(effect for effect in left_out if effect.parameters)
 
 
 def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:

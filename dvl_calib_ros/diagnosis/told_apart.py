@@ -94,7 +94,7 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     that fits worse could be if it needs fewer.
     """
     rest = fit_without(fitter, fit, effect)
-    log_p = log_p_in_place(fit, rest, effect)
+    log_p = log_p_in_place(fitter, fit, rest, effect)
     drop = rest.deviance - fit.deviance
     table = straight_lines(fitter, rest, effects)
     n = len(fit.seen)

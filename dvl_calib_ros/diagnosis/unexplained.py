@@ -183,9 +183,10 @@ def _looked(
     """
     noise = fit.noise
     known = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    q, white = _beside_prior(fit, noise.whiten(known), noise.whiten(residual))
+    unshown, sizes = problem.unshown_columns(fit.hypothesis, seen)
+    q, white = _beside_prior(fit, noise.whiten(np.concatenate([known, unshown], axis=2)), noise.whiten(residual), sizes)
     white = white - q @ (q.T @ white)
-    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1]))
+    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + len(sizes)))
     looks: list[FollowTest] = []
     raw: dict[str, Array] = {}
     sound = ~_upset(fitter, noise)[:, None]
@@ -197,15 +198,15 @@ def _looked(
     return looks, white, raw, q
 
 
-def _beside_prior(fit: Fit, known: Array, white: Array) -> tuple[Array, Array]:
-    """Orthonormal basis of whitened columns (M A, 6 + p), and a whitened series (M A,), each with the rows of the fit's
-    prior below: 6 + p more.
+def _beside_prior(fit: Fit, known: Array, white: Array, sizes: Array) -> tuple[Array, Array]:
+    """Orthonormal basis of whitened columns (M A, 6 + p + u), and a whitened series (M A,), each with the rows of the
+    prior below, the fit's and that of sizes (u,): 6 + p + u more.
 
     Without it the scale of a sway that is hardly there, which is noise, would explain that noise.
     """
-    std = prior_std(fit.hypothesis)
-    basis = _orthonormal(np.concatenate([known, np.diag(1.0 / std)]))
-    return basis, np.concatenate([white, fit.hypothesis.vector() / std])
+    own = prior_std(fit.hypothesis)
+    basis = _orthonormal(np.concatenate([known, np.diag(1.0 / np.append(own, sizes))]))
+    return basis, np.concatenate([white, fit.hypothesis.vector() / own, np.zeros(len(sizes))])
 
 
 def _with_rows_of_prior(columns: Array, white: Array) -> Array:
