@@ -685,18 +685,23 @@ def _grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     seconds = max(base.time[-1] - base.time[0], base.interval)
     width = max(settings.bins_per_interval * base.interval, settings.shortest_bin, seconds / settings.max_bins)
     per_bin = max(2, round(width / base.interval))
-    true = base.time - base_late
+    streams = (recording.dvl, offsets.dvl), (recording.reference, offsets.reference)
+    others = [(curve, own_late) for curve, own_late in streams if curve is not base]
+    told = np.ones(len(base.time), dtype=bool)
+    for curve, own_late in (*others, *((each, 0.0) for each in (recording.attitude, recording.rates) if each)):
+        told &= curve.tells(base.time - base_late + own_late)
+    stamps = base.time[told]
+    true = stamps - base_late
     known = np.ones(len(true), dtype=bool)
-    for curve, own_late in ((recording.dvl, offsets.dvl), (recording.reference, offsets.reference)):
-        if curve is not base:
-            for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
-                known &= curve.covers(true + own_late + at)
+    for curve, own_late in others:
+        for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
+            known &= curve.covers(true + own_late + at)
     for oriented in (recording.attitude, recording.rates):
         for at in (base_late, -MARGIN_S, MARGIN_S):
             known &= True if oriented is None else oriented.covers(true + at)
-    breaks = np.flatnonzero(np.diff(base.time) > settings.max_gap_intervals * base.interval) + 1
+    breaks = np.flatnonzero(np.diff(stamps) > settings.max_gap_intervals * base.interval) + 1
     kept = []
     for part in np.split(np.arange(len(true)), np.unique(np.concatenate([breaks, np.flatnonzero(np.diff(known)) + 1]))):
         if len(part) and known[part[0]]:
             kept.append(part[: len(part) // per_bin * per_bin])
-    return Grid(clock, base.time[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_late)
+    return Grid(clock, stamps[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_late)

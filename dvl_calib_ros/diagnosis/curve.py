@@ -27,6 +27,8 @@ NOISE_ALONE, SOME_MOTION = 1.4, 2.5
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Streams slower than this show turns and waves barely; they have no frequencies to spare
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
+# Times before and after, in intervals, whose product is larger lie where a sample is lost: 0.25 in the middle of two
+TOLD = 0.4
 
 
 class Remembered:
@@ -175,6 +177,15 @@ class Curve:
         apart = self.time[after] - self.time[after - 1]
         inside = (at >= self.time[0]) & (at <= self.time[-1])
         return inside & (apart <= SETTINGS.max_gap_intervals * self.interval)
+
+    def tells(self, at: Array) -> NDArray[np.bool_]:
+        """(M,) whether `covers`, and no sample is lost there of a slow stream, of which nothing else tells a wave."""
+        known = self.covers(at)
+        if self.interval <= FAST_ENOUGH_S:
+            return known
+        after = np.clip(np.searchsorted(self.time, at), 1, len(self.time) - 1)
+        apart = (at - self.time[after - 1]) * (self.time[after] - at)
+        return known & (apart <= TOLD * self.interval**2)
 
     def averaged(self, rate_hz: float) -> Curve:
         """Means over groups of samples, so that they come at no more than a rate."""
